@@ -4,7 +4,8 @@ A `Continuity` is a driver's tap for one target of a run. `lost` says what speak
 uninterrupted unit:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
-  switched its power (R28); or after a silence in which it has not confirmed the reset;
+  switched its power (R28); or after a silence in which it has not confirmed the reset or its
+  image;
 - it announces itself in the middle of a transfer, or an application answers, which is erased then;
 - before the run has sent anything that restarts it, the watcher counts another power-up of what it
   had heard, also in the time before the run;
@@ -122,8 +123,10 @@ class Continuity:
         """
         self._announced_on = 0
         """Announcements of the burst that goes on, since the last reset."""
-        self._awaits_confirmation = False
-        """A reset was sent to an application that runs, and is not confirmed."""
+        self._awaits_confirmation = self._awaits_complete = False
+        """A reset was sent to an application that runs, or the end of the transfer, and is not
+        confirmed.
+        """
         self._requested_s: float | None = None
         """The same for when the transfer that goes on was requested; None: none does."""
         self._is_identified = False
@@ -165,7 +168,8 @@ class Continuity:
     def settle(self) -> None:
         """Its application has answered a question of the run: what was restarted has started."""
         self.is_running, self.is_told_to_update = True, False
-        self._awaits_confirmation, self._requested_s = False, None
+        self._awaits_confirmation = self._awaits_complete = False
+        self._requested_s = None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
@@ -212,6 +216,7 @@ class Continuity:
         requests, announcements = watcher.transfer_requests, watcher.announcements
         answers, confirmations = watcher.answers, watcher.confirmations
         was_heard, power_ups = watcher.is_known, watcher.power_ups
+        completions = watcher.completions
         watcher(frame, sent=False, now=now)
         if was_heard and watcher.power_ups > power_ups:
             self._take_power_up(now)
@@ -221,6 +226,7 @@ class Continuity:
             self._heard_s = self._listened_s
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
+        self._awaits_complete = self._awaits_complete and watcher.completions == completions
         if watcher.transfer_requests > requests and self.is_told_to_update:
             self._requested_s, self._burst_until = self._listened_s, -inf
         if watcher.announcements > announcements:
@@ -257,13 +263,13 @@ class Continuity:
             elif found.command == Command.UPDATE:
                 if not self._is_identified:
                     self._stay()
-                self.is_running = self._awaits_confirmation = False
+                self.is_running = self._awaits_confirmation = self._awaits_complete = False
                 self.is_told_to_update = True
                 # A burst that the reset before it has caused may still come: it was lost then.
                 self._requested_s = None
             elif found.command == Command.END_OF_TRANSFER:
                 self._requested_s = None
-                self._burst_until = inf
+                self._burst_until, self._awaits_complete = inf, True
                 self._announced_on = _ANNOUNCED_ON
 
     @property
@@ -277,7 +283,7 @@ class Continuity:
         return inf if self._announced_s is None else self._listened_s - self._announced_s
 
     def _restart(self) -> None:
-        self.is_running = self._awaits_confirmation = False
+        self.is_running = self._awaits_confirmation = self._awaits_complete = False
         self._has_acted = True
         self._requested_s = None
         # However late: only an answer of the application shows that no burst will follow.
@@ -312,9 +318,10 @@ class Continuity:
             return
         if is_caused:
             has_returned = self._listened_s - self._returned_s < _MESSAGE_S
-            if self._awaits_confirmation and has_returned:
-                self._lose_by_restart("and had not confirmed the reset before")
-            self.is_running = self._awaits_confirmation = False
+            if (self._awaits_confirmation or self._awaits_complete) and has_returned:
+                what = "the reset" if self._awaits_confirmation else "its image"
+                self._lose_by_restart(f"and had not confirmed {what} before")
+            self.is_running = self._awaits_confirmation = self._awaits_complete = False
         elif now > self._supplied_until:
             self._lose_by_restart("although this run had not restarted it")
         version, self._boot_version = self._boot_version, self.watcher.version

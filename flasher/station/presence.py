@@ -13,7 +13,13 @@ from typing import Final, Protocol
 from flasher.protocol import catalogue
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.messages import BootVersion, GeneralFeedback, RequestTransfer, decode
+from flasher.protocol.messages import (
+    BootVersion,
+    Complete,
+    GeneralFeedback,
+    RequestTransfer,
+    decode,
+)
 from flasher.protocol.spec import Target, data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
@@ -73,6 +79,8 @@ class TargetWatcher:
         """Of its bootloader."""
         self.confirmations = 0
         """Of writes and resets."""
+        self.completions = 0
+        """Of images, by its bootloader."""
         self.answers = 0
         """To a question for its version, whoever asked."""
         self.answer: Content | None = None
@@ -106,14 +114,8 @@ class TargetWatcher:
                 self._hear_application()
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
-                row = decode(found) if isinstance(found, Message) else None
-                if isinstance(row, BootVersion):
-                    self._announced(now)
-                    self.version = printable(row.version)
-                elif isinstance(row, RequestTransfer):
-                    self.transfer_requests += 1
-                elif isinstance(row, GeneralFeedback):
-                    self.confirmations += 1
+                if isinstance(found, Message):
+                    self._hear_bootloader(found, now)
         if self._answers is not None and frame.can_id == self._answers.can_id:
             for found in self._answers.feed(frame.data, now):
                 if isinstance(found, Message):
@@ -128,6 +130,18 @@ class TargetWatcher:
     def is_known(self) -> bool:
         """True when it has announced itself, or its application was heard."""
         return self.announcements > 0 or self.has_application
+
+    def _hear_bootloader(self, message: Message, now: float) -> None:
+        match decode(message):
+            case BootVersion(version=version):
+                self._announced(now)
+                self.version = printable(version)
+            case RequestTransfer():
+                self.transfer_requests += 1
+            case GeneralFeedback():
+                self.confirmations += 1
+            case Complete():
+                self.completions += 1
 
     def _hear_application(self) -> None:
         if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:

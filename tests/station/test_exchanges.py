@@ -327,6 +327,19 @@ def test_a_reset_that_the_first_unit_did_not_receive(
     world.check_caught()
 
 
+@BOTH_KINDS
+@pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5])
+def test_a_unit_that_is_pulled_before_it_confirms_its_image(
+    tmp_path: Path, numbers: tuple[str, str], gap_s: float
+) -> None:
+    """The second one runs the new version already, as the first one would."""
+    first = replace(NEW_UNIT, program_time_s=0.25)
+    second = replace(NEW_UNIT, factory_version=BMS_VERSION)
+    world = Exchange(tmp_path, numbers, gap_s=gap_s, first=first, second=second)
+    world.when = lambda: world.first.state.value == "checking"
+    world.check_caught()
+
+
 @pytest.mark.parametrize("reset_delay_s", [0.0, 0.1])
 def test_a_confirmation_of_the_reset_may_be_lost(tmp_path: Path, reset_delay_s: float) -> None:
     """A restart that follows so soon is that of the same unit."""

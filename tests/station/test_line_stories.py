@@ -155,6 +155,11 @@ STORIES = {
         " @9.0 stall socket=A seconds=2.0 ; @9.3 pull unit=3 ; @10.0 put unit=1 socket=A ;"
         " @12.0 label by=mo unit=3"
     ),
+    "a unit that is pulled before it confirms its image": (
+        "line sockets=1 ; unit label=2 pace=slow ; unit label=3 application=new ; person name=al ;"
+        " @3.0 put unit=2 socket=A ; @6.6 label by=al unit=2 ; @8.7 pull unit=2 ;"
+        " @9.0 put unit=3 socket=A"
+    ),
     "a unit that is pulled as its run ends": (
         "line sockets=1 ; unit label=1 ; person name=jo source=jo ; @0.0 put unit=1 socket=A ;"
         " @0.83 label by=jo unit=1 ; @2.21 pull unit=1"

@@ -44,7 +44,7 @@ class Exchange:
     """Of the other one."""
     gap_s: float
     is_new: bool
-    """The other one has the image of the recipe already."""
+    """The other one runs the version of the recipe already."""
 
 
 def _may_announce_itself(pulled: Pulled) -> bool:
@@ -63,8 +63,8 @@ UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
         each.pulled.state is State.RESTARTING
         and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
     ),
-    "between the end of the transfer and the first answer": lambda each: (
-        each.pulled.state in (State.CHECKING, State.STARTING)
+    "between the complete image and the first answer": lambda each: (
+        each.pulled.state is State.STARTING
         and each.is_new
         and each.gap_s <= DEFAULT_TIMINGS.application_start_timeout_s
     ),

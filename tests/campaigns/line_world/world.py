@@ -412,7 +412,9 @@ class World:
         moved_s = self.now - max(bay.emptied_at, self._pulled_at.get(act.unit, -HAND_S))
         if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S or self._holds(bay):
             return False
-        is_new = unit.engine.stored_image == IMAGES[BMS].data
+        engine = unit.engine
+        is_new = engine.profile.factory_version == BMS_VERSION
+        is_new = is_new or engine.stored_image == IMAGES[BMS].data
         if self.setup.line.tells:
             self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
