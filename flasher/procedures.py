@@ -88,8 +88,14 @@ class Watch(TypedDict, total=False):
     """Gets what happens, as dataclasses of `flasher.events`."""
     cancelled: Callable[[], bool] | None
     """Asked while it runs; ends it at the next message boundary."""
+    ends_write: Callable[[], bool] | None
+    """Asked while it writes an item, which `cancelled` does not end: the device may be another one
+    now, and nothing is repeated to it.
+    """
     hung_up: Callable[[], bool] | None
-    """The same for a terminal that is gone: it does not end an upgrade that has begun to erase."""
+    """As `cancelled`, for a terminal that is gone: it does not end an upgrade that has begun to
+    erase.
+    """
 
 
 @dataclass(frozen=True)
@@ -180,8 +186,8 @@ class Procedures:
         """Run an engine until it is done. `taps` see the frames after those of the caller, and
         `on_event` gets its events before the caller does.
 
-        Without `may_cancel` the user does not end it; a terminal that hangs up ends it only while
-        `hang_up_ends` says so.
+        Without `may_cancel` the user does not end it, only `ends_write` does; a terminal that
+        hangs up ends it only while `hang_up_ends` says so.
         """
         drive(
             engine,
@@ -189,7 +195,11 @@ class Procedures:
             self.clock,
             taps=(*self.watch.get("taps", ()), *taps),
             on_event=partial(self._tell, of_step=on_event),
-            cancelled=partial(self._is_cancelled, hang_up_ends) if may_cancel else None,
+            cancelled=(
+                partial(self._is_cancelled, hang_up_ends)
+                if may_cancel
+                else self.watch.get("ends_write")
+            ),
         )
 
     def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:

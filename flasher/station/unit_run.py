@@ -159,6 +159,7 @@ class UnitRun:
                     self._continuity[each.name],
                     taps,
                     self._is_over,
+                    self._is_lost,
                     goes_on=self._goes_on,
                 )
                 for each in self._recipe.targets
@@ -287,13 +288,18 @@ class UnitRun:
         """Asked between frames: a person stopped it, the step's time is over, or the unit may be
         another one.
         """
+        ends_at = self._step_ends_at
+        is_late = ends_at is not None and self._clock.now() >= ends_at
+        return self._is_lost() or self._cancelled() or is_late
+
+    def _is_lost(self) -> bool:
+        """Asked between frames: the unit may be another one."""
         now = self._clock.now()
         for each in self._continuity.values():
             each.listened(now)
             if each.lost or each.unobserved:
                 return True
-        ends_at = self._step_ends_at
-        return self._cancelled() or (ends_at is not None and now >= ends_at)
+        return False
 
     def _progress(self, share: float) -> None:
         now = self._clock.now()

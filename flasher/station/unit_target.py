@@ -75,6 +75,7 @@ class UnitTarget:
         continuity: Continuity,
         taps: Sequence[Tap],
         cancelled: Callable[[], bool],
+        is_lost: Callable[[], bool],
         *,
         goes_on: bool = False,
     ) -> None:
@@ -92,6 +93,7 @@ class UnitTarget:
             is_alone=True,
             taps=taps,
             cancelled=cancelled,
+            ends_write=is_lost,
         )
         rate = connection.bit_rate
         self.job = prepare(

@@ -203,6 +203,22 @@ def test_a_unit_that_is_exchanged_between_two_steps(
     world.check_caught()
 
 
+def test_a_write_is_not_repeated_to_the_unit_that_came_meanwhile(tmp_path: Path) -> None:
+    world = Exchange(tmp_path, gap_s=0.15)
+    begun = bytes.fromhex("55AA16124110")
+
+    # A person does not end a write, so `cancelled` is not asked: the exchange is looked after as
+    # the write is sent, and repeated.
+    def look(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001
+        if sent and frame.data.startswith(begun):
+            world.when = lambda: True
+            world.look()
+
+    world.bench.taps = (look,)
+    world.check_caught()
+    assert world.is_done
+
+
 @pytest.mark.parametrize(("numbers", "gap_s"), [(BLANK, 3.5), (OF_MAKER, 3.5), (OF_MAKER, 0.3)])
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
 def test_a_unit_that_keeps_its_supply_and_announces_nothing(
