@@ -329,7 +329,8 @@ class Line:
             has_passed = any(r["serial"] == label and r["state"] == "pass" for r in runs)
             if has_passed and found["serial"] != label:
                 said.append(f"{Fault.UNTRUE.value}: {label} in the records: {found['serial']!r}")
-            pulled = self._pulled_in.get(label, "no state")
+            others = [each for each, plan in self._plans.items() if plan is self._plans[label]]
+            pulled = ", ".join(self._pulled_in.get(each, "no state") for each in others)
             title = f"{self._plans[label].title}, pulled in {pulled}"
             self.problems += [f"{each} ({title})" for each in said]
         for each in self._ask("verify")["problems"]:

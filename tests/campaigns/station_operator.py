@@ -45,6 +45,7 @@ _JUST_S: Final = 1.0
 _GAPS_S: Final = (0.0, 0.3, 0.8)
 """How long a socket is empty while its unit is exchanged."""
 _NAMED: Final = re.compile(r"\binto socket ([0-9]+)\b")
+_FREE: Final = re.compile(r"If it is out, scan FREE ([0-9]+)")
 _CARD: Final = re.compile(r"\bscan (the card|SOCKET)\b", re.IGNORECASE)
 _CYCLE: Final = re.compile(r"off.*on again")
 
@@ -524,6 +525,8 @@ class Operator:
                 self.counts["unit moved, as the station said"] += 1
         if self._answer == "accepted":
             self._see_run(place.unit, place, over)
+        elif free := _FREE.search(" ".join(self._said)):
+            self._scan(f"FREE {free[1]}")  # it is out: here one unit of a label is in one place
         place.changed_at = time.perf_counter()
 
     def _see_run(self, label: str, place: Place, over: Callable[[], bool]) -> None:
