@@ -147,8 +147,9 @@ class Found:
         head = f"{self.bug.name:34} {self.kind or 'NOT FOUND':12} {self.seconds:5.1f} s"
         yield f"{head} {self.steps:6} steps" + (f" {self.acts:3} acts" if self.kind else "")
         yield f"    {self.bug.breaks}"
-        if self.kind:
+        if self.text:
             yield f"    {self.text}"
+        if self.kind:
             yield f"    {self.story}"
         if self.not_ours:
             yield f"    ({self.not_ours} stories that end so without the mistake were left out)"
@@ -198,7 +199,7 @@ def _converse(process: subprocess.Popen[str], bug: Bug) -> Found:
         not_ours += not is_ours
         process.stdin.write(f"{_YES if is_ours else 'no'}\n")
         process.stdin.flush()
-    raise RuntimeError(f"the process with {bug.name} ended with code {process.wait()}")
+    return Found(bug, "", f"Its process ended with code {process.wait()}.", 0.0, 0, "", not_ours)
 
 
 def _say(line: str) -> None:
