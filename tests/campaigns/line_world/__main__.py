@@ -2,8 +2,8 @@
 
 Each story is drawn from a seed and judged; a violation is shrunk to a story of one line, which
 `--replay LINE` plays with all that is shown; - reads it from standard input. The package says what
-a story may hold, and what has to hold in it. `python -m tests.campaigns.line_bugs` plants mistakes in
-the station to see what this finds.
+a story may hold, and what has to hold in it. `python -m tests.campaigns.line_bugs` plants
+mistakes in the station, to see what this finds.
 """
 
 from __future__ import annotations

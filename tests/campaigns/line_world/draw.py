@@ -189,8 +189,10 @@ class Teller:
     def _exchange_in_step(self, _name: str) -> Iterator[Step]:
         """Another unit into a socket, at a certain step of its run."""
         bay = self.chance.choice(list(self.world.bays.values()))
-        step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
-        is_at_its_end = step is StepName.FLASH and self.chance.random() < 0.7
+        is_at_its_end = self.chance.random() < 0.35
+        step = StepName.FLASH
+        if not is_at_its_end:
+            step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
         give_up_at = self.world.now + 10.0
         while not (bay.is_working and bay.step is step and bay.is_complete >= is_at_its_end):
             if self.world.now > give_up_at:
@@ -199,7 +201,7 @@ class Teller:
         # The step began up to 0.1 s ago.
         yield self.chance.choice((0.0, self.chance.uniform(0.0, 0.3))), None
         if bay.unit is not None:
-            yield from self._put_another(bay)
+            yield from self._put_another(bay, is_new=is_at_its_end)
 
     def _exchange(self, _name: str) -> Iterator[Step]:
         """Another unit into a socket that works."""
@@ -211,10 +213,14 @@ class Teller:
         if bay.unit is not None:
             yield from self._put_another(bay)
 
-    def _put_another(self, bay: Bay) -> Iterator[Step]:
+    def _put_another(self, bay: Bay, *, is_new: bool = False) -> Iterator[Step]:
+        """`is_new`: rather one that runs the recipe's firmware already."""
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
         others = [each for each in self._on_table() if each != before] or [before]
+        if is_new:
+            new = {e.label for e in self.world.setup.units if e.application == "new"}
+            others = [each for each in others if each in new] or others
         unit = before if self.chance.random() < 0.1 else self.chance.choice(others)
         yield self.chance.choice(_GAPS_S), stories.Put(unit=unit, socket=bay.name)
 

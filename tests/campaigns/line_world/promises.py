@@ -47,7 +47,7 @@ class _Run:
     had_application: bool
     is_identified: bool = False
     was_running: bool = False
-    """It was pulled after it was identified and before its flash, while its application ran."""
+    """It was pulled after it had answered and before its flash, while its application ran."""
 
     @property
     def is_flashed(self) -> bool:
@@ -139,10 +139,11 @@ class Promises:
                 engine.stored_image is not None,
             )
 
-    def pulled(self, socket: str) -> None:
+    def pulled(self, socket: str, *, was_calm: bool) -> None:
+        """`was_calm`: it was in the socket and heard for some time before the run."""
         self.touched(socket)
         run = self._runs.get(socket)
-        if run is not None and run.is_identified and not run.is_flashed:
+        if run is not None and (run.is_identified or was_calm) and not run.is_flashed:
             run.was_running = run.was_running or run.unit.engine.state is State.APPLICATION
 
     def _ended(self, event: RunEnded) -> None:

@@ -457,7 +457,7 @@ class World:
         if self._holds(bay):
             return False
         if self.setup.line.tells:
-            self.promises.pulled(bay.name)
+            self.promises.pulled(bay.name, was_calm=_is_calm(bay))
         else:
             self.promises.touched(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
@@ -722,7 +722,7 @@ class World:
         self.seen[self._last_end] += 1
         if event.code == "INTERNAL":
             raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
-        is_calm = bay.disturbed_at < bay.run_at - CALM_S
+        is_calm = _is_calm(bay)
         if event.code == "UNIT_CHANGED" and is_calm:
             raise Violation(
                 "ACCUSED",
@@ -953,6 +953,11 @@ def _make(setup: stories.UnitSetup, none: str, line: stories.LineSetup) -> Paper
     for device in devices:
         device.power_cut(0.0)
     return PaperUnit(devices, label_of(setup.label))
+
+
+def _is_calm(bay: Bay) -> bool:
+    """Nobody had touched anything for some time before the run."""
+    return bay.disturbed_at < bay.run_at - CALM_S
 
 
 def _stored(unit: PaperUnit) -> _Stored:
