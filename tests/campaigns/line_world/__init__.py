@@ -13,7 +13,7 @@ goes on where another one ended with the `--seed` that its last line names.
 Clauses, one a line or parted by " ; ". First what there is:
 
     line sockets=2 recipe=writes    writes, plain, held, bicycle, wmc or obc
-    unit label=1 number=none application=old pace=fast answers=yes
+    unit label=1 number=none application=old pace=fast answers=true
     person name=jo source=page      who has the same source shares a scanner or a page;
                                     mounted: the scanners at the sockets
 
