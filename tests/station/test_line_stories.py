@@ -188,6 +188,11 @@ STORIES = {
         " @10.35 label by=jo unit=2 ; @10.62 put unit=3 socket=B ; @13.05 label by=jo unit=3 ;"
         " @14.12 pull unit=2 ; @14.22 pull unit=3 ; @17.72 put unit=2 socket=B"
     ),
+    "a card that is dropped as the label is scanned": (
+        "line sockets=3 recipe=plain ; unit label=2 ; unit label=5 ; person name=jo ;"
+        " @3.0 put unit=2 socket=C ; @3.1 put unit=5 socket=A ; @6.5 card by=jo unit=2 ;"
+        " @22.0 label by=jo unit=2 ; @29.0 card by=jo unit=5"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

@@ -529,9 +529,7 @@ class World:
             return False
         before = len(self._answers)
         if self._scan(unit.label, person):
-            accepted = [e for e in self._answers[before:] if isinstance(e, ScanAccepted)]
-            if accepted and not accepted[-1].socket:
-                person.label = act.unit
+            self._await_card(person, act.unit, before)
         return True
 
     def _label_after_card(
@@ -548,9 +546,17 @@ class World:
             return False
         person.card = None
         before = len(self._answers)
-        if not self._scan(unit.label, person) and self._says_card_waits(before):
-            person.card = card
+        if not self._scan(unit.label, person):
+            person.card = card if self._says_card_waits(before) else None
+        else:
+            self._await_card(person, number, before)
         return True
+
+    def _await_card(self, person: PersonAtWork, number: int, before: int) -> None:
+        """The label that a person has scanned may wait for a card, and the screen says so."""
+        accepted = [each for each in self._answers[before:] if isinstance(each, ScanAccepted)]
+        if accepted and not accepted[-1].socket:
+            person.label = number
 
     def _says_card_waits(self, before: int) -> bool:
         refused = [each for each in self._answers[before:] if isinstance(each, ScanRefused)]
