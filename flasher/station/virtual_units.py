@@ -193,6 +193,7 @@ class VirtualSocket:
         self.unit: VirtualUnit | None = None
         """The one in the socket."""
         self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
+        self._exchanged: set[str] = set()
         self._returns: deque[VirtualUnit] = deque()
         """Units that were exchanged for another one in their run, and come back."""
         self._exchange_at_operation: int | None = None
@@ -281,7 +282,8 @@ class VirtualSocket:
     def _planned_exchange(self, unit: VirtualUnit) -> int | None:
         """During which operation of its flash somebody exchanges this unit; None: nobody does."""
         chance, units = _chance(self._virtual.units, "exchanged", unit.label), self._virtual.units
-        if not unit.devices or chance.random() >= units.exchanged:
+        was_exchanged = unit.label in self._exchanged
+        if not unit.devices or was_exchanged or chance.random() >= units.exchanged:
             return None
         name = next(iter(unit.devices))
         target = next(each for each in self._recipe.targets if each.name == name)
@@ -307,6 +309,7 @@ class VirtualSocket:
         pulled = None if other is None else self.take_out()
         if pulled is not None:
             self._returns.append(pulled)
+            self._exchanged.add(pulled.label)
             gap_s = _chance(self._virtual.units, "gap", pulled.label).choice(EXCHANGE_GAPS_S)
             self._in_hand, self._put_at = other, now + gap_s
             self._be_due(self._put_at)

@@ -236,3 +236,14 @@ def test_a_unit_that_is_exchanged_in_its_run_comes_back_as_it_was(tmp_path: Path
     assert socket.unit is first
     assert first.devices["bms"].stored_image is None, "torn, as it was pulled out"
     assert run_in(socket, recipe, one).code == "OK"
+
+
+def test_a_unit_is_exchanged_once_however_many_others_there_are(tmp_path: Path) -> None:
+    recipe = make_recipe(tmp_path, USUAL + WRITES)
+    socket = VirtualSocket(recipe, VirtualUnits(MockUnits(exchanged=0.5), speed=0))
+    codes: dict[str, list[str]] = {}
+    while not any(len(each) > 1 for each in codes.values()):
+        change = until_something(socket)
+        if change.is_there:
+            codes.setdefault(change.label, []).append(run_in(socket, recipe, change.label).code)
+    assert ["UNIT_CHANGED", "OK"] in codes.values()
