@@ -189,9 +189,11 @@ def disturb_runs(folder: Path, sockets: int, seed: int, trials: Trials) -> None:
             result = trial.run(recipe)
             where = f"at {share:.0%} of the flash" if share is not None else " ".join(trial.note)
             what = trial.wrong(result)
-            where = where if trial.exchange is not None else "before anything was exchanged"
+            is_early = trial.exchange is None
+            where = "before anything was exchanged" if is_early else where
+            ending = f"{result.code}: {result.text}" if is_early else result.code
             problem = f"run {number}, {kind}, {where}, {trial.gap_s} s: {what}; {result}"
-            trials.note(f"pulled {where.strip()}", result.code, [problem] if what else [])
+            trials.note(f"pulled {where.strip()}", ending, [problem] if what else [])
 
     with Units(ports, folder / "units.log") as units:
         _in_threads([lambda port=port: work(port, units) for port in ports])  # type: ignore[misc]
