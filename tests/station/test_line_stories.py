@@ -193,6 +193,23 @@ STORIES = {
         " @3.0 put unit=2 socket=C ; @3.1 put unit=5 socket=A ; @6.5 card by=jo unit=2 ;"
         " @22.0 label by=jo unit=2 ; @29.0 card by=jo unit=5"
     ),
+    "two cards at one page, of which one was dropped just now": (
+        "line sockets=2 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
+        " person name=mo ; @8.67 put unit=1 socket=B ; @13.44 put unit=2 socket=A ;"
+        " @13.48 card by=mo unit=1 ; @14.5 worker socket=B ; @14.86 card by=jo unit=2 ;"
+        " @15.09 label by=mo unit=1"
+    ),
+    "the adapter is away when a unit is missed": (
+        "line sockets=1 recipe=bicycle ; unit label=3 ; person name=jo source=jo ;"
+        " @0.0 put unit=3 socket=A ; @3.5 label by=jo unit=3 ; @24.1 pull unit=3 ;"
+        " @26.0 unplug socket=A seconds=4.0 ; @29.0 look"
+    ),
+    "a new flash after an interrupted one": (
+        "line sockets=1 ; unit label=1 pace=slow ; person name=jo source=jo ;"
+        " @36.875 label by=jo unit=1 ; @43.122 put unit=1 socket=A ; @43.665 pull unit=1 ;"
+        " @47.54 label by=jo unit=1 ; @47.548 put unit=1 socket=A ; @51.137 station seconds=1.05 ;"
+        " @60.0 label by=jo unit=1"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

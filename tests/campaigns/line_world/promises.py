@@ -136,7 +136,8 @@ class Promises:
                 unit,
                 self._number_of(unit),
                 engine.operations_done,
-                engine.stored_image is not None,
+                # One that nobody can ask is not identified with an application either.
+                engine.stored_image is not None or not engine.target.has_version_query,
             )
 
     def pulled(self, socket: str, *, was_calm: bool) -> None:
@@ -180,6 +181,7 @@ class Promises:
     def died(self) -> None:
         """The station: what it worked on is to be rechecked."""
         self._interrupted = {socket: (run.label, None) for socket, run in self._runs.items()}
+        self._changed -= {run.label for run in self._runs.values() if run.is_flashed}
         self._runs.clear()
         self._cards.clear()
         self._labels.clear()

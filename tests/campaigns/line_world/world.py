@@ -377,6 +377,9 @@ class World:
             bay = self.bays[event.socket]
             if event.meaning == "label":
                 bay.label_at = self.now
+                for person in self.people.values():
+                    if person.source == event.source:
+                        person.card = None  # the screen says that it was used
             else:
                 bay.card_at = self.now
 
@@ -494,8 +497,9 @@ class World:
             return False
         if person.label not in (None, act.unit):
             return False
-        if any(each.label is not None for each in self._sharing(person)):
-            return False  # the screen says whose card is awaited
+        sharing = self._sharing(person)
+        if any(each.label is not None or each.notices_at < inf for each in sharing):
+            return False  # the screen says whose card is awaited, or whose was dropped just now
         if self._scan(f"SOCKET {bay.name}", person):
             text = "" if bay.shown is None else bay.shown.text
             is_awaited = text.startswith(_SCAN_LABEL)
@@ -661,6 +665,7 @@ class World:
         if bay is None or not bay.bus.faults.is_plugged:
             return False
         bay.bus.unplug(back_after_s=act.seconds)
+        bay.changed_at = max(bay.changed_at, self.now + act.seconds)
         self.promises.touched(bay.name)
         bay.disturbed_at = max(bay.disturbed_at, self.now + act.seconds)
         return True
