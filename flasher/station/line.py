@@ -827,6 +827,8 @@ class Line:
         if asked is not None and not self.is_checking_pin and now >= asked.until_s:
             self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
+            if socket.out_of_service and now - socket.out_since_s >= SHORT_OUTAGE_S:
+                socket.is_last_there = False
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
                 reason = say("Its unit did not come.")

@@ -736,6 +736,18 @@ def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBen
     assert len(line.of(UnitArrived)) == 1
 
 
+def test_green_goes_in_an_outage_in_which_a_unit_can_be_exchanged(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.say("A", AdapterDown("no such device"))
+    line.bench.clock.go_on(2.0)
+    line.turn()
+    assert line.state("A") is SocketState.PASS
+    line.say("A", AdapterDown("its process ended"))
+    line.bench.clock.go_on(1.5)
+    line.turn()
+    assert line.state("A") is SocketState.ERROR
+
+
 # -- start and end --------------------------------------------------------------------------------
 
 
