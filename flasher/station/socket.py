@@ -232,7 +232,11 @@ class Socket:
             self.is_last_there = True
             return False
         says_other = self.own is not None and (last.has_said or self.is_own_known)
-        if says_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
+        # One that has passed runs its application: what only announces itself after an outage, in
+        # which nobody listened, is another one.
+        has_application = last.outcome is RunState.PASS
+        was_unheard = before is Occupancy.UNKNOWN and self.is_in_bootloader and has_application
+        if says_other or was_unheard or before in (Occupancy.SILENT, Occupancy.EMPTY):
             # Another unit; or one that was silent for a while, and does not say who it is.
             was_last, self.is_last_there = self.is_last_there, False
             return was_last or before is not Occupancy.THERE

@@ -210,6 +210,11 @@ STORIES = {
         " @47.54 label by=jo unit=1 ; @47.548 put unit=1 socket=A ; @51.137 station seconds=1.05 ;"
         " @60.0 label by=jo unit=1"
     ),
+    "exchanged for a bootloader while the process is away": (
+        "line sockets=1 ; unit label=1 application=none ; unit label=3 ; person name=al source=al ;"
+        " @3.6 put unit=3 socket=A ; @5.0 card by=al unit=3 ; @6.0 label by=al unit=3 ;"
+        " @31.5 worker socket=A ; @32.0 pull unit=3 ; @32.2 put unit=1 socket=A ; @38.0 look"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
