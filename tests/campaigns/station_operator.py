@@ -382,7 +382,7 @@ class Operator:
             return
         if self._answer == "accepted":
             if self._wants_card():
-                self._scan(f"SOCKET {place.name}")
+                self._scan_card(place)
             self._see_run(label, place, over)
 
     def _next_unit(self) -> str:
@@ -516,7 +516,7 @@ class Operator:
                 self._scan(place.unit)
         elif self._scan(place.unit):
             if way == "label, card" or self._wants_card():
-                self._scan(f"SOCKET {place.name}")
+                self._scan_card(place)
             elif self._named(place) is not place:
                 label, place.unit = place.unit, ""
                 self.units.out(label)
@@ -528,6 +528,12 @@ class Operator:
         elif free := _FREE.search(" ".join(self._said)):
             self._scan(f"FREE {free[1]}")  # it is out: here one unit of a label is in one place
         place.changed_at = time.perf_counter()
+
+    def _scan_card(self, place: Place) -> None:
+        """After its label. The card of another socket, for another unit, would be taken for it."""
+        if not self._scan(f"SOCKET {place.name}"):
+            self._scan("CANCEL")
+            self._answer = "refused"
 
     def _see_run(self, label: str, place: Place, over: Callable[[], bool]) -> None:
         """Wait until the run has begun, while the other sockets go on by themselves."""
