@@ -24,6 +24,7 @@ from flasher.mock.table import State
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC
 from flasher.station.messages import RunResult
+from flasher.station.worker import IDLE_S
 from tests.station.factory import BMS_VERSION, USUAL
 from tests.station.test_exchanges import (
     BLANK,
@@ -78,7 +79,8 @@ def stays(folder: Path, seed: int) -> tuple[str, str]:
     def save() -> None:
         until = bench.clock.now() + (chance.choice(SAVES_S) if chance.random() < 0.2 else 0.0)
         while bench.clock.now() < until:
-            bench.bus.advance(until)
+            bench.bus.advance(min(until, bench.clock.now() + IDLE_S))
+            bench.unit_run.listen_meanwhile()
 
     bench.journal.on_note = save
     result = bench.run()
@@ -114,6 +116,7 @@ def is_exchanged(folder: Path, seed: int) -> tuple[str, str]:
         while bench.clock.now() < until:
             bench.bus.advance(min(until, bench.clock.now() + 0.02))
             world.look()
+            bench.unit_run.listen_meanwhile()
 
     world.when = is_time
     bench.journal.on_note = save
