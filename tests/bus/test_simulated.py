@@ -211,12 +211,12 @@ def test_a_paced_bus_takes_the_real_time_divided_by_its_speed(
     make: Callable[[float], Clock],
 ) -> None:
     speed = 50.0
+    frames = [Frame(0x725, bytes([number % 256] * 8)) for number in range(1000)]
+    began = time.perf_counter()
     clock = make(speed)
     bus = SimulatedBus(BITRATE, clock)
-    frames = [Frame(0x725, bytes([number % 256] * 8)) for number in range(1000)]
     bus.attach(Talker(*frames))
     link = bus.link()
-    began = time.perf_counter()
     for _ in frames:
         link.receive(clock.now() + 10.0)
     took_s = time.perf_counter() - began
