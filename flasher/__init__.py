@@ -68,12 +68,6 @@ from flasher.protocol import contents
 
 __version__ = "0.1.0"
 __all__ = [
-    "flash",
-    "connect",
-    "aconnect",
-    "connect_mock",
-    "load",
-    "make_plan",
     "AsyncDevice",
     "Connection",
     "Device",
@@ -92,6 +86,12 @@ __all__ = [
     "UpgradeOptions",
     "Verification",
     "Written",
+    "aconnect",
+    "connect",
+    "connect_mock",
     "contents",
     "events",
+    "flash",
+    "load",
+    "make_plan",
 ]

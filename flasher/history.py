@@ -26,8 +26,8 @@ from platformdirs import user_data_path
 from flasher.errors import UsageError, printable
 from flasher.events import Phase
 from flasher.files import opened, owner_only
+from flasher.i18n import text
 from flasher.prose import prose_of
-from flasher.said import say
 
 SIZE_MAX: Final = 2 * 1024 * 1024
 """In bytes: beyond it the older half is dropped, some thousand flashes."""
@@ -49,14 +49,14 @@ _LEFT_IN: Final = {
 """Words of `flasher.host.outcome.DeviceLeft`, by the phase that was reached."""
 
 _TRANSFERRED: Final = {
-    True: say("transferred"),
-    False: say("not transferred"),
-    None: say("transferred not known"),
+    True: text("transferred"),
+    False: text("not transferred"),
+    None: text("transferred not known"),
 }
 _COMPLETED: Final = {
-    True: say("completed"),
-    False: say("not completed"),
-    None: say("completed not known"),
+    True: text("completed"),
+    False: text("not completed"),
+    None: text("completed not known"),
 }
 
 
@@ -114,7 +114,7 @@ class Ended:
         return (
             _TRANSFERRED[self.transferred],
             _COMPLETED[self.completed],
-            say("running {version}", version=version) if version else say("running not known"),
+            text("running {version}", version=version) if version else text("running not known"),
         )
 
 
@@ -142,8 +142,8 @@ class Flash:
     def device_left(self) -> str:
         """The state in which a flash without an end has left the device, in a sentence."""
         if self.reached is None:
-            return say("as far as is known it was not told to erase anything")
-        return say(prose_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
+            return text("as far as is known it was not told to erase anything")
+        return text(prose_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
 
     @property
     def left_device_open(self) -> bool:

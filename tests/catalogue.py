@@ -39,18 +39,21 @@ from flasher.web.translation import NAMES
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "web" / "locale"
 LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
-_METHODS: Final = [("**.py", "python"), ("web/templates/**.html", "jinja2.ext:babel_extract")]
-_OPTIONS: Final = {"web/templates/**.html": {"trimmed": "true"}}
+_PAGES: Final = "web/templates/**.html"
+_METHODS: Final = {"text": ("**.py", "python"), "_": (_PAGES, "jinja2.ext:babel_extract")}
+_OPTIONS: Final = {_PAGES: {"trimmed": "true"}}
 
 
-def said() -> Iterator[str]:
-    """Every sentence that the code or a page says in the language of who reads it."""
-    found = extract_from_dir(
-        ROOT, method_map=_METHODS, options_map=_OPTIONS, keywords={"say": None, "_": None}
-    )
-    for _, _, message, _, _ in found:
-        assert isinstance(message, str)
-        yield message
+def sentences() -> Iterator[str]:
+    """Every sentence of the code and of the pages that is shown in the reader's language."""
+    for keyword, method in _METHODS.items():
+        for name, _, message, _, _ in extract_from_dir(
+            ROOT, method_map=[method], options_map=_OPTIONS, keywords={keyword: None}
+        ):
+            # `text` of SQLAlchemy is another function
+            if keyword == "_" or "flasher.i18n" in (ROOT / name).read_text("utf-8"):
+                assert isinstance(message, str)
+                yield message
     yield from (prose(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
     explained = [
         *_EXPLANATIONS.values(),
@@ -99,7 +102,7 @@ def main() -> int:
     """Write the catalogues; returns 1 when a translation is missing."""
     missing = 0
     for language in LANGUAGES:
-        known, wanted = messages(language), sorted(set(said()))
+        known, wanted = messages(language), sorted(set(sentences()))
         made = Catalog(locale=language, project="flasher", copyright_holder="", fuzzy=False)
         for each in wanted:
             made.add(each, known.get(each, ""))

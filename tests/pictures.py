@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from playwright.sync_api import Browser, Page, expect
 
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station import codes
 from flasher.station.events import LineStopped, Progressed, ScanAccepted, ScanRefused, SocketState
 from flasher.station.records.model import StepName
@@ -39,7 +39,7 @@ def _at_work(line: LineScreen) -> None:
     line.state("2", SocketState.RUNNING, serial(12))
     line.say(Progressed("2", serial(12), StepName.FLASH, 0.62, 9.0, "bms", at=AT))
     line.state("3", SocketState.FAIL, serial(13), codes.REFUSED.action)
-    line.state("4", SocketState.SCAN, "", say("Scan the label of the unit{card}.", card=""))
+    line.state("4", SocketState.SCAN, "", text("Scan the label of the unit{card}.", card=""))
     line.say(ScanAccepted(serial(12), "label", "2", at=AT))
 
 
@@ -55,9 +55,9 @@ def _every_state(line: LineScreen) -> None:
 
 def _refused(line: LineScreen) -> None:
     _at_work(line)
-    reason = say("It was scanned already.")
-    wanted = say("Connect {label}.", label="BAT2620-0014")
-    remedy = say("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
+    reason = text("It was scanned already.")
+    wanted = text("Connect {label}.", label="BAT2620-0014")
+    remedy = text("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
     line.say(ScanRefused("BAT2620-0014", "DOUBLE_SCAN", reason, remedy, at=AT))
 
 

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 from flasher.events import CheckMade
 from flasher.host.options import firmware_version
 from flasher.host.table import Ending
+from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.image.plausible import Cpu, doubt
 from flasher.image.release import Release, target_problem
@@ -23,7 +24,6 @@ from flasher.protocol.contents import RunningInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Target
 from flasher.protocol.text import FirmwareVersion, printable
-from flasher.said import say
 
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_IN_USE_MA: Final = 1000
@@ -190,19 +190,19 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
         yield identity.refusal(Check.TARGET, problem)
     elif identity.release is not None or image.named_targets:
         has_release = identity.release is not None
-        source = say("the manifest") if has_release else say("a name inside the image")
+        source = text("the manifest") if has_release else text("a name inside the image")
         yield CheckResult(
             Check.TARGET,
             CheckVerdict.PASSED,
-            say("by {source} the image is for the {wanted}", source=source, wanted=wanted),
+            text("by {source} the image is for the {wanted}", source=source, wanted=wanted),
         )
     else:
-        text = say(
+        sentence = text(
             "no manifest, and the image names no device: nobody can tell whether it is for the "
             "{wanted}",
             wanted=wanted,
         )
-        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, text)
+        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, sentence)
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
@@ -243,43 +243,45 @@ def _untold(identity: Identity, target: Target) -> CheckResult:
     hardware = release is not None and bool(release.hardware_versions)
     previous = release is not None and release.rules_previous
     if not hardware and not previous:
-        text = say(
+        sentence = text(
             "the {node}'s application does not tell its versions: neither hardware nor downgrade "
             "can be checked",
             node=target.node.name,
         )
-        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
+        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
-    text = say(
+    sentence = text(
         "the {node}'s application does not tell its versions: the manifest's rule on {rules} "
         "cannot be checked",
         node=target.node.name,
         rules=rules,
     )
-    return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, text)
+    return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, sentence)
 
 
 def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
     release = identity.release
     if release is None or not release.hardware_versions:
-        text = say("no manifest says which hardware the image fits")
-        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
+        sentence = text("no manifest says which hardware the image fits")
+        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
-        text = say("the device does not tell its hardware; the manifest lists {fits}", fits=fits)
-        return identity.uncheckable(Check.HARDWARE, text)
+        sentence = text(
+            "the device does not tell its hardware; the manifest lists {fits}", fits=fits
+        )
+        return identity.uncheckable(Check.HARDWARE, sentence)
     if release.fits_hardware(hardware):
         return CheckResult(
             Check.HARDWARE,
             CheckVerdict.PASSED,
-            say("the manifest lists hardware {hardware}", hardware=hardware),
+            text("the manifest lists hardware {hardware}", hardware=hardware),
         )
-    text = say(
+    sentence = text(
         "the device's hardware {hardware} is not in the manifest, which lists {fits}",
         hardware=hardware,
         fits=fits,
     )
-    return identity.refusal(Check.HARDWARE, text)
+    return identity.refusal(Check.HARDWARE, sentence)
 
 
 def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckResult]:
@@ -289,30 +291,30 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
         yield from _previous(release, identity, running)
     new = new_version(image, release)
     if new is None:
-        text = say(
+        sentence = text(
             "the image names no version to compare with the running {running}", running=running
         )
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
         return
     if new == running:
         skipped = CheckVerdict.SKIPPED if identity.skip_same_version else CheckVerdict.WARNED
-        text = say("the device already runs {running}", running=running)
-        yield CheckResult(Check.SAME_VERSION, skipped, text)
+        sentence = text("the device already runs {running}", running=running)
+        yield CheckResult(Check.SAME_VERSION, skipped, sentence)
         return
     before, after = FirmwareVersion.parse(running), FirmwareVersion.parse(new)
     if before is None or after is None:
-        text = say(
+        sentence = text(
             "{running} and {new} cannot be compared: not both follow the naming rule",
             running=running,
             new=new,
         )
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
     elif after < before:
-        text = say("{new} is older than {running}, which runs now", new=new, running=running)
-        yield identity.refusal(Check.DOWNGRADE, text)
+        sentence = text("{new} is older than {running}, which runs now", new=new, running=running)
+        yield identity.refusal(Check.DOWNGRADE, sentence)
     else:
-        text = say("{new} is newer than {running}, which runs now", new=new, running=running)
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.PASSED, text)
+        sentence = text("{new} is newer than {running}, which runs now", new=new, running=running)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.PASSED, sentence)
 
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:
@@ -320,32 +322,32 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
     if not release.rules_previous:
         return
     if release.fits_previous(running):
-        text = say("the manifest lets {running} be replaced", running=running)
-        yield CheckResult(Check.PREVIOUS, CheckVerdict.PASSED, text)
+        sentence = text("the manifest lets {running} be replaced", running=running)
+        yield CheckResult(Check.PREVIOUS, CheckVerdict.PASSED, sentence)
     else:
         excluded = running in release.previous_except or release.previous_from is None
-        text = say("the device runs {running}: the manifest excludes it", running=running)
+        sentence = text("the device runs {running}: the manifest excludes it", running=running)
         if not excluded:
-            text = say(
+            sentence = text(
                 "the device runs {running}: the manifest replaces {oldest} and newer",
                 running=running,
                 oldest=release.previous_from,
             )
-        yield identity.refusal(Check.PREVIOUS, text)
+        yield identity.refusal(Check.PREVIOUS, sentence)
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
     """Charge and current; a discharging current is negative (5.1)."""
     if running.mean_current_ma < -identity.in_use_ma:
-        text = say(
+        sentence = text(
             "the battery gives {current_ma} mA, more than {limit_ma} mA",
             current_ma=-running.mean_current_ma,
             limit_ma=identity.in_use_ma,
         )
-        yield identity.refusal(Check.IN_USE, text)
+        yield identity.refusal(Check.IN_USE, sentence)
     if running.state_of_charge_percent < identity.low_charge_percent:
-        text = say(
+        sentence = text(
             "the battery is at {charge} %: charge it first, if it can wait",
             charge=running.state_of_charge_percent,
         )
-        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, text)
+        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, sentence)

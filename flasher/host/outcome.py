@@ -26,11 +26,11 @@ from flasher.errors import (
 from flasher.events import Phase
 from flasher.host import waivers
 from flasher.host.table import Ending
+from flasher.i18n import Text, text
 from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
 from flasher.prose import prose
 from flasher.protocol.spec import Target
-from flasher.said import Said, say
 
 
 class DeviceLeft(Enum):
@@ -65,15 +65,17 @@ class Statistics:
 
 def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
     """Where an upgrade stands, in words."""
-    where = say(prose(phase))
+    where = text(prose(phase))
     if packet:
-        where = say(
+        where = text(
             "{where}, packet {packet} of {packets}",
             where=where,
             packet=packet,
             packets=total_packets,
         )
-    return say("{where}, attempt {attempt}", where=where, attempt=attempt) if attempt > 1 else where
+    return (
+        text("{where}, attempt {attempt}", where=where, attempt=attempt) if attempt > 1 else where
+    )
 
 
 @dataclass(frozen=True)
@@ -139,20 +141,20 @@ class Outcome:
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
             explained = _TWO_TOLD_TO_UPDATE
         kind, cause, remedy, code = explained
-        node, ending = self.target.node.name, say(prose(self.ending))
-        what = say("{node}: {ending}.", node=node, ending=ending)
+        node, ending = self.target.node.name, text(prose(self.ending))
+        what = text("{node}: {ending}.", node=node, ending=ending)
         if self.detail:
             detail = self.detail
-            what = say("{node}: {ending} ({detail}).", node=node, ending=ending, detail=detail)
-        names = {"node": node, "boot_name": self.target.boot_name, "again": say(AGAIN)}
+            what = text("{node}: {ending} ({detail}).", node=node, ending=ending, detail=detail)
+        names = {"node": node, "boot_name": self.target.boot_name, "again": text(AGAIN)}
         error = kind(
             what,
             where=self.where,
-            cause=Said(cause, names),
-            remedy=say(
+            cause=Text(cause, names),
+            remedy=text(
                 "{remedy} State of the device: {state}.",
-                remedy=Said(remedy, names),
-                state=say(prose(self.device_left)),
+                remedy=Text(remedy, names),
+                state=text(prose(self.device_left)),
             ),
             code=code,
         )

@@ -45,12 +45,12 @@ from flasher.host.verify import (
     check_memory,
     check_version,
 )
+from flasher.i18n import text
 from flasher.image.plan import Plan
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Node, can_id
-from flasher.said import say
 
 _NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
 """Errors that a battery which switched off explains, or a computer that paused."""
@@ -263,8 +263,8 @@ class Session(Runner[Result]):
         if finding.ending is None or not finding.is_unchecked:
             return finding
         self._upgrade.unchecked = finding
-        text = say("{text}: only a device in an open session is upgraded", text=finding.text)
-        return finding._replace(verdict=CheckVerdict.WARNED, text=text)
+        sentence = text("{text}: only a device in an open session is upgraded", text=finding.text)
+        return finding._replace(verdict=CheckVerdict.WARNED, text=sentence)
 
     def _judge(self, findings: Iterable[CheckResult]) -> Result | None:
         """Report what was found; what is refused ends the session."""

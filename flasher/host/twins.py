@@ -25,6 +25,7 @@ from itertools import pairwise
 from math import inf
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY, Item, answer_of
 from flasher.protocol.fields import Content, label
@@ -34,7 +35,6 @@ from flasher.protocol.spec import COMMAND_SIZE, FRAME_DATA_SIZE, PREFIX_SIZE, Co
 from flasher.protocol.text import printable
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message
-from flasher.said import say
 
 LISTENS_ON_S: Final = 0.1
 """How much later than the first device a second one is still heard."""
@@ -301,7 +301,7 @@ class Twins:
         )
         if not self._seen or not differences:
             return self._seen
-        return say("{seen}: {differences}", seen=self._seen, differences=differences)
+        return text("{seen}: {differences}", seen=self._seen, differences=differences)
 
     def _garbled(self, damage: Damage, now: float) -> None:
         """An answer that was begun counts: two at once spoil each other."""
@@ -324,9 +324,9 @@ class Twins:
                 contents.append(content)
         self._count(question, now)
         if len(contents) > 1 and hasattr(contents[0], "firmware_version"):
-            self._see_two(say("two devices answered"))
+            self._see_two(text("two devices answered"))
         elif question.is_odd and question.key[1] == Command.GENERAL_FEEDBACK:
-            self._see_two(say("one message was confirmed twice"))
+            self._see_two(text("one message was confirmed twice"))
 
     def _count(self, question: _Question, now: float) -> None:
         if now - question.answered_at < _DOUBLED_S:
@@ -339,7 +339,7 @@ class Twins:
             question.is_odd = True
             question.odd_rounds += 1
             if question.odd_rounds > 1:
-                self._see_two(say("two devices answered"))
+                self._see_two(text("two devices answered"))
 
     # -- the upgrade ------------------------------------------------------------------------------
 
@@ -355,7 +355,7 @@ class Twins:
         else:
             self.is_beside = self.is_beside or self.announces(answer_id, now)
         if is_odd and not self._packets:
-            self._see_two(say("one message was confirmed twice"))
+            self._see_two(text("one message was confirmed twice"))
         elif is_odd:
             self._note_odd()
 
@@ -394,12 +394,12 @@ class Twins:
         if not self._was_told_to_update:
             return
         if self._is_complete and isinstance(row, _OF_A_TRANSFER):
-            self._see_two(say("one device continued a transfer that another one had completed"))
+            self._see_two(text("one device continued a transfer that another one had completed"))
         match row:
             case messages.RequestTransfer():
                 self._requested_at = min(self._requested_at, now)
                 if self._has_ack:
-                    self._lost_by = say("request transfer came again")
+                    self._lost_by = text("request transfer came again")
             case messages.Ack(number):
                 self._acknowledged(number, now)
             case messages.Nak():
@@ -407,7 +407,9 @@ class Twins:
                 self._weigh(self._packet)
             case messages.Complete():
                 if self._lost_by:
-                    self._see_two(say("{what}, yet the transfer was completed", what=self._lost_by))
+                    self._see_two(
+                        text("{what}, yet the transfer was completed", what=self._lost_by)
+                    )
                 self._is_complete = self._has_ended
 
     def _announce(self, can_id: int, boot: BootVersion, now: float) -> None:
@@ -418,23 +420,23 @@ class Twins:
         elif boot != announced.boot:
             texts = [printable(f"{each.name} {each.version}") for each in (announced.boot, boot)]
             self._see_two(
-                say("bootloaders announced {one} and {other}", one=texts[0], other=texts[1])
+                text("bootloaders announced {one} and {other}", one=texts[0], other=texts[1])
             )
         # What waits in this computer is heard before something leaves: this came after that.
         after_request_s = self._left_at - self._requested_at
         if after_request_s > self._timings.leftover_boot_version_s and not self._has_ended:
-            self._lost_by = say("a bootloader announced itself")
+            self._lost_by = text("a bootloader announced itself")
         application_at = self._application_at.get(can_id & _SENDER_MASK, -inf)
         is_between = bool(times) and times[-1] < application_at < now
         if is_between and max(application_at - times[-1], now - application_at) <= self._longest_s:
-            self._see_two(say("a bootloader announced itself while an application was running"))
+            self._see_two(text("a bootloader announced itself while an application was running"))
         gap_s = now - (times[-1] if times else announced.last_at)
         is_documented = self._shortest_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
         announced.last_at = now
         times.append(now)
         if self._alternate(list(times), is_documented=announced.is_documented):
-            self._see_two(say("two bootloaders announced themselves alternately"))
+            self._see_two(text("two bootloaders announced themselves alternately"))
 
     def _alternate(self, times: list[float], *, is_documented: bool) -> bool:
         """True when the four are those of two bootloaders; one that is twice as fast as documented
@@ -452,11 +454,11 @@ class Twins:
     def _acknowledged(self, number: int, now: float) -> None:
         self._has_ack = True
         if self._confirmed.note_ack():
-            self._see_two(say("some packets were confirmed by general feedback, others were not"))
+            self._see_two(text("some packets were confirmed by general feedback, others were not"))
         if self._lost_by:
             what = self._lost_by
             self._see_two(
-                say("{what}, yet packet {number} was acknowledged", what=what, number=number)
+                text("{what}, yet packet {number} was acknowledged", what=what, number=number)
             )
         packet = self._packets.get(number)
         if packet is None:  # never sent, or long ago
@@ -467,7 +469,7 @@ class Twins:
         packet.unacknowledged -= 1
         if packet.unacknowledged < 0 and now - packet.acked_at > _CLEARLY_APART_S:
             self._see_two(
-                say("packet {number} was acknowledged more often than it was sent", number=number)
+                text("packet {number} was acknowledged more often than it was sent", number=number)
             )
         packet.acked_at = now
         self._weigh(packet)
@@ -480,7 +482,7 @@ class Twins:
     def _note_odd(self) -> None:
         self._odd_answers += 1
         if self._odd_answers >= _ODD_ANSWERS:
-            self._see_two(say("packets were answered more often than they were sent"))
+            self._see_two(text("packets were answered more often than they were sent"))
 
     def _see_two(self, what: str) -> None:
         self._seen = self._seen or what

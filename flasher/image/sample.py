@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.errors import ErrorCode, ImageError
+from flasher.i18n import text
 from flasher.image.image import Image
-from flasher.said import say
 
 MARK: Final = b"#flasher:sample#"
 """Sixteen bytes at a multiple of sixteen: a line of a hex or S-record file has them whole."""
@@ -28,9 +28,9 @@ def is_sample(image: Image) -> bool:
 def refused_sample(image: Image, adapter: str) -> ImageError:
     """The error for a sample that was to be sent through a physical adapter. Nothing waives it."""
     return ImageError(
-        say("{image} is a firmware sample: no device can run it.", image=image.source),
-        where=say("{adapter}, a physical CAN controller or one of unknown kind", adapter=adapter),
-        cause=say("a sample was named where the firmware of the device was meant"),
-        remedy=say("Name the firmware of the device. Samples are for --mock and virtual buses."),
+        text("{image} is a firmware sample: no device can run it.", image=image.source),
+        where=text("{adapter}, a physical CAN controller or one of unknown kind", adapter=adapter),
+        cause=text("a sample was named where the firmware of the device was meant"),
+        remedy=text("Name the firmware of the device. Samples are for --mock and virtual buses."),
         code=ErrorCode.IMAGE_SAMPLE,
     )

@@ -25,7 +25,7 @@ from flasher.mock.store import MemoryMap
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
 from flasher.protocol.contents import CheckCode, Fault, PhysicalId, ProductionInformation
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.spec import (
     DIALECTS,
     MOTINOVA,
@@ -317,7 +317,7 @@ def _factory_settings(profile: DeviceProfile) -> dict[str, Content]:
         "model": contents.Model(_text(profile.model)),
         "serial number": contents.SerialNumber(_text(profile.serial_number)),
         "production information": ProductionInformation(
-            _text("WELLING", 8), _text("WUXI", 8), Text(b"20220512")
+            _text("WELLING", 8), _text("WUXI", 8), WireText(b"20220512")
         ),
         "design information": design,
         "physical id": PhysicalId(identity.ljust(PhysicalId.SIZE_BYTES, _ID_FILLER)),
@@ -328,15 +328,15 @@ def _factory_settings(profile: DeviceProfile) -> dict[str, Content]:
     }
 
 
-def _text(text: str, size_bytes: int = VERSION_FIELD_SIZE) -> Text:
-    return Text(encode_text(text, size_bytes))
+def _text(text: str, size_bytes: int = VERSION_FIELD_SIZE) -> WireText:
+    return WireText(encode_text(text, size_bytes))
 
 
-def _version_text(text: str) -> Text:
+def _version_text(text: str) -> WireText:
     """A text as a field; one that fills the field has no terminator, a longer one is cut (R20)."""
     if len(text) < VERSION_FIELD_SIZE:
         return _text(text)
-    return Text(text.encode("ascii")[:VERSION_FIELD_SIZE])
+    return WireText(text.encode("ascii")[:VERSION_FIELD_SIZE])
 
 
 def _sent_item(content: type[Content], dialect: Dialect) -> Item:

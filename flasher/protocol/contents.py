@@ -16,8 +16,8 @@ from flasher.protocol.fields import (
     Flags,
     Number,
     Numbers,
-    Text,
     TextField,
+    WireText,
     constant,
     field,
     number,
@@ -153,7 +153,7 @@ class DesignInformation(Content):
 
     design_capacity_mah: int = number(2, "mAh")
     design_voltage_v: int = number(1, "V")
-    cell_model: Text = field(TextField(8))
+    cell_model: WireText = field(TextField(8))
     reserved: bytes = reserved(5)
 
 
@@ -161,10 +161,10 @@ class DesignInformation(Content):
 class VersionInformation(Content):
     """Who the battery is and what it runs."""
 
-    model: Text = field(TextField(16))
-    serial_number: Text = field(TextField(16))
-    hardware_version: Text = field(TextField(16))
-    firmware_version: Text = field(TextField(16))
+    model: WireText = field(TextField(16))
+    serial_number: WireText = field(TextField(16))
+    hardware_version: WireText = field(TextField(16))
+    firmware_version: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,9 @@ class History(Content):
 class ProductionInformation(Content):
     """Who made the battery, where and when."""
 
-    manufacturer: Text = field(TextField(8))
-    place: Text = field(TextField(8))
-    date: Text = field(DateField())
+    manufacturer: WireText = field(TextField(8))
+    place: WireText = field(TextField(8))
+    date: WireText = field(DateField())
     reserved: bytes = reserved(8)
 
 
@@ -220,21 +220,21 @@ class ProductionInformation(Content):
 class UserString(Content):
     """A text for free use."""
 
-    text: Text = field(TextField(16))
+    text: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class Model(Content):
     """The model of version information, to be written."""
 
-    model: Text = field(TextField(16))
+    model: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class SerialNumber(Content):
     """The serial number of version information, to be written."""
 
-    serial_number: Text = field(TextField(16))
+    serial_number: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def flag_names(names: type[Bits], value: int) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Text:
+class WireText:
     """An ASCII field as it stands on the wire; `str()` is its text, escaped (R20)."""
 
     raw: bytes
@@ -157,44 +157,44 @@ class Text:
 
 @dataclass(frozen=True)
 class TextField:
-    """Text, terminator, spaces (5.1). Takes a str or a `Text`."""
+    """Text, terminator, spaces (5.1). Takes a str or a `WireText`."""
 
     size_bytes: int
     unit: str = ""
 
-    def encode(self, value: Text | str) -> bytes:
+    def encode(self, value: WireText | str) -> bytes:
         if isinstance(value, str):
             return encode_text(value, self.size_bytes)
         return _sized(value.raw, self.size_bytes)
 
-    def decode(self, raw: bytes) -> Text:
-        return Text(raw)
+    def decode(self, raw: bytes) -> WireText:
+        return WireText(raw)
 
-    def show(self, value: Text | str) -> str:
+    def show(self, value: WireText | str) -> str:
         return printable(str(value))
 
 
 @dataclass(frozen=True)
 class DateField:
     """Eight digits YYYYMMDD, without terminator. Takes a str of eight digits (whether the calendar
-    has the day is for the caller to ask) or a `Text`.
+    has the day is for the caller to ask) or a `WireText`.
     """
 
     size_bytes: int = 8
     unit: str = ""
 
-    def encode(self, value: Text | str) -> bytes:
+    def encode(self, value: WireText | str) -> bytes:
         if not isinstance(value, str):
             return _sized(value.raw, self.size_bytes)
         if len(value) != self.size_bytes or not (value.isascii() and value.isdigit()):
             raise ValueError(f"{value!a} is not YYYYMMDD")
         return value.encode("ascii")
 
-    def decode(self, raw: bytes) -> Text:
-        return Text(raw)
+    def decode(self, raw: bytes) -> WireText:
+        return WireText(raw)
 
-    def show(self, value: Text | str) -> str:
-        # Not the text of `Text`: a dot in a date is no terminator.
+    def show(self, value: WireText | str) -> str:
+        # Not the text of `WireText`: a dot in a date is no terminator.
         text = printable(value if isinstance(value, str) else value.raw.decode("latin-1")).rstrip()
         is_date = len(text) == self.size_bytes and text.isdigit()
         return f"{text[:4]}-{text[4:6]}-{text[6:]}" if is_date else text

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flasher.host.query import check_range
+from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.settings.profile import Profile
 
 
@@ -31,7 +31,7 @@ def area_of_image(image: Image) -> Area | None:
         return None
     end = image.base + image.size_bytes
     check_range(image.base, end)
-    return Area(image.base, end, say("the image {name}", name=printable(image.source)))
+    return Area(image.base, end, text("the image {name}", name=printable(image.source)))
 
 
 def area_of_profile(profile: Profile) -> Area | None:
@@ -40,4 +40,4 @@ def area_of_profile(profile: Profile) -> Area | None:
     if area is None:
         return None
     check_range(area.start, area.end)
-    return Area(area.start, area.end, say("application_area of the profile"))
+    return Area(area.start, area.end, text("application_area of the profile"))

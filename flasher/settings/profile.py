@@ -35,7 +35,7 @@ from flasher.image.image import Image
 from flasher.image.plausible import Cpu
 from flasher.protocol.catalogue import Item
 from flasher.protocol.contents import Empty, VersionInformation
-from flasher.protocol.fields import Bytes, Content, Text, TextField
+from flasher.protocol.fields import Bytes, Content, TextField, WireText
 from flasher.protocol.fields import field as wire_field
 from flasher.protocol.spec import (
     COMMAND_SIZE,
@@ -151,7 +151,7 @@ class VersionQuery:
 class VersionAnswer(Content):
     """The answer to a version query that a profile describes."""
 
-    firmware_version: Text
+    firmware_version: WireText
 
 
 def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> type[Content]:
@@ -160,7 +160,7 @@ def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> ty
         "VersionAnswer",
         [
             ("before", bytes, wire_field(Bytes(before_bytes))),
-            ("firmware_version", Text, wire_field(TextField(text_bytes))),
+            ("firmware_version", WireText, wire_field(TextField(text_bytes))),
             ("behind", bytes, wire_field(Bytes(behind_bytes))),
         ],
         bases=(VersionAnswer,),

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station import codes
 from flasher.station.events import (
     FiguresChanged,
@@ -39,27 +39,27 @@ from flasher.station.scans import Word
 from flasher.station.socket import PAGE, source_words
 
 STEPS: Final = {
-    StepName.CONNECT: say("connect"),
-    StepName.IDENTIFY: say("identify"),
-    StepName.CHECK: say("check"),
-    StepName.FLASH: say("flash"),
-    StepName.WRITE: say("write"),
-    StepName.RESTART: say("restart"),
-    StepName.VERIFY: say("verify"),
-    StepName.SAVE: say("save"),
+    StepName.CONNECT: text("connect"),
+    StepName.IDENTIFY: text("identify"),
+    StepName.CHECK: text("check"),
+    StepName.FLASH: text("flash"),
+    StepName.WRITE: text("write"),
+    StepName.RESTART: text("restart"),
+    StepName.VERIFY: text("verify"),
+    StepName.SAVE: text("save"),
 }
 """What a socket does."""
 _PAGES_MAX: Final = 100
 """Pages whose last answers are kept."""
-NO_BADGES: Final = say("No badge table: people are taken at their word.")
+NO_BADGES: Final = text("No badge table: people are taken at their word.")
 
 
 def _doing(step: StepName, target: str, try_number: int) -> str:
     words = STEPS[step]
     if target:
-        words = say("{step} {target}", step=words, target=target)
+        words = text("{step} {target}", step=words, target=target)
     if try_number > 1:
-        words = say("{step} try {number}", step=words, number=try_number)
+        words = text("{step} try {number}", step=words, number=try_number)
     return words
 
 
@@ -222,9 +222,13 @@ class Board:
             return
         self.pin_of = printable(event.person) if isinstance(event, PinAwaited) else ""
         if isinstance(event, PinAwaited):
-            text = printable(event.text)
+            sentence = printable(event.text)
             self.speak(
-                say("{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of)
+                text(
+                    "{text}: type the PIN of {name}, or scan CANCEL.",
+                    text=sentence,
+                    name=self.pin_of,
+                )
             )
 
     def _scanner(self, event: ScannerChanged) -> None:
@@ -245,40 +249,40 @@ class Board:
             row.note = self.said
 
     def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
-        text = printable(event.text)
+        sentence = printable(event.text)
         if isinstance(event, ScanRefused):
             self.refused.append(event)
             if self.waiting.get(event.text) == event.source:
                 del self.waiting[event.text]
             reason, remedy = shown(event.reason), shown(event.remedy)
-            said = say("{text}: {reason} {remedy}", text=text, reason=reason, remedy=remedy)
+            said = text("{text}: {reason} {remedy}", text=sentence, reason=reason, remedy=remedy)
             self.speak(said, event.source, is_refusal=True)
         else:
-            meaning = say(event.meaning)
+            meaning = text(event.meaning)
             if event.socket and event.meaning != Word.SOCKET.value.lower():
                 socket = printable(event.socket)
-                said = say(
+                said = text(
                     "{text}: {meaning} for socket {socket}",
-                    text=text, meaning=meaning, socket=socket,
+                    text=sentence, meaning=meaning, socket=socket,
                 )  # fmt: skip
             else:
-                said = say("{text}: {meaning}", text=text, meaning=meaning)
+                said = text("{text}: {meaning}", text=sentence, meaning=meaning)
             if event.meaning == "label" and not event.socket:
                 self.waiting[event.text] = event.source
-                said = say("{said}. {prompt}", said=said, prompt=self.prompt)
+                said = text("{said}. {prompt}", said=said, prompt=self.prompt)
             elif event.meaning == Word.CANCEL.value.lower():
                 kept = {n: source for n, source in self.waiting.items() if source != event.source}
                 self.waiting = kept
             self.speak(said, event.source)
         self.prompt = ""
 
-    def speak(self, text: str, source: str = "", *, is_refusal: bool = False) -> None:
+    def speak(self, answer: str, source: str = "", *, is_refusal: bool = False) -> None:
         """Show an answer where its scan came from; of several scanners, named."""
         if source and not source.startswith(PAGE):
             self.scanners.add(source)
             if len(self.scanners) > 1:
-                text = say("{source}: {said}", source=source_words(source), said=text)
-        self.spoken = self.spoken.with_answer(text, source, is_refusal=is_refusal)
+                answer = text("{source}: {said}", source=source_words(source), said=answer)
+        self.spoken = self.spoken.with_answer(answer, source, is_refusal=is_refusal)
 
     def _socket(self, event: StationEvent) -> None:
         if isinstance(event, RecordNotSaved):
@@ -317,9 +321,9 @@ class Board:
         if not self.virtual_sockets:
             return ""
         if len(self.virtual_sockets) == len(self.rows):
-            return say("VIRTUAL UNITS, no products.")
+            return text("VIRTUAL UNITS, no products.")
         names = ", ".join(map(printable, self.virtual_sockets))
-        return say("VIRTUAL UNITS in {names}, no products.", names=names)
+        return text("VIRTUAL UNITS in {names}, no products.", names=names)
 
     @property
     def exchanged(self) -> frozenset[str]:
@@ -336,7 +340,7 @@ class Board:
 def beside_words(event: LabelFailed | ScannerChanged) -> str:
     """What happened to a label or a scanner, and what to do."""
     if isinstance(event, LabelFailed):
-        return say(
+        return text(
             "No label for {serial}: {reason} {remedy}",
             serial=printable(event.serial),
             reason=shown(event.reason),
@@ -344,8 +348,8 @@ def beside_words(event: LabelFailed | ScannerChanged) -> str:
         )
     name = printable(event.scanner)
     if event.is_ready:
-        return say("Scanner {name} is ready.", name=name)
-    return say("Scanner {name} cannot be read: {why}", name=name, why=shown(event.reason))
+        return text("Scanner {name} is ready.", name=name)
+    return text("Scanner {name} cannot be read: {why}", name=name, why=shown(event.reason))
 
 
 def shown(text: str) -> str:

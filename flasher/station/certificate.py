@@ -16,9 +16,9 @@ from markupsafe import Markup
 
 from flasher import __version__
 from flasher.errors import UsageError
+from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
-from flasher.said import say
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.heads import Head
 from flasher.station.records.model import (
@@ -41,23 +41,23 @@ _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
 _ROW: Final = ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
 UNIT_WORDS: Final = {
-    UnitState.PASS: (Status.GOOD, say("PASS"), "This unit passed."),
-    UnitState.FAIL: (Status.BAD, say("FAIL"), "This unit did not pass: it is no good unit."),
+    UnitState.PASS: (Status.GOOD, text("PASS"), "This unit passed."),
+    UnitState.FAIL: (Status.BAD, text("FAIL"), "This unit did not pass: it is no good unit."),
     UnitState.RECHECK: (
         Status.WARNING,
-        say("RECHECK"),
+        text("RECHECK"),
         "The last run of this unit did not come to a result. It has to be checked.",
     ),
-    UnitState.RUNNING: (Status.NEUTRAL, say("RUNNING"), "This unit is being made: no result yet."),
-    UnitState.NEW: (Status.NEUTRAL, say("NEW"), "Nothing was done to this unit."),
+    UnitState.RUNNING: (Status.NEUTRAL, text("RUNNING"), "This unit is being made: no result yet."),
+    UnitState.NEW: (Status.NEUTRAL, text("NEW"), "Nothing was done to this unit."),
 }
 RUN_WORDS: Final = {
-    RunState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
-    RunState.PASS: (say("PASS"), Status.GOOD),
-    RunState.FAIL: (say("FAIL"), Status.BAD),
-    RunState.ERROR: (say("ERROR"), Status.WARNING),
-    RunState.ABORTED: (say("ABORTED"), Status.WARNING),
-    RunState.INTERRUPTED: (say("INTERRUPTED"), Status.WARNING),
+    RunState.RUNNING: (text("RUNNING"), Status.NEUTRAL),
+    RunState.PASS: (text("PASS"), Status.GOOD),
+    RunState.FAIL: (text("FAIL"), Status.BAD),
+    RunState.ERROR: (text("ERROR"), Status.WARNING),
+    RunState.ABORTED: (text("ABORTED"), Status.WARNING),
+    RunState.INTERRUPTED: (text("INTERRUPTED"), Status.WARNING),
 }
 
 

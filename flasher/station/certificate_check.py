@@ -18,8 +18,8 @@ from pydantic import ValidationError
 
 from flasher import __version__
 from flasher.errors import UsageError
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.certificate import EARLIER_SHOWN, Proof, code_lines, render_certificate
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import RunId
@@ -40,11 +40,11 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
     """
     is_pdf = data.startswith(_PDF)
     pages = list(_pages_of_pdf(data)) if is_pdf else []
-    text = "\n".join(pages) if is_pdf else data.decode("utf-8", "replace")
-    code = _CODE.search(text.replace("\r\n", "\n").strip())
+    page_text = "\n".join(pages) if is_pdf else data.decode("utf-8", "replace")
+    code = _CODE.search(page_text.replace("\r\n", "\n").strip())
     if code is not None:
         return _check_code(store, code[0])
-    sealed = sealed_in(text)
+    sealed = sealed_in(page_text)
     try:
         problems = sealed.wrong()
         life = sealed.life()
@@ -60,20 +60,22 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
         page = render_certificate(life, made_at, proof, sealed.earlier_left_out)
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
-            say("The certificate was changed: what it carries is no run."),
-            remedy=say("Ask for the certificate anew."),
+            text("The certificate was changed: what it carries is no run."),
+            remedy=text("Ask for the certificate anew."),
         ) from error
     if is_pdf:
         where = _difference_of_print(page, pages)
-    elif "<html" in text:
-        where = "" if page.encode("utf-8") == data else _difference(_text_of(page), _text_of(text))
+    elif "<html" in page_text:
+        where = (
+            "" if page.encode("utf-8") == data else _difference(_text_of(page), _text_of(page_text))
+        )
     else:
         where = ""  # the signed lines alone
     if where:
-        problems.append(say("its page was changed: {where}", where=where))
+        problems.append(text("its page was changed: {where}", where=where))
         if sealed.flasher != __version__:
             problems.append(
-                say(
+                text(
                     "it was made by flasher {other}, and this is {version}: that version tells"
                     " whether the page was changed",
                     other=printable(sealed.flasher),
@@ -112,27 +114,29 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     if head is None or (head.station, head.number, head.hash) != (
         sealed.station, sealed.row["number"], sealed.row["hash"],
     ):  # fmt: skip
-        return [say("the run is not in these records")], ()
+        return [text("the run is not in these records")], ()
     problems: list[str] = []
     if head.key != sealed.key:
-        problems.append(say("it is not signed with the key that the station had in these records"))
+        problems.append(text("it is not signed with the key that the station had in these records"))
     examined = store.examine_run(run_id)
     problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
     if problems:
         return problems, ()
     last = store.read.run(run_id)
     if sealed.life().last != last:
-        problems.append(say("it does not say what the records say of the run"))
+        problems.append(text("it does not say what the records say of the run"))
     runs = [each.run for each in store.read.unit(last.run.serial, last.run.part).runs]
     before = [plain(run) for run in runs if run.run_id < run_id]
     carried = [dict(each) for each in sealed.earlier]
     if before[-EARLIER_SHOWN:] != carried or sealed.earlier_left_out != max(
         0, len(before) - EARLIER_SHOWN
     ):
-        problems.append(say("it does not say what the records say of the earlier runs of the unit"))
+        problems.append(
+            text("it does not say what the records say of the earlier runs of the unit")
+        )
     later = [run for run in runs if run.run_id > run_id]
     remarks: tuple[str, ...] = tuple(
-        say(
+        text(
             "the unit had a later run: {run}, {day}, {state}",
             run=run.run_id,
             day=f"{run.begun_at:%Y-%m-%d}",
@@ -143,26 +147,26 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     return problems, remarks
 
 
-def _check_code(store: Store, text: str) -> CheckedCertificate:
+def _check_code(store: Store, code_text: str) -> CheckedCertificate:
     """Check the text of a QR code: it says which run, and its hashes and signature."""
-    run_line = re.search(r"\nrun (\d{1,18}) ", text)
+    run_line = re.search(r"\nrun (\d{1,18}) ", code_text)
     try:
         run_id = RunId(int(run_line[1])) if run_line else RunId(0)
         details = store.read.run(run_id)
     except NotFoundError as error:
         raise UnprovenError(
-            say("The run of this code is not in these records."),
+            text("The run of this code is not in these records."),
             cause="the code is of other records, or was changed",
         ) from error
     problems: list[str] = []
     head = store.read.head_of(run_id)
     if head is None:
-        problems.append(say("the run is not signed in these records"))
+        problems.append(text("the run is not signed in these records"))
     else:
         expected = code_lines(details, store.read.record_sha256(run_id), head)
-        found = text.split("\n")
+        found = code_text.split("\n")
         problems += [
-            say(
+            text(
                 "the code says '{said}', the records '{line}'",
                 said=printable(said),
                 line=printable(line),
@@ -171,7 +175,7 @@ def _check_code(store: Store, text: str) -> CheckedCertificate:
             if line != said
         ]
         if not is_signed(head.hash, head.signature, head.key):
-            problems.append(say("the signature in the records is not that of the station's key"))
+            problems.append(text("the signature in the records is not that of the station's key"))
     examined = store.examine_run(run_id)
     problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
     run = details.run
@@ -232,14 +236,14 @@ def _bare(text: str) -> str:
 def _difference(expected: str, found: str) -> str:
     """Where two texts differ first, in words."""
     if expected == found:
-        return say("its text is the same, its markup is another")
+        return text("its text is the same, its markup is another")
     at = next(
         (at for at, pair in enumerate(zip(expected, found, strict=False)) if pair[0] != pair[1]),
         min(len(expected), len(found)),
     )
     begin = max(0, at - _AROUND)
     said, signed = (printable(each[begin : at + _AROUND]) for each in (found, expected))
-    return say("it says '{said}', the station signed '{signed}'", said=said, signed=signed)
+    return text("it says '{said}', the station signed '{signed}'", said=said, signed=signed)
 
 
 def _difference_of_print(page: str, pages: list[str]) -> str:
@@ -253,8 +257,8 @@ def _difference_of_print(page: str, pages: list[str]) -> str:
     title = re.search(r"<title>(.*?)</title>", page, re.DOTALL)
     edge = _edge(title[1] if title else "")
     found = ""
-    for number, text in enumerate(pages):
-        lines = text.strip().split("\n")
+    for number, printed in enumerate(pages):
+        lines = printed.strip().split("\n")
         for _ in range(_EDGE_LINES):
             if lines and edge.fullmatch(lines[0].strip()):
                 del lines[0]
@@ -285,6 +289,6 @@ def _pages_of_pdf(data: bytes) -> Iterator[str]:
             yield unicodedata.normalize("NFKC", page.extract_text())
     except (PyPdfError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
         raise UsageError(
-            say("The PDF cannot be read."),
-            remedy=say("Print the certificate to a PDF in a browser, or name its HTML file."),
+            text("The PDF cannot be read."),
+            remedy=text("Print the certificate to a PDF in a browser, or name its HTML file."),
         ) from error

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from flasher.host.table import Ending
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station.records.model import RunState
 
-_NEXT: Final = say("Take the unit out.")
-_REPAIR: Final = say("Put the unit aside as bad, with this code on its tag.")
-_TECHNICIAN: Final = say("Call the technician; the unit is not judged.")
+_NEXT: Final = text("Take the unit out.")
+_REPAIR: Final = text("Put the unit aside as bad, with this code on its tag.")
+_TECHNICIAN: Final = text("Call the technician; the unit is not judged.")
 
 
 class Code(NamedTuple):
@@ -36,13 +36,13 @@ def _error(name: str, meaning: str, action: str = _TECHNICIAN, *, may_retry: boo
 
 
 OK: Final = Code(
-    "OK", RunState.PASS, say("done and verified as the recipe asks"), _NEXT, may_retry=False
+    "OK", RunState.PASS, text("done and verified as the recipe asks"), _NEXT, may_retry=False
 )
 OPERATOR_ABORT: Final = Code(
     "OPERATOR_ABORT",
     RunState.ABORTED,
-    say("a person stopped the run"),
-    say("Scan the unit again to finish it."),
+    text("a person stopped the run"),
+    text("Scan the unit again to finish it."),
     may_retry=False,
 )
 
@@ -50,104 +50,106 @@ OPERATOR_ABORT: Final = Code(
 
 NO_ANSWER: Final = _fail(
     "NO_ANSWER",
-    say("the unit does not answer"),
-    say("Check its plug and its key, then scan it again."),
+    text("the unit does not answer"),
+    text("Check its plug and its key, then scan it again."),
 )
 WRONG_HARDWARE: Final = _fail(
     "WRONG_HARDWARE",
-    say("the hardware is not one that the recipe lists"),
-    say("Put the unit aside: it belongs to another recipe."),
+    text("the hardware is not one that the recipe lists"),
+    text("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
 OLD_VERSION: Final = _fail(
     "OLD_VERSION",
-    say("the version that runs now must not be replaced by this one"),
-    say("Put the unit aside: it belongs to another recipe."),
+    text("the version that runs now must not be replaced by this one"),
+    text("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
 IN_USE: Final = _fail(
-    "IN_USE", say("the battery gives current"), say("Switch its loads off, then scan again.")
+    "IN_USE", text("the battery gives current"), text("Switch its loads off, then scan again.")
 )
 NOT_FOR_DEVICE: Final = _fail(
     "NOT_FOR_DEVICE",
-    say("the image is not meant for this device, or its bootloader is not the right one"),
-    say("Put the unit aside: it belongs to another recipe."),
+    text("the image is not meant for this device, or its bootloader is not the right one"),
+    text("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
-NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", say("its bootloader does not announce itself"))
-ERASE_FAILED: Final = _fail("ERASE_FAILED", say("the bootloader does not begin the transfer"))
-TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", say("the transfer failed"))
-REFUSED: Final = _fail("REFUSED", say("the device refused the image at the end"), may_retry=False)
-UNCONFIRMED: Final = _fail("UNCONFIRMED", say("the final answer of the bootloader never came"))
+NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", text("its bootloader does not announce itself"))
+ERASE_FAILED: Final = _fail("ERASE_FAILED", text("the bootloader does not begin the transfer"))
+TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", text("the transfer failed"))
+REFUSED: Final = _fail("REFUSED", text("the device refused the image at the end"), may_retry=False)
+UNCONFIRMED: Final = _fail("UNCONFIRMED", text("the final answer of the bootloader never came"))
 OTHER_VERSION: Final = _fail(
-    "OTHER_VERSION", say("the device runs another version than it was given")
+    "OTHER_VERSION", text("the device runs another version than it was given")
 )
-NOT_RUNNING: Final = _fail("NOT_RUNNING", say("the new application does not answer"))
-MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", say("the memory differs from the image"))
-WRITE_FAILED: Final = _fail("WRITE_FAILED", say("the device does not confirm a write"))
-WRITE_DIFFERS: Final = _fail("WRITE_DIFFERS", say("a field reads back differently than written"))
-CHANGED: Final = _fail("CHANGED", say("a field that must not change has changed"), may_retry=False)
+NOT_RUNNING: Final = _fail("NOT_RUNNING", text("the new application does not answer"))
+MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", text("the memory differs from the image"))
+WRITE_FAILED: Final = _fail("WRITE_FAILED", text("the device does not confirm a write"))
+WRITE_DIFFERS: Final = _fail("WRITE_DIFFERS", text("a field reads back differently than written"))
+CHANGED: Final = _fail("CHANGED", text("a field that must not change has changed"), may_retry=False)
 UNCHANGED_UNKNOWN: Final = _fail(
     "UNCHANGED_UNKNOWN",
-    say("a field that must not change could not be read before the first write"),
-    say("Put the unit aside: nothing was written, but it has no application to read from."),
+    text("a field that must not change could not be read before the first write"),
+    text("Put the unit aside: nothing was written, but it has no application to read from."),
     may_retry=False,
 )
-LIMIT: Final = _fail("LIMIT", say("a measurement is out of its limits"))
-TOO_SLOW: Final = _fail("TOO_SLOW", say("a step took longer than the recipe allows"))
-NO_RESTART: Final = _fail("NO_RESTART", say("the device did not restart"))
+LIMIT: Final = _fail("LIMIT", text("a measurement is out of its limits"))
+TOO_SLOW: Final = _fail("TOO_SLOW", text("a step took longer than the recipe allows"))
+NO_RESTART: Final = _fail("NO_RESTART", text("the device did not restart"))
 
 # -- the station ----------------------------------------------------------------------------------
 
 WRONG_UNIT: Final = _error(
     "WRONG_UNIT",
-    say("the unit's own serial number is not the one on the label"),
-    say("Compare label and unit: scan the label of the unit that is in the socket."),
+    text("the unit's own serial number is not the one on the label"),
+    text("Compare label and unit: scan the label of the unit that is in the socket."),
 )
 UNIT_CHANGED: Final = _error(
     "UNIT_CHANGED",
-    say("the unit in the socket may be another one than at the beginning of the run"),
-    say("Put the unit of this label into the socket, and scan the label again."),
+    text("the unit in the socket may be another one than at the beginning of the run"),
+    text("Put the unit of this label into the socket, and scan the label again."),
 )
 NOT_OBSERVED: Final = _error(
     "NOT_OBSERVED",
-    say("this computer stood still, so that it did not see whether the unit stayed in the socket"),
-    say("Scan the unit again; it is not judged."),
+    text("this computer stood still, so that it did not see whether the unit stayed in the socket"),
+    text("Scan the unit again; it is not judged."),
 )
 TWO_DEVICES: Final = _error(
     "TWO_DEVICES",
-    say("two devices of one kind answer"),
-    say("Connect one unit to this socket only."),
+    text("two devices of one kind answer"),
+    text("Connect one unit to this socket only."),
 )
 SECOND_TOOL: Final = _error(
     "SECOND_TOOL",
-    say("a second tool speaks on the bus"),
-    say("Disconnect the other tool, then scan again."),
+    text("a second tool speaks on the bus"),
+    text("Disconnect the other tool, then scan again."),
 )
 BUS: Final = _error(
     "BUS",
-    say("the adapter or the bus failed"),
-    say("Check the plugs of adapter and unit, then scan again."),
+    text("the adapter or the bus failed"),
+    text("Check the plugs of adapter and unit, then scan again."),
     may_retry=True,
 )
-POWER: Final = _error("POWER", say("the power command failed"), may_retry=True)
+POWER: Final = _error("POWER", text("the power command failed"), may_retry=True)
 CANNOT_VERIFY: Final = _error(
-    "CANNOT_VERIFY", say("a target cannot be asked, so it cannot be verified without a new flash")
+    "CANNOT_VERIFY", text("a target cannot be asked, so it cannot be verified without a new flash")
 )
-RECIPE: Final = _error("RECIPE", say("the recipe does not fit its own images or this unit"))
-RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", say("the records could not be written"))
-TRACE_NOT_SAVED: Final = _error("TRACE_NOT_SAVED", say("the trace of the bus could not be written"))
+RECIPE: Final = _error("RECIPE", text("the recipe does not fit its own images or this unit"))
+RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", text("the records could not be written"))
+TRACE_NOT_SAVED: Final = _error(
+    "TRACE_NOT_SAVED", text("the trace of the bus could not be written")
+)
 PROCESS_DIED: Final = _error(
     "PROCESS_DIED",
-    say("the process of the socket ended"),
-    say("Scan the unit again; it is not judged."),
+    text("the process of the socket ended"),
+    text("Scan the unit again; it is not judged."),
 )
 PROCESS_HUNG: Final = _error(
     "PROCESS_HUNG",
-    say("the process of the socket hung"),
-    say("Scan the unit again; it is not judged."),
+    text("the process of the socket hung"),
+    text("Scan the unit again; it is not judged."),
 )
-INTERNAL: Final = _error("INTERNAL", say("an internal error: a bug of flasher"))
+INTERNAL: Final = _error("INTERNAL", text("an internal error: a bug of flasher"))
 
 CODES: Final[Mapping[str, Code]] = {
     value.name: value for value in tuple(globals().values()) if isinstance(value, Code)

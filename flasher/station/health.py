@@ -9,8 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.board import Board
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
@@ -56,37 +56,39 @@ class Watch:
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
-        text = board.records_fault or say("every run is saved")
-        checks = [Check(say("records"), is_good=not board.records_fault, text=text)]
+        sentence = board.records_fault or text("every run is saved")
+        checks = [Check(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:
-            text = say("not printed: {names}", names=_few(board.unprinted))
-            checks.append(Check(say("labels"), is_good=False, text=text))
+            sentence = text("not printed: {names}", names=_few(board.unprinted))
+            checks.append(Check(text("labels"), is_good=False, text=sentence))
         if board.lost_scanners:
-            text = say("cannot be read: {names}", names=_few(board.lost_scanners))
-            checks.append(Check(say("scanners"), is_good=False, text=text))
+            sentence = text("cannot be read: {names}", names=_few(board.lost_scanners))
+            checks.append(Check(text("scanners"), is_good=False, text=sentence))
         if unkept := self._unkept():
-            text = say("not kept yet in: {names}", names=_few(unkept))
-            checks.append(Check(say("heads"), is_good=False, text=text))
+            sentence = text("not kept yet in: {names}", names=_few(unkept))
+            checks.append(Check(text("heads"), is_good=False, text=sentence))
         return (*checks, *self._seen)
 
     def _disk(self) -> Check:
         try:
             free = shutil.disk_usage(self._folder).free
         except OSError as error:
-            return Check(say("disk"), is_good=False, text=error.strerror or str(error))
+            return Check(text("disk"), is_good=False, text=error.strerror or str(error))
         size = f"{free / 1024**3:.1f} GiB"
-        return Check(say("disk"), is_good=free >= LITTLE_BYTES, text=say("{size} free", size=size))
+        return Check(
+            text("disk"), is_good=free >= LITTLE_BYTES, text=text("{size} free", size=size)
+        )
 
     def _clock(self) -> Check:
         shift_s = self._utc().timestamp() - self._monotonic_s() - self._offset_s
         if abs(shift_s) <= CLOCK_SHIFT_MAX_S:
-            return Check(say("clock"), is_good=True, text=say("not set since the start"))
-        text = say("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
-        return Check(say("clock"), is_good=False, text=text)
+            return Check(text("clock"), is_good=True, text=text("not set since the start"))
+        sentence = text("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
+        return Check(text("clock"), is_good=False, text=sentence)
 
 
 def _few(names: Collection[str]) -> str:
     """The first of them, and how many there are more."""
     first = ", ".join(map(printable, list(names)[:NAMES_SHOWN]))
     more = len(names) - NAMES_SHOWN
-    return say("{first} and {more} more", first=first, more=more) if more > 0 else first
+    return text("{first} and {more} more", first=first, more=more) if more > 0 else first

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.config import LabelConfig
 from flasher.station.label_template import LabelTemplate
 
@@ -72,7 +72,7 @@ class LabelPrinter:
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
-            self._done.append((job, say("Too many labels wait for the printer.")))
+            self._done.append((job, text("Too many labels wait for the printer.")))
             self._wake()
 
     def take(self) -> list[tuple[LabelJob, str]]:
@@ -98,7 +98,7 @@ class LabelPrinter:
             except NotPrinted as error:
                 reason = error.args[0]
             except Exception as error:  # noqa: BLE001  of a template: a station has to know it
-                reason = say("The label cannot be made: {why}.", why=printable(str(error))[:200])
+                reason = text("The label cannot be made: {why}.", why=printable(str(error))[:200])
             self._done.append((job, reason))
             self._wake()
 
@@ -194,7 +194,7 @@ def run_command(words: Sequence[str], data: bytes, limit_s: float) -> None:
     if done.returncode:
         said = printable(done.stderr.decode(errors="replace").strip()[-200:])
         raise NotPrinted(
-            say(
+            text(
                 "{command} ended with {code}: {said}.",
                 command=printable(shlex.join(words))[:80],
                 code=done.returncode,
@@ -204,9 +204,9 @@ def run_command(words: Sequence[str], data: bytes, limit_s: float) -> None:
 
 
 def _too_slow(limit_s: float) -> NotPrinted:
-    return NotPrinted(say("The printer took longer than {limit} s.", limit=f"{limit_s:g}"))
+    return NotPrinted(text("The printer took longer than {limit} s.", limit=f"{limit_s:g}"))
 
 
 def _unreachable(error: OSError) -> NotPrinted:
     why = printable(error.strerror or str(error))
-    return NotPrinted(say("The printer cannot be reached: {why}.", why=why))
+    return NotPrinted(text("The printer cannot be reached: {why}.", why=why))

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station import codes
 from flasher.station.events import (
     LineResumed,
@@ -84,8 +84,8 @@ _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
-_AGAIN: Final = say("Scan it again.")
-_NOTHING: Final = say("Nothing to do.")
+_AGAIN: Final = text("Scan it again.")
+_NOTHING: Final = text("Nothing to do.")
 
 
 # -- inputs and effects ---------------------------------------------------------------------------
@@ -264,9 +264,9 @@ class Line:
     def _down(self, socket: Socket, what: AdapterDown, now: float) -> None:
         if socket.can_work or not socket.out_since_s:
             socket.out_since_s = now
-        socket.out_of_service = what.reason or say("It cannot work.")
-        reason = say("Socket {socket} is out of service.", socket=socket.name)
-        self._drop_scans(socket, _FORGOTTEN, reason, say("Scan it again when it works again."))
+        socket.out_of_service = what.reason or text("It cannot work.")
+        reason = text("Socket {socket} is out of service.", socket=socket.name)
+        self._drop_scans(socket, _FORGOTTEN, reason, text("Scan it again when it works again."))
         # What happens in it cannot be seen now. What was silent before stays doubtful.
         socket.own, socket.is_own_known, socket.presence_number = None, False, 0
         if socket.occupancy is not Occupancy.SILENT:
@@ -276,16 +276,16 @@ class Line:
         """A unit is heard, reports its serial number, or is not heard any more."""
         socket.presence_number = what.number
         if not what.is_there:
-            reason = say("Its unit is not heard any more.")
-            remedy = say("Scan it again when it is connected.")
+            reason = text("Its unit is not heard any more.")
+            remedy = text("Scan it again when it is connected.")
             self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
-            code, reason = codes.UNIT_CHANGED, say("The unit was exchanged, or had no power.")
+            code, reason = codes.UNIT_CHANGED, text("The unit was exchanged, or had no power.")
             if what.was_missed and not what.is_power_up:
                 code = codes.NOT_OBSERVED
-                reason = say("This computer stood still, and did not see whether the unit stayed.")
-            remedy = say("See which unit it is, then scan again.")
+                reason = text("This computer stood still, and did not see whether the unit stayed.")
+            remedy = text("See which unit it is, then scan again.")
             self._silent(socket, now, code.name, reason, remedy, is_certain=False)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
@@ -329,7 +329,7 @@ class Line:
         if awaits:
             socket.begin_at_s = None
         if self._drop_scans(socket, code, reason, remedy, keeps_label=awaits):
-            socket.note = say("{reason} {remedy}", reason=reason, remedy=remedy)
+            socket.note = text("{reason} {remedy}", reason=reason, remedy=remedy)
             socket.note_until_s = now + NOTE_S
 
     def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
@@ -337,14 +337,14 @@ class Line:
             self._drop_label(
                 socket,
                 _FORGOTTEN,
-                say("A unit was in socket {socket} already.", socket=socket.name),
-                say("Scan it again with the card of its socket."),
+                text("A unit was in socket {socket} already.", socket=socket.name),
+                text("Scan it again with the card of its socket."),
             )
         elif borne and borne != socket.label:
-            reason = say(
+            reason = text(
                 "The unit in socket {socket} bears {label}.", socket=socket.name, label=borne
             )
-            remedy = say("Scan {label}.", label=borne)
+            remedy = text("Scan {label}.", label=borne)
             self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket, socket.source)
         else:
             # It may be one that woke up: it is asked who it is before anything begins.
@@ -355,14 +355,14 @@ class Line:
             (e for e in self.sockets.values() if e.label and e.binding is Binding.NAMED), None
         )
         if named is not None and socket.awaits_label:
-            text = say(
+            sentence = text(
                 "Wrong socket: {label} goes into socket {socket}. If it stays here, scan SOCKET"
                 " {here}, then its label.",
                 label=printable(named.label),
                 socket=named.name,
                 here=socket.name,
             )
-            self._tell(OperatorPrompted(socket.name, text, source=named.source.name))
+            self._tell(OperatorPrompted(socket.name, sentence, source=named.source.name))
 
     def _claimed(self, socket: Socket, _what: Claimed, _now: float) -> None:
         socket.phase = Phase.RUN
@@ -375,7 +375,7 @@ class Line:
     def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
         serial, socket.phase, socket.serial = socket.serial, Phase.REST, ""
         self._refuse(serial, what.code, what.reason, what.remedy, socket, socket.source)
-        socket.note = say("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
+        socket.note = text("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
         if what.stops_line:
             self.stop(what.code, what.reason, what.remedy)
 
@@ -404,9 +404,9 @@ class Line:
 
     # -- scans ------------------------------------------------------------------------------------
 
-    def scan(self, text: str, now: float, source: Source = UNNAMED) -> None:
+    def scan(self, raw: str, now: float, source: Source = UNNAMED) -> None:
         """Something was scanned at a source."""
-        scanned = text.strip()
+        scanned = raw.strip()
         crew = self._crew
         person = crew.find(scanned)
         waiting = self._waiting.setdefault(source.name, Waiting(source))
@@ -428,12 +428,12 @@ class Line:
             self._tell(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # Typed too late, or too often: it must not be shown in what is said of it.
-            reason = say("No PIN is awaited, and it is no serial number of this recipe.")
-            remedy = say("Scan first what needs the PIN.")
+            reason = text("No PIN is awaited, and it is no serial number of this recipe.")
+            remedy = text("Scan first what needs the PIN.")
             self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, remedy, source=source)
         else:
             self._answer(
-                printable(scanned)[:80], source, lambda: self._understand(text, waiting, now)
+                printable(scanned)[:80], source, lambda: self._understand(raw, waiting, now)
             )
         self._go_on(now)
 
@@ -450,9 +450,9 @@ class Line:
                 name = "" if socket is None else socket.name
                 self._tell(ScanAccepted(shown, meaning, name, source.name))
 
-    def _understand(self, text: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
+    def _understand(self, raw: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
         """What a scan means, and for which socket. Raises Refused."""
-        understood = understand(text)
+        understood = understand(raw)
         if isinstance(understood, Label):
             self._crew.check_somebody()
         was_in_doubt = waiting.is_in_doubt
@@ -472,7 +472,7 @@ class Line:
                 return word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)
             case NotUnderstood(why):
                 waiting.is_in_doubt = bool(waiting.text)  # it may have been a second card or label
-                raise Refused("NOT_UNDERSTOOD", why, say("Scan the label again."))
+                raise Refused("NOT_UNDERSTOOD", why, text("Scan the label again."))
 
     @staticmethod
     def _in_doubt(waiting: Waiting) -> Refused:
@@ -480,13 +480,13 @@ class Line:
         if not waiting.text:
             return Refused(
                 "NO_SOCKET",
-                say("The card that was scanned before it does not count."),
-                say("Scan the card of the socket that the unit is in, then the label again."),
+                text("The card that was scanned before it does not count."),
+                text("Scan the card of the socket that the unit is in, then the label again."),
             )
         return Refused(
             "CARD_WAITS" if waiting.card is not None else "LABEL_WAITS",
-            say("{text} waits, and something else was scanned after it.", text=waiting.text),
-            say("Scan {text} again, then what belongs to it; or scan CANCEL.", text=waiting.text),
+            text("{text} waits, and something else was scanned after it.", text=waiting.text),
+            text("Scan {text} again, then what belongs to it; or scan CANCEL.", text=waiting.text),
         )
 
     # -- badges and PINs --------------------------------------------------------------------------
@@ -494,11 +494,11 @@ class Line:
     def _take_pin(self, asked: Asked, scanned: str, source: Source, now: float) -> None:
         """What was scanned while a PIN is awaited: it is never shown."""
         if scanned.upper() == Word.CANCEL.value:
-            self._end_pin(asked, "CANCELLED", say("It was cancelled."), _NOTHING)
+            self._end_pin(asked, "CANCELLED", text("It was cancelled."), _NOTHING)
         elif is_form(scanned):
             name = asked.person.name
             if remedy := self._crew.lock_words(name, source, now):
-                reason = say("Too many wrong PINs of {name}.", name=printable(name))
+                reason = text("Too many wrong PINs of {name}.", name=printable(name))
                 self._refuse(HIDDEN, "PIN_LOCKED", reason, remedy, source=source)
                 return
             self._crew.count_try(name, source, now)
@@ -508,8 +508,8 @@ class Line:
             self._refuse(
                 HIDDEN,
                 "NO_PIN",
-                say("That is no PIN: it has {form}.", form=FORM_WORDS),
-                say("Type the PIN of {name}, or scan CANCEL.", name=printable(asked.person.name)),
+                text("That is no PIN: it has {form}.", form=FORM_WORDS),
+                text("Type the PIN of {name}, or scan CANCEL.", name=printable(asked.person.name)),
                 source=source,
             )
 
@@ -531,10 +531,10 @@ class Line:
                 lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)),
             )
         elif remedy := crew.lock_words(asked.person.name, source, now):
-            self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
+            self._end_pin(asked, "PIN_LOCKED", text("Too many wrong PINs."), remedy)
         else:
-            remedy = say("Type it again, or scan CANCEL.")
-            self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy, source=source)
+            remedy = text("Type it again, or scan CANCEL.")
+            self._refuse(HIDDEN, "WRONG_PIN", text("The PIN is wrong."), remedy, source=source)
         self._go_on(now)
 
     def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
@@ -558,7 +558,7 @@ class Line:
         placed = place(self.sockets, serial, waiting.source)
         for other in self._waiting.values():
             if other.label == serial and other is not waiting:  # it is where it was scanned last
-                reason = say("It was scanned elsewhere.")
+                reason = text("It was scanned elsewhere.")
                 self._drop_waiting(other, _FORGOTTEN, reason, _NOTHING)
         if placed is None:
             self._keep_waiting(serial, waiting, now)
@@ -577,7 +577,7 @@ class Line:
         self._check_takes(socket)
         self._check_for(socket, serial, source)
         if socket.label == serial:  # it scans by itself: nobody says that the unit is there
-            raise Refused("DOUBLE_SCAN", say("It was scanned already."), socket.wanted)
+            raise Refused("DOUBLE_SCAN", text("It was scanned already."), socket.wanted)
         self._take_for(socket, serial, self._waiting[source.name], now)
         return socket
 
@@ -604,7 +604,7 @@ class Line:
         for other in self._waiting.values():
             if other.label == serial:
                 other.forget()
-        reason = say(
+        reason = text(
             "Socket {socket} is for {label} now.", socket=socket.name, label=printable(serial)
         )
         for other in self._waiting.values():
@@ -623,8 +623,8 @@ class Line:
 
     def _check_line(self) -> None:
         if self.stopped is not None:
-            reason = say("The line stands: {reason}", reason=self.stopped.reason)
-            remedy = say("{remedy} Then scan RESUME.", remedy=self.stopped.remedy)
+            reason = text("The line stands: {reason}", reason=self.stopped.reason)
+            remedy = text("{remedy} Then scan RESUME.", remedy=self.stopped.remedy)
             raise Refused("LINE_STOPPED", reason, remedy)
 
     def _check_label(self, serial: str) -> None:
@@ -635,8 +635,8 @@ class Line:
         except ValueError as error:
             raise Refused(
                 Refusal.WRONG_SERIAL.value,
-                say("No serial number of this recipe: {why}.", why=str(error)),
-                say("Scan the label of the unit."),
+                text("No serial number of this recipe: {why}.", why=str(error)),
+                text("Scan the label of the unit."),
             ) from error
         check_known(self.sockets, serial)
 
@@ -644,14 +644,14 @@ class Line:
         if not any(each.can_work for each in self.sockets.values()):
             raise Refused(
                 "SOCKET_BROKEN",
-                say("No socket works."),
-                say("Mend one of them, then scan it again."),
+                text("No socket works."),
+                text("Mend one of them, then scan it again."),
             )
         waiting.label, waiting.forget_at_s = serial, now + SCAN_LIMIT_S
         shown, before = printable(serial), was_in(self.sockets, serial)
-        words = say("Scan the card of the socket that {label} is in, or goes into.", label=shown)
+        words = text("Scan the card of the socket that {label} is in, or goes into.", label=shown)
         if before is not None:
-            words = say(
+            words = text(
                 "{label} was in socket {socket}. If it is still there, scan SOCKET {socket}; else"
                 " the card of its socket.",
                 label=shown,
@@ -698,14 +698,14 @@ class Line:
     def _named(self, name: str) -> Socket:
         found = next((e for e in self.sockets.values() if e.name.lower() == name.lower()), None)
         if found is None:
-            remedy = say("There are: {sockets}.", sockets=", ".join(self.sockets))
-            raise Refused("NO_SUCH_SOCKET", say("There is no such socket."), remedy)
+            remedy = text("There are: {sockets}.", sockets=", ".join(self.sockets))
+            raise Refused("NO_SUCH_SOCKET", text("There is no such socket."), remedy)
         return found
 
     def _abort(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
         if socket.phase is not Phase.RUN:
-            reason = say("Nothing runs in socket {socket}.", socket=socket.name)
+            reason = text("Nothing runs in socket {socket}.", socket=socket.name)
             raise Refused("NOT_RUNNING", reason, _NOTHING)
         self._audit(AuditEvent.ABORT, socket=socket.name, serial=socket.serial)
         self._effects.append(AbortRun(socket.name))
@@ -714,8 +714,8 @@ class Line:
     def _free(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
         check_free(socket)
-        reason = say("Socket {socket} is free.", socket=socket.name)
-        remedy = say("Scan it again when it is connected.")
+        reason = text("Socket {socket} is free.", socket=socket.name)
+        remedy = text("Scan it again when it is connected.")
         self._drop_scans(socket, _FORGOTTEN, reason, remedy)
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
@@ -739,17 +739,17 @@ class Line:
             (
                 each.label,
                 each.source,
-                say("Scan CANCEL there, or FREE {socket}.", socket=each.name),
+                text("Scan CANCEL there, or FREE {socket}.", socket=each.name),
             )
             for each in bound
         ]
-        there = say("Scan CANCEL there.")
+        there = text("Scan CANCEL there.")
         waits += [(e.text, e.source, there) for e in self._waiting.values() if e.text]
         if waits:
-            text, source, remedy = waits[0]
-            reason = say(
+            waiting_text, source, remedy = waits[0]
+            reason = text(
                 "{text} waits, and was not scanned here ({source}).",
-                text=printable(text),
+                text=printable(waiting_text),
                 source=source_words(source.name),
             )
             raise Refused("NOTHING_WAITS", reason, remedy)
@@ -759,7 +759,7 @@ class Line:
 
     def _set_operator(self, argument: str, _now: float, _waiting: Waiting) -> None:
         if self._crew.has_badges:
-            raise Refused("BADGES", say("Here a badge says who works."), say("Scan your badge."))
+            raise Refused("BADGES", text("Here a badge says who works."), text("Scan your badge."))
         self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
         self.operator = argument
 
@@ -781,7 +781,7 @@ class Line:
 
     def _resume(self, _argument: str, _now: float, _waiting: Waiting) -> None:
         if self.stopped is None:
-            raise Refused("NOT_STOPPED", say("The line is not stopped."), _NOTHING)
+            raise Refused("NOT_STOPPED", text("The line is not stopped."), _NOTHING)
         self._audit(AuditEvent.RESUME, code=self.stopped.code)
         unsaved = [each.name for each in self.sockets.values() if each.phase is Phase.SAVE]
         self._effects.append(SaveAgain(tuple(unsaved)))
@@ -800,8 +800,8 @@ class Line:
             self._refuse(
                 word,
                 "STILL_NOT_SAVED",
-                say("It still cannot be saved."),
-                say("Mend the cause first."),
+                text("It still cannot be saved."),
+                text("Mend the cause first."),
             )
         self._go_on(now)
 
@@ -813,9 +813,9 @@ class Line:
                 self._drop_waiting(
                     waiting,
                     _FORGOTTEN,
-                    say("No card of a socket was scanned for it.")
+                    text("No card of a socket was scanned for it.")
                     if waiting.label
-                    else say("No label was scanned for it."),
+                    else text("No label was scanned for it."),
                     _AGAIN,
                 )
                 waiting.is_in_doubt = False
@@ -825,14 +825,14 @@ class Line:
                 del self._waiting[waiting.source.name]
         asked = self._crew.asked
         if asked is not None and not self.is_checking_pin and now >= asked.until_s:
-            self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
+            self._end_pin(asked, "NO_PIN", text("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
             if socket.out_of_service and now - socket.out_since_s >= SHORT_OUTAGE_S:
                 socket.is_last_there = False
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
-                reason = say("Its unit did not come.")
-                self._drop_label(socket, _FORGOTTEN, reason, say("Scan it again with its unit."))
+                reason = text("Its unit did not come.")
+                self._drop_label(socket, _FORGOTTEN, reason, text("Scan it again with its unit."))
             if socket.note_until_s is not None and now >= socket.note_until_s:
                 self._clear_drop_note(socket)
         self._go_on(now)
@@ -900,14 +900,14 @@ class Line:
 
     def _drop_unidentified(self, socket: Socket) -> None:
         reason = (
-            say(
+            text(
                 "The unit in socket {socket} is in its bootloader and cannot say who it is.",
                 socket=socket.name,
             )
             if socket.is_in_bootloader
-            else say("The unit in socket {socket} does not say who it is.", socket=socket.name)
+            else text("The unit in socket {socket} does not say who it is.", socket=socket.name)
         )
-        remedy = say("Scan SOCKET {socket}, then the label.", socket=socket.name)
+        remedy = text("Scan SOCKET {socket}, then the label.", socket=socket.name)
         self._drop_label(socket, "NOT_IDENTIFIED", reason, remedy)
 
     def _forget_card(self, waiting: Waiting) -> None:
@@ -915,8 +915,8 @@ class Line:
         card = waiting.card
         waiting.forget()
         if card is not None:
-            why = say("SOCKET {socket} was scanned, and not its label.", socket=card.name)
-            self._drop_label(card, _FORGOTTEN, why, say("Scan it again with the card."))
+            why = text("SOCKET {socket} was scanned, and not its label.", socket=card.name)
+            self._drop_label(card, _FORGOTTEN, why, text("Scan it again with the card."))
 
     @staticmethod
     def _clear_drop_note(socket: Socket) -> None:
@@ -937,8 +937,8 @@ class Line:
             return
         self.stopped = LineStopped(code, reason, remedy)
         self._tell(self.stopped)
-        reason = say("The line was stopped.")
-        self.drop_all(_FORGOTTEN, reason, say("Scan it again when it goes on."))
+        reason = text("The line was stopped.")
+        self.drop_all(_FORGOTTEN, reason, text("Scan it again when it goes on."))
 
     def _is_serial(self, text: str) -> bool:
         try:

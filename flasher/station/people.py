@@ -22,8 +22,8 @@ from typing import Any, Final
 from pydantic import Field, field_validator, model_validator
 
 from flasher.errors import Fault
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.settings.reading import Reader, Table
 from flasher.station import pins
 from flasher.station.attempts import BackOff
@@ -175,7 +175,7 @@ class Crew:
         """Raises Refused before the first badge."""
         if self.has_badges and self.person is None:
             raise Refused(
-                "NOBODY", say("Nobody has scanned a badge yet."), say("Scan your badge first.")
+                "NOBODY", text("Nobody has scanned a badge yet."), text("Scan your badge first.")
             )
 
     def check_role(self, word: Word) -> Person | None:
@@ -189,10 +189,10 @@ class Crew:
         if person is not None and person.role not in _ROLES[word]:
             raise Refused(
                 "NOT_ALLOWED",
-                say("{name} may not do that.", name=printable(person.name)),
-                say("Somebody of rework, or a supervisor, has to scan the badge first.")
+                text("{name} may not do that.", name=printable(person.name)),
+                text("Somebody of rework, or a supervisor, has to scan the badge first.")
                 if Role.REWORK in _ROLES[word]
-                else say("A supervisor has to scan the badge first."),
+                else text("A supervisor has to scan the badge first."),
             )
         return person
 
@@ -200,7 +200,7 @@ class Crew:
         """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
         if remedy := self.lock_words(person.name, source, now):
             name = printable(person.name)
-            raise Refused("PIN_LOCKED", say("Too many wrong PINs of {name}.", name=name), remedy)
+            raise Refused("PIN_LOCKED", text("Too many wrong PINs of {name}.", name=name), remedy)
         self.asked = Asked(person, word, argument, now + PIN_LIMIT_S, source)
         return self.asked
 
@@ -209,7 +209,7 @@ class Crew:
         wait_s = self._tries_of(name, source).wait_s(now)
         if wait_s == 0.0:
             return ""
-        return say("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
+        return text("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
 
     def count_try(self, name: str, source: Source, now: float) -> None:
         """A PIN of this person is going to be checked."""

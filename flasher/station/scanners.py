@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.config import ScannerConfig
 from flasher.station.events import ScannerChanged, ScanRefused, StationEvent
 from flasher.station.keys import KeyDecoder, ScanBuilder
@@ -123,8 +123,8 @@ class Scanner:
             ScanRefused(
                 "",
                 "DAMAGED",
-                say("A part of a scan of {scanner} is lost.", scanner=printable(self.config.name)),
-                say("Scan it again."),
+                text("A part of a scan of {scanner} is lost.", scanner=printable(self.config.name)),
+                text("Scan it again."),
                 self.config.socket,
                 self._source.name,
             )
@@ -159,7 +159,7 @@ def input_device(config: ScannerConfig, sys_input: Path = _SYS_INPUT) -> Path:
     for entry in sorted(sys_input.glob("event*"), key=lambda each: int(each.name[5:])):
         if config.usb_path in entry.resolve().parts and _types_text(entry):
             return _DEV_INPUT / entry.name
-    raise NoScanner(say("No scanner is plugged in at {place}.", place=config.usb_path))
+    raise NoScanner(text("No scanner is plugged in at {place}.", place=config.usb_path))
 
 
 def _types_text(entry: Path) -> bool:

@@ -31,8 +31,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
@@ -108,29 +108,29 @@ class NotUnderstood:
     why: str
 
 
-def understand(text: str) -> Label | Command | NotUnderstood:
+def understand(scan: str) -> Label | Command | NotUnderstood:
     """Parse a scan. Whether a label fits the recipe is checked later."""
-    scanned = text.strip()
+    scanned = scan.strip()
     if not scanned:
-        return NotUnderstood(say("Nothing was scanned."))
+        return NotUnderstood(text("Nothing was scanned."))
     if not scanned.isprintable() or len(scanned) > _COMMAND_MAX:
-        return NotUnderstood(say("It holds characters that no label has, or too many."))
+        return NotUnderstood(text("It holds characters that no label has, or too many."))
     first, _, rest = scanned.partition(" ")
     word = next((each for each in Word if each.value == first.upper()), None)
     if word is not None and (word in ALONE) == (not rest.strip()):
         return Command(word, rest.strip())
     if word is not None:
         return NotUnderstood(
-            say("{word} stands alone.", word=word.value)
+            text("{word} stands alone.", word=word.value)
             if word in ALONE
-            else say("{word} what?", word=word.value)
+            else text("{word} what?", word=word.value)
         )
     if len(scanned) > TEXT_MAX:
-        return NotUnderstood(say("It is longer than {most} characters.", most=TEXT_MAX))
+        return NotUnderstood(text("It is longer than {most} characters.", most=TEXT_MAX))
     return Label(scanned)
 
 
-WAIT: Final = say("Wait for its end.")
+WAIT: Final = text("Wait for its end.")
 Sockets = Mapping[str, Socket]
 
 
@@ -160,11 +160,11 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
     if starting is not None:
         raise Refused(
             "STARTING",
-            say(
+            text(
                 "Socket {socket} is still starting: it is not known what is in it.",
                 socket=starting.name,
             ),
-            say("Scan the card of the unit's socket, then the label; or wait for it."),
+            text("Scan the card of the unit's socket, then the label; or wait for it."),
         )
     may_be_in = (each.awaits_label and not each.is_of_another(serial) for each in sockets.values())
     if was_in(sockets, serial) is not None or any(may_be_in):
@@ -199,12 +199,12 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
         # It may sit in its bootloader, and announce itself at any time.
         raise Refused(
             "TAKE_OUT",
-            say(
+            text(
                 "{serial} may still be in socket {socket}.",
                 serial=printable(last.serial),
                 socket=only.name,
             ),
-            say("Take it out, scan FREE {socket}, then the label again.", socket=only.name),
+            text("Take it out, scan FREE {socket}, then the label again.", socket=only.name),
         )
     return Binding.ONLY
 
@@ -213,31 +213,31 @@ def check_free(socket: Socket) -> None:
     """Raises Refused while a run of the socket goes on, or is not saved."""
     if socket.phase is not Phase.REST:
         serial = printable(socket.serial)
-        reason = say("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
+        reason = text("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
         raise Refused(Refusal.SOCKET_BUSY.value, reason, WAIT)
 
 
 def check_service(socket: Socket) -> None:
     """Raises Refused for a socket that cannot work; one that starts will."""
     if socket.out_of_service:
-        reason = say(
+        reason = text(
             "Socket {socket} is out of service: {why}",
             socket=socket.name,
             why=socket.out_of_service,
         )
-        raise Refused("SOCKET_BROKEN", reason, say("Use another socket, or mend this one."))
+        raise Refused("SOCKET_BROKEN", reason, text("Use another socket, or mend this one."))
 
 
 def check_known(sockets: Sockets, serial: str) -> None:
     """Raises Refused for the label of a unit that runs, or has just passed."""
     for each in sockets.values():
         if each.phase is not Phase.REST and each.serial == serial:
-            reason = say("It runs in socket {socket}.", socket=each.name)
+            reason = text("It runs in socket {socket}.", socket=each.name)
             raise Refused(Refusal.UNIT_RUNNING.value, reason, WAIT)
         last = each.verdict
         if last is not None and last.serial == serial and last.outcome is RunState.PASS:
-            reason = say("It has just passed in socket {socket}.", socket=each.name)
-            raise Refused("JUST_PASSED", reason, say("Take it out, and scan the next unit."))
+            reason = text("It has just passed in socket {socket}.", socket=each.name)
+            raise Refused("JUST_PASSED", reason, text("Take it out, and scan the next unit."))
 
 
 def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
@@ -246,19 +246,19 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
     """
     for each in sockets.values():
         if each.label == serial:
-            remedy = say(
+            remedy = text(
                 "{wanted} If it is there, scan SOCKET {socket}, then the label.",
                 wanted=each.wanted,
                 socket=each.name,
             )
-            raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
+            raise Refused("DOUBLE_SCAN", text("It was scanned already."), remedy)
         if each.label and each.binding is Binding.NAMED:
             raise one_at_a_time(each.label, each.wanted, _way_out(each, waiting.source))
     label = waiting.label
     if label:
-        remedy = say("Scan the card of the socket that {label} is in.", label=printable(label))
+        remedy = text("Scan the card of the socket that {label} is in.", label=printable(label))
         if label == serial:
-            raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
+            raise Refused("DOUBLE_SCAN", text("It was scanned already."), remedy)
         raise one_at_a_time(label, remedy)
 
 
@@ -274,7 +274,7 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
             raise Refused(
                 codes.WRONG_UNIT.name,
                 _said_by(each),
-                say(
+                text(
                     "Compare the labels of the units in the sockets {one} and {other}.",
                     one=each.name,
                     other=socket.name,
@@ -284,16 +284,16 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
 
 def _said_by(socket: Socket) -> str:
     own = printable(socket.own or "")
-    return say("The unit in socket {socket} says that it is {own}.", socket=socket.name, own=own)
+    return text("The unit in socket {socket} says that it is {own}.", socket=socket.name, own=own)
 
 
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Source) -> None:
     """Raises Refused for a label that a person gave to another socket."""
     for each in sockets.values():
         if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
-            reason = say("It was scanned for socket {socket}.", socket=each.name)
+            reason = text("It was scanned for socket {socket}.", socket=each.name)
             way = _way_out(each, source)
-            remedy = say("{wanted} Or scan {way}.", wanted=each.wanted, way=way)
+            remedy = text("{wanted} Or scan {way}.", wanted=each.wanted, way=way)
             raise Refused("DOUBLE_SCAN", reason, remedy)
 
 
@@ -306,25 +306,25 @@ def card_waits(socket: Socket) -> Refused:
     """For a scan at one source that means a socket whose card was scanned at another one."""
     return Refused(
         "CARD_WAITS",
-        say("The card of socket {socket} was scanned elsewhere.", socket=socket.name),
-        say("Its label has to be scanned there, or CANCEL; then scan it here."),
+        text("The card of socket {socket} was scanned elsewhere.", socket=socket.name),
+        text("Its label has to be scanned there, or CANCEL; then scan it here."),
     )
 
 
 def one_at_a_time(label: str, wanted: str, way: str = Word.CANCEL.value) -> Refused:
     """For a label that is scanned while another one waits."""
-    reason = say("{label} was scanned before and waits for its unit.", label=printable(label))
-    return Refused("LABEL_WAITS", reason, say("{wanted} Or scan {way}.", wanted=wanted, way=way))
+    reason = text("{label} was scanned before and waits for its unit.", label=printable(label))
+    return Refused("LABEL_WAITS", reason, text("{wanted} Or scan {way}.", wanted=wanted, way=way))
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:
     """For a scan that means another unit than the one that is heard."""
     return Refused(
         "TAKE_OUT",
-        say(
+        text(
             "{serial} is still in socket {socket}.",
             serial=printable(last.serial),
             socket=socket.name,
         ),
-        say("Take it out first. If it is out, scan FREE {socket}.", socket=socket.name),
+        text("Take it out first. If it is out, scan FREE {socket}.", socket=socket.name),
     )

@@ -18,7 +18,7 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 
 from flasher.errors import UsageError
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station.records import chain
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.heads import Head
@@ -81,9 +81,9 @@ class Sealed:
         """What of it is not as the station signed it, in words; empty where all is."""
         row = self.row
         if chain.row_hash(row) != row["hash"]:
-            return [say("the audit row in it was changed")]
+            return [text("the audit row in it was changed")]
         if not is_signed(row["hash"], self.signature, self.key):
-            return [say("the signature is not that of the key in it")]
+            return [text("the signature is not that of the key in it")]
         found = {name: chain.digest(value) for name, value in self.content.items()}
         found["claim"] = chain.digest(chain.claim_of(self.content))
         words = chain.OWN | chain.NAMED
@@ -95,7 +95,7 @@ class Sealed:
         if not self.digests or row["run_id"] != self.content["run"]["id"]:
             wrong.append("which run it is about")
         return (
-            [say("it was changed after it was signed: {what}", what=", ".join(wrong))]
+            [text("it was changed after it was signed: {what}", what=", ".join(wrong))]
             if wrong
             else []
         )
@@ -193,18 +193,18 @@ def as_text(sealed: Sealed) -> str:
     return "\n".join([_BEGIN, *lines, _END])
 
 
-def sealed_in(text: str) -> Sealed:
+def sealed_in(document: str) -> Sealed:
     """What a text carries. Raises UsageError where it carries nothing, UnprovenError where that was
     changed.
     """
-    start = text.find(_BEGIN)
-    stop = text.find(_END, start)
+    start = document.find(_BEGIN)
+    stop = document.find(_END, start)
     if start < 0 or stop < 0:
         raise UsageError(
-            say("The file carries no signed certificate."),
-            remedy=say("Name a certificate as flasher wrote or printed it, with its annex."),
+            text("The file carries no signed certificate."),
+            remedy=text("Name a certificate as flasher wrote or printed it, with its annex."),
         )
-    lines = (line.strip() for line in text[start + len(_BEGIN) : stop].splitlines())
+    lines = (line.strip() for line in document[start + len(_BEGIN) : stop].splitlines())
     carried = "".join(line for line in lines if _CARRIED.fullmatch(line))
     try:
         data = base64.b64decode(carried, validate=True)
@@ -212,6 +212,6 @@ def sealed_in(text: str) -> Sealed:
         return _TYPE.validate_python(json.loads(found))
     except (binascii.Error, zlib.error, ValueError, ValidationError, RecursionError) as error:
         raise UnprovenError(
-            say("The certificate was changed: what it carries cannot be read."),
-            remedy=say("Ask for the certificate anew."),
+            text("The certificate was changed: what it carries cannot be read."),
+            remedy=text("Ask for the certificate anew."),
         ) from error

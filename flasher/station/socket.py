@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Final
 
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.events import LineStopped, SocketState
 from flasher.station.messages import PresenceChanged
 from flasher.station.records.model import RunState, UnitState
@@ -40,19 +40,19 @@ FILE: Final = Source("file of scans")
 UNNAMED: Final = Source()
 """Of a program that has one."""
 _SHOWN: Final = {
-    TERMINAL.name: say("terminal"),
-    PIPE.name: say("standard input"),
-    FILE.name: say("file of scans"),
-    UNNAMED.name: say("a program"),
+    TERMINAL.name: text("terminal"),
+    PIPE.name: text("standard input"),
+    FILE.name: text("file of scans"),
+    UNNAMED.name: text("a program"),
 }
 
 
 def source_words(name: str) -> str:
     """The name of a source for people."""
     if name.startswith(SCANNER):
-        return say("scanner {name}", name=printable(name.removeprefix(SCANNER)))
+        return text("scanner {name}", name=printable(name.removeprefix(SCANNER)))
     if name.startswith(PAGE):
-        return say("page {number}", number=printable(name.removeprefix(PAGE)))
+        return text("page {number}", number=printable(name.removeprefix(PAGE)))
     return _SHOWN.get(name, printable(name))
 
 
@@ -313,11 +313,11 @@ class Socket:
         """What its label waits for."""
         shown = printable(self.label)
         if self.binding is not Binding.NAMED:
-            return say("Connect {label}.", label=shown)
+            return text("Connect {label}.", label=shown)
         if self.verdict is not None:
             before = printable(self.verdict.serial)
-            return say("Take {before} out, then connect {label}.", before=before, label=shown)
-        return say("Put {label} into socket {socket}.", label=shown, socket=self.name)
+            return text("Take {before} out, then connect {label}.", before=before, label=shown)
+        return text("Put {label} into socket {socket}.", label=shown, socket=self.name)
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
         """What it shows; `stopped` is why the line is stopped, `is_only`: there is no other one."""
@@ -326,7 +326,7 @@ class Socket:
         if self.phase is Phase.SAVE:
             return SocketState.ERROR if self.note else SocketState.SAVING, self.serial, self.note
         if self.is_chosen:
-            words = say("Scan the label of the unit that is in this socket, or goes into it.")
+            words = text("Scan the label of the unit that is in this socket, or goes into it.")
             return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None and not self.label:
@@ -341,44 +341,44 @@ class Socket:
             own = printable(self.own or "")
             wanted = self.wanted
             if self.is_of_another(self.label):
-                wanted = say(
+                wanted = text(
                     "The unit in it says that it is {own}. {wanted}", own=own, wanted=self.wanted
                 )
             return SocketState.SCAN, self.label, wanted
         if self.is_starting:
-            return SocketState.STARTING, "", say("Listening for a unit.")
+            return SocketState.STARTING, "", text("Listening for a unit.")
         needs_card = not is_only or self.is_in_bootloader
-        card = say(" and SOCKET {socket}", socket=self.name) if needs_card else ""
+        card = text(" and SOCKET {socket}", socket=self.name) if needs_card else ""
         return self._view_free(card)
 
     def _view_free(self, card: str) -> Shown:
         """Without a label; `card` is what has to be scanned with it."""
-        borne = say(" It bears {label}.", label=printable(self.borne)) if self.borne else ""
+        borne = text(" It bears {label}.", label=printable(self.borne)) if self.borne else ""
         if self.interrupted:
-            text = say(
+            sentence = text(
                 "{serial} was interrupted here: scan its label{card}.{borne}",
                 serial=printable(self.interrupted),
                 card=card,
                 borne=borne,
             )
-            return SocketState.SCAN, self.interrupted, text
+            return SocketState.SCAN, self.interrupted, sentence
         if self.note:
-            return SocketState.SCAN, "", say("{said}{borne}", said=self.note, borne=borne)
+            return SocketState.SCAN, "", text("{said}{borne}", said=self.note, borne=borne)
         if self.is_there:
             asked = self._asked_for(card)
-            return SocketState.SCAN, "", say("{said}{borne}", said=asked, borne=borne)
+            return SocketState.SCAN, "", text("{said}{borne}", said=asked, borne=borne)
         if self.occupancy is Occupancy.EMPTY:
             return SocketState.EMPTY, "", ""
-        return SocketState.SILENT, "", say("Nothing is heard: no unit, or one that sleeps.")
+        return SocketState.SILENT, "", text("Nothing is heard: no unit, or one that sleeps.")
 
     def _asked_for(self, card: str) -> str:
         if self.is_own_known:
             own = printable(self.own or "")
-            return say("It says that it is {own}: scan its label.", own=own)
+            return text("It says that it is {own}: scan its label.", own=own)
         last = self.last
         if last is None or last.outcome is None:
-            return say("Scan the label of the unit{card}.", card=card)
-        return say(
+            return text("Scan the label of the unit{card}.", card=card)
+        return text(
             "After {state} of {serial} it was silent or without power. If this is another unit,"
             " scan its label{card}.",
             state=_state_after(last.outcome).value,

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from flasher.errors import UsageError
+from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station import codes, line, pins
 from flasher.station.codes import CODES
 from flasher.station.events import (
@@ -197,8 +197,8 @@ class Station:
         if are_mixed and self._has_badges:
             self.line.stop(
                 "VIRTUAL_MIXED",
-                say("Real and virtual units share these records."),
-                say("A supervisor has to allow it."),
+                text("Real and virtual units share these records."),
+                text("A supervisor has to allow it."),
             )
         self.turn(0.0)
 
@@ -221,8 +221,8 @@ class Station:
 
     def drop_waiting(self) -> None:
         """Drop the cards and labels that wait: no scan follows. Called in the station's thread."""
-        remedy = say("Scan it again when the station runs.")
-        self.line.drop_all(SCANS_ENDED, say("The scans have ended."), remedy)
+        remedy = text("Scan it again when the station runs.")
+        self.line.drop_all(SCANS_ENDED, text("The scans have ended."), remedy)
         self._carry_out()
 
     def stop(self) -> None:
@@ -577,8 +577,8 @@ class Station:
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
         """Print a label once more; why not, if it is refused."""
         if self._labels is None:
-            reason = say("This station has no printer.")
-            return Refused("NO_PRINTER", reason, say("Set it up in the station's file."))
+            reason = text("This station has no printer.")
+            return Refused("NO_PRINTER", reason, text("Set it up in the station's file."))
         try:
             life = self._life(serial)
             last = None if life is None else life.last
@@ -606,7 +606,7 @@ class Station:
                 self.tell(LabelPrinted(job.socket, job.serial, job.is_reprint))
 
     def _label_failed(self, socket: str, serial: str, reason: str) -> None:
-        remedy = say("Mend it, then scan REPRINT {serial}.", serial=printable(serial))
+        remedy = text("Mend it, then scan REPRINT {serial}.", serial=printable(serial))
         self.tell(LabelFailed(socket, serial, reason, remedy))
 
     def _not_saved(
@@ -618,7 +618,7 @@ class Station:
 
 
 _NOT_PASSED: Final = Refused(
-    "NOT_PASSED", say("The unit has not passed."), say("It gets a label when it has.")
+    "NOT_PASSED", text("The unit has not passed."), text("It gets a label when it has.")
 )
 
 
@@ -627,7 +627,7 @@ def _not_labelled(run: RunRecord) -> Refused | None:
     if run.state is not RunState.PASS:
         return _NOT_PASSED
     if run.is_virtual or run.kind is RunKind.GOLDEN:
-        return Refused("NO_PRODUCT", say("It is no product."), say("It gets no label."))
+        return Refused("NO_PRODUCT", text("It is no product."), text("It gets no label."))
     return None
 
 

@@ -20,9 +20,9 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
 from flasher.host.verify import Verdict, memory_check
 from flasher.host.write import WritePlan
+from flasher.i18n import text
 from flasher.prose import prose
 from flasher.protocol.fields import Content
-from flasher.said import say
 from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
 from flasher.station.power import PowerControl
@@ -286,8 +286,10 @@ class UnitSteps:
                         self._power.begin_cycle()
                     else:
                         name = target.name.upper()
-                        text = say("Switch the {target} off, wait 3 s, and on again.", target=name)
-                        self._prompt(text, wait_s)
+                        sentence = text(
+                            "Switch the {target} off, wait 3 s, and on again.", target=name
+                        )
+                        self._prompt(sentence, wait_s)
 
         is_in_bootloader = self._identified[target.name].is_in_bootloader
         options = replace(target.job.options, at_power_up=at_power_up)

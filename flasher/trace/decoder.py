@@ -25,7 +25,7 @@ from flasher.prose import prose
 from flasher.protocol import catalogue, messages
 from flasher.protocol.bittime import fixed_bits, frame_bits
 from flasher.protocol.contents import Faults
-from flasher.protocol.fields import Bits, Content, Reserved, Text, flag_names, label
+from flasher.protocol.fields import Bits, Content, Reserved, WireText, flag_names, label
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, Dialect, Mode, Node, can_id
 from flasher.protocol.text import printable
@@ -295,7 +295,7 @@ def _plain_value(value: object) -> Any:
     match value:
         case Bits():
             return flag_names(type(value), value)
-        case Text():
+        case WireText():
             return str(value)
         case str():
             return printable(value)

@@ -24,6 +24,7 @@ from flasher.host.identity import Check, DeviceAnswers, judge_device, new_versio
 from flasher.host.outcome import AGAIN
 from flasher.host.query import piece_of
 from flasher.host.told import line_of, warning_of
+from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, refused_sample
 from flasher.procedures import nobody_heard
@@ -31,7 +32,6 @@ from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.report.base import visible
-from flasher.said import say, with_value
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
@@ -47,8 +47,8 @@ NOTES_KEPT: Final = 12
 WATCH_TURN_S: Final = 0.5
 """Time between two looks at what is said on the bus: slow enough to read."""
 SUBJECT: Final = "bench"
-_AGAIN: Final = say("Begin again with the adapter.")
-_RESCUE: Final = say("Then rescue this device.")
+_AGAIN: Final = text("Begin again with the adapter.")
+_RESCUE: Final = text("Then rescue this device.")
 T = TypeVar("T")
 Order = Callable[["Bench"], object]
 """A step for the bench to carry out in its own thread."""

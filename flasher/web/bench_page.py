@@ -16,12 +16,12 @@ from starlette.routing import BaseRoute, Route
 
 from flasher.errors import UsageError
 from flasher.host.waivers import WAIVERS
+from flasher.i18n import Text, text
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
 from flasher.report.base import visible
-from flasher.said import Said, say
 from flasher.trace.decoder import Field, content_fields
 from flasher.web.bench import Bench
 from flasher.web.bench_state import Done, State
@@ -235,8 +235,8 @@ def _listed(shown: Field) -> str:
     names = shown.value if isinstance(shown.value, list) else []
     if not names or not all(isinstance(name, str) for name in names):
         return ""
-    values = {f"name_{number}": say(name) for number, name in enumerate(names)}
-    return Said(", ".join(f"{{{name}}}" for name in values), values)
+    values = {f"name_{number}": text(name) for number, name in enumerate(names)}
+    return Text(", ".join(f"{{{name}}}" for name in values), values)
 
 
 def facts(state: State) -> list[tuple[str, str]]:

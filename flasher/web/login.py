@@ -23,7 +23,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 from starlette.types import Scope
 
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station import pins
 from flasher.station.attempts import Attempts
 from flasher.station.people import Person, Role
@@ -53,9 +53,9 @@ _BADGE_MAX: Final = 300
 
 
 ROLE_WORDS: Final = {
-    Role.OPERATOR: say("operator"),
-    Role.REWORK: say("rework"),
-    Role.SUPERVISOR: say("supervisor"),
+    Role.OPERATOR: text("operator"),
+    Role.REWORK: text("rework"),
+    Role.SUPERVISOR: text("supervisor"),
 }
 
 
@@ -103,7 +103,7 @@ class _Places:
     @contextmanager
     def of(self, address: str) -> Iterator[None]:
         if self._taken.total() >= _WAITING_MAX or self._taken[address] >= _WAITING_OF_ONE_MAX:
-            trouble = say("Others are signing in at this moment. Try it again.")
+            trouble = text("Others are signing in at this moment. Try it again.")
             raise _RefusedError(trouble, 503, wait_s=1)
         self._taken[address] += 1
         try:
@@ -226,7 +226,7 @@ class Login:
             return person
         if not pin:  # a scanner ends what it types by Enter
             self._count(address, None)
-            raise _RefusedError(say("Type the PIN of the badge."), badge=code)
+            raise _RefusedError(text("Type the PIN of the badge."), badge=code)
         # Of a badge that opens nothing too, so that the time tells nothing of it.
         pin_hash = person.pin if person is not None and person.pin else badges.any_hash
         with self._places.of(address):
@@ -245,7 +245,7 @@ class Login:
         """Count a try, before it is checked. Raises _RefusedError for one too many."""
         wait_s = ceil(self._attempts.begin(address, badge, self._clock.monotonic_s()))
         if wait_s:
-            trouble = say("Too many tries: wait {seconds} s.", seconds=wait_s)
+            trouble = text("Too many tries: wait {seconds} s.", seconds=wait_s)
             raise _RefusedError(trouble, 429, wait_s=wait_s)
 
     def _wrong(self, address: str, badge: str, why: str, name: str = "") -> _RefusedError:
@@ -255,14 +255,14 @@ class Login:
         if pause_s:
             data["pause"] = f"{ceil(pause_s)} s"
         self._note(AuditEvent.SIGN_IN_REFUSED, data)
-        return _RefusedError(say("That is not it."))
+        return _RefusedError(text("That is not it."))
 
     def _check_supervisor(self, address: str, person: Person) -> None:
         """Raises _RefusedError for another role."""
         if person.role is not Role.SUPERVISOR:
             data = {"name": person.name, "address": address, "why": "no supervisor"}
             self._note(AuditEvent.SIGN_IN_REFUSED, data)
-            raise _RefusedError(say("That badge is no supervisor's."))
+            raise _RefusedError(text("That badge is no supervisor's."))
 
     def _is_for_supervisors(self, request: Request) -> bool:
         wanted = str(request.session.get("wanted", "/")).partition("?")[0]

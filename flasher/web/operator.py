@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station.board import Board, Row, Spoken
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
 from flasher.station.health import Check, Watch
@@ -43,17 +43,17 @@ LINE: Final = "/line"
 """Where the page is, and below it what it asks for."""
 
 WORDS: Final = {
-    SocketState.STARTING: say("STARTING"),
-    SocketState.EMPTY: say("EMPTY"),
-    SocketState.SILENT: say("NO UNIT?"),
-    SocketState.SCAN: say("SCAN"),
-    SocketState.RUNNING: say("RUNNING"),
-    SocketState.SAVING: say("SAVING"),
-    SocketState.PASS: say("PASS"),
-    SocketState.FAIL: say("FAIL"),
-    SocketState.RECHECK: say("RECHECK"),
-    SocketState.ERROR: say("ERROR"),
-    SocketState.STOPPED: say("STOPPED"),
+    SocketState.STARTING: text("STARTING"),
+    SocketState.EMPTY: text("EMPTY"),
+    SocketState.SILENT: text("NO UNIT?"),
+    SocketState.SCAN: text("SCAN"),
+    SocketState.RUNNING: text("RUNNING"),
+    SocketState.SAVING: text("SAVING"),
+    SocketState.PASS: text("PASS"),
+    SocketState.FAIL: text("FAIL"),
+    SocketState.RECHECK: text("RECHECK"),
+    SocketState.ERROR: text("ERROR"),
+    SocketState.STOPPED: text("STOPPED"),
 }
 """What a tile says in large letters."""
 
@@ -87,14 +87,14 @@ class Head:
     def said(self, translate: Translator, source: Source) -> dict[str, Any]:
         """The head in a language, for the page's script in the session that is this source."""
         stopped, lot, spoken = self.stopped, self.lot, self.spoken.to(source.name)
-        name = lot.name or translate(say("no lot"))
+        name = lot.name or translate(text("no lot"))
         left = max(lot.size - lot.good, 0)
         return {
             "station": self.station,
             "recipe": self.recipe,
             "part": self.part,
             "operator": translate(self.operator),
-            "lot": translate(say("{name}, {left} left"), name=name, left=left)
+            "lot": translate(text("{name}, {left} left"), name=name, left=left)
             if lot.size
             else name,
             "virtual": translate(self.virtual),
@@ -126,13 +126,13 @@ class Head:
 
 
 def _counted(count: tuple[int, int], translate: Translator) -> str:
-    return translate(say("{good} good, {bad} bad"), good=count[0], bad=count[1])
+    return translate(text("{good} good, {bad} bad"), good=count[0], bad=count[1])
 
 
 def _left(left_s: float, translate: Translator) -> str:
     whole = round(max(left_s, 0.0))
-    text = f"{whole} s" if whole < 100 else f"{whole // 60}:{whole % 60:02d} min"
-    return translate(say("{time} left"), time=text)
+    sentence = f"{whole} s" if whole < 100 else f"{whole // 60}:{whole % 60:02d} min"
+    return translate(text("{time} left"), time=sentence)
 
 
 def _tile(row: Row, translate: Translator) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def _tile(row: Row, translate: Translator) -> dict[str, Any]:
         "step": translate(row.step),
         "code": row.code,
         "line": translate(row.note),
-        "virtual": translate(say("virtual unit: no product")) if row.is_virtual else "",
+        "virtual": translate(text("virtual unit: no product")) if row.is_virtual else "",
     }
 
 

@@ -19,9 +19,9 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
 from flasher.errors import FlasherError, UsageError
+from flasher.i18n import text
 from flasher.report.chart import WIDTHS, histogram
 from flasher.report.explain_page import status_of, told
-from flasher.said import say
 from flasher.station import codes
 from flasher.station.certificate import (
     RUN_WORDS,
@@ -73,22 +73,22 @@ SPANS_MAX: Final = 400
 CHECK: Final = "/certificate"
 """The page that takes a certificate."""
 _NAMES: Final = {
-    "/runs": say("Runs"),
-    "/units": say("Units"),
-    "/yield": say("Yield and causes"),
-    "/times": say("Times"),
-    "/images": say("Images"),
-    "/audit": say("Audit trail"),
-    CHECK: say("Check a certificate"),
+    "/runs": text("Runs"),
+    "/units": text("Units"),
+    "/yield": text("Yield and causes"),
+    "/times": text("Times"),
+    "/images": text("Images"),
+    "/audit": text("Audit trail"),
+    CHECK: text("Check a certificate"),
 }
 """The menu."""
-_SIGN_INS: Final = {"/sign-ins": say("Sign-ins")}
+_SIGN_INS: Final = {"/sign-ins": text("Sign-ins")}
 """What it has besides where people sign in."""
 BY_WORDS: Final = {
-    By.SOCKET: say("socket"),
-    By.RECIPE: say("recipe"),
-    By.LOT: say("lot"),
-    By.SHIFT: say("shift"),
+    By.SOCKET: text("socket"),
+    By.RECIPE: text("recipe"),
+    By.LOT: text("lot"),
+    By.SHIFT: text("shift"),
 }
 PART_SIZE: Final = 2000
 """Rows of a file that are read at once."""
@@ -317,7 +317,7 @@ class Supervisor:
             name_of=_name_of,
             whole=whole,
             chart=lines(
-                said(say("Yield over time")),
+                said(text("Yield over time")),
                 [_name_of(row.span).removeprefix(f"{span.end.astimezone():%Y-}") for row in rows],
                 {
                     "end": [100 * (row.share or 0) for row in rows],
@@ -332,7 +332,7 @@ class Supervisor:
             groups=groups,
             causes=causes,
             causes_chart=stacked_bars(
-                said(say("Causes")),
+                said(text("Causes")),
                 [row.code for row in causes[:CAUSES_DRAWN]],
                 {
                     f"{at} {group}": [row.counts[at] for row in causes[:CAUSES_DRAWN]]
@@ -365,8 +365,8 @@ class Supervisor:
             meaning = codes.CODES[code].meaning if code in codes.CODES else ""
             share = so_far / everything
             rows.append(PartOfCauses(code, meaning, tuple(shown), counts.total(), share))
-        names = [name or said(say("no lot")) for name in sorted(kept)]
-        return [*names, *([said(say("others"))] if has_others else [])], rows
+        names = [name or said(text("no lot")) for name in sorted(kept)]
+        return [*names, *([said(text("others"))] if has_others else [])], rows
 
     def times(self, question: Question) -> Answer:
         chosen, span = self._figured(question)

@@ -12,7 +12,7 @@ from typing import Final
 from babel.messages.mofile import write_mo
 from babel.messages.pofile import read_po
 
-from flasher.said import in_language
+from flasher.i18n import translate
 
 NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
 """The languages by their codes, each by its own name. English needs no catalogue."""
@@ -27,7 +27,7 @@ class Translator:
 
     def __call__(self, text: str, **values: object) -> str:
         """A text of a page or of the station in this language; `values` for a page's own."""
-        said = in_language(text, self._translate)
+        said = translate(text, self._translate)
         return said.format(**values) if values else said
 
 

@@ -13,13 +13,13 @@ from flasher.api import Connection, Job
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.link import Clock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
+from flasher.i18n import text
 from flasher.mock.clients import ClientApplication
 from flasher.mock.faults import AtTime, FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
-from flasher.said import say
 
 _ONE_FAULT: Final = 1 << 3
 _HAND_S: Final = 2.0
@@ -43,14 +43,14 @@ class Fault(Enum):
 
 
 NOTES: Final = {
-    Fault.NONE: say("nothing is wrong with it"),
-    Fault.POWER: say("loses its power in the middle of the upgrade"),
-    Fault.PULLED: say("the adapter is pulled out in the middle of the upgrade"),
-    Fault.SECOND_TOOL: say("a second tool speaks in the middle of the upgrade"),
-    Fault.REFUSES: say("its devices refuse the image at the end"),
-    Fault.HARDWARE: say("has other hardware, and reports a fault"),
-    Fault.NO_APPLICATION: say("its upgrade was interrupted: its devices do not start"),
-    Fault.OFF: say("is switched off"),
+    Fault.NONE: text("nothing is wrong with it"),
+    Fault.POWER: text("loses its power in the middle of the upgrade"),
+    Fault.PULLED: text("the adapter is pulled out in the middle of the upgrade"),
+    Fault.SECOND_TOOL: text("a second tool speaks in the middle of the upgrade"),
+    Fault.REFUSES: text("its devices refuse the image at the end"),
+    Fault.HARDWARE: text("has other hardware, and reports a fault"),
+    Fault.NO_APPLICATION: text("its upgrade was interrupted: its devices do not start"),
+    Fault.OFF: text("is switched off"),
 }
 
 

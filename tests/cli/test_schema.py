@@ -19,7 +19,7 @@ from flasher.cli.main import COMMANDS
 from flasher.cli.output import Output
 from flasher.cli.schema import build, command_modules, event_classes
 from flasher.protocol.contents import UserString
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from tests import schema_document
 from tests.cli.conftest import SAMPLES, Flasher
 
@@ -256,7 +256,7 @@ def sample(hint: Any) -> Any:
     if get_origin(hint) is tuple:
         return (sample(get_args(hint)[0]),) * 2
     if hint is object:
-        return UserString(Text(b"a\x1b"))
+        return UserString(WireText(b"a\x1b"))
     return {int: 7, float: 0.5, bool: True, str: "text", bytes: b"\x00\xff"}[hint]
 
 

@@ -11,7 +11,7 @@ from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.contents import RunningInformation, Status, VersionInformation
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
@@ -26,7 +26,7 @@ BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, byte
 
 def version(serial: str = "W1", firmware: str = "V1r0r0_20220512") -> VersionInformation:
     texts = ("BM36", serial, "V1r2r0_20220512", firmware)
-    return VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+    return VersionInformation(*(WireText(encode_text(text, 16)) for text in texts))
 
 
 class Asked:

@@ -22,7 +22,7 @@ from flasher.image.image import Image
 from flasher.image.plausible import Cpu
 from flasher.image.release import Release
 from flasher.protocol.contents import RunningInformation, Status, VersionInformation
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.protocol.text import encode_text
 from flasher.settings.manifest import release_of
@@ -41,7 +41,7 @@ def release(**stated: object) -> Release:
 
 def seen(firmware: str = OLD, hardware: str = "V1r2r0_20220512") -> DeviceAnswers:
     texts = ("BM36", "W1", hardware, firmware)
-    return DeviceAnswers(VersionInformation(*(Text(encode_text(text, 16)) for text in texts)))
+    return DeviceAnswers(VersionInformation(*(WireText(encode_text(text, 16)) for text in texts)))
 
 
 def verdicts(findings: Iterable[CheckResult]) -> list[tuple[Check, CheckVerdict]]:
@@ -160,7 +160,7 @@ def test_what_a_device_tells_is_shown_escaped() -> None:
         b"\x1b[31mred\x07.".ljust(16),
         b"V\x1b[2J.".ljust(16),
     )
-    device = DeviceAnswers(VersionInformation(*map(Text, texts)))
+    device = DeviceAnswers(VersionInformation(*map(WireText, texts)))
     said = [
         found.text
         for found in judge_device(IMAGE, BMS, Identity(release(hardware_versions=("V1*",))), device)

@@ -29,7 +29,7 @@ from flasher.image.plan import Plan, plan
 from flasher.mock.model import MockDevice
 from flasher.protocol import catalogue
 from flasher.protocol.contents import Memory, ReadMemory, VersionInformation
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from flasher.protocol.text import encode_text
@@ -292,7 +292,7 @@ def test_an_application_that_starts_slowly_is_waited_for() -> None:
     application = Application(check)
     while application.now < 53.0:
         assert application.next_question() is not None
-    texts = [Text(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW)]
+    texts = [WireText(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW)]
     application.answer(VERSION, VersionInformation(*texts))
     assert application.next_question() is not None, "it is asked again, to count its answers"
     application.answer(VERSION, VersionInformation(*texts))

@@ -17,7 +17,7 @@ from flasher.host.table import Ending, State
 from flasher.host.upgrade import Upgrade, UpgradeStage
 from flasher.image.image import Image
 from flasher.image.plan import plan
-from flasher.protocol.fields import Content, Text, TextField, field
+from flasher.protocol.fields import Content, TextField, WireText, field
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC
 from flasher.protocol.text import encode_text
@@ -111,12 +111,12 @@ def test_a_target_without_a_version_query_cannot_be_asked() -> None:
 class OnlyFirmware(Content):
     """What a version query of a product's own may answer: no hardware in it."""
 
-    firmware_version: Text = field(TextField(16))  # noqa: RUF009  as in contents
+    firmware_version: WireText = field(TextField(16))  # noqa: RUF009  as in contents
 
 
 def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
-    told = DeviceAnswers(OnlyFirmware(Text(encode_text("V1r0r0_20220512", 16))))
+    told = DeviceAnswers(OnlyFirmware(WireText(encode_text("V1r0r0_20220512", 16))))
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))
     hardware = next(found for found in findings if found.check is Check.HARDWARE)
     assert hardware.verdict is CheckVerdict.REFUSED

@@ -23,7 +23,7 @@ from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import RunningInformation, Shutdown, Status, VersionInformation
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     Ack,
@@ -56,7 +56,7 @@ SHUTDOWN = next(item for item in catalogue.ITEMS if item.content is Shutdown)
 
 def version(firmware: str = OLD, serial: str = "W1") -> VersionInformation:
     texts = ("BM36", serial, "V1r2r0_20220512", firmware)
-    return VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+    return VersionInformation(*(WireText(encode_text(text, 16)) for text in texts))
 
 
 class Dialogue(Bench):

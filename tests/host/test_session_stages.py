@@ -22,7 +22,7 @@ from flasher.mock.model import MockDevice
 from flasher.prose import prose
 from flasher.protocol import catalogue
 from flasher.protocol.contents import VersionInformation
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import encode_text
@@ -360,7 +360,7 @@ class LateTwin(Speaker):
         self._delay_s = delay_s
         answer = catalogue.BY_KEY[(0x720, 0x1540)]
         texts = (TWIN.model, TWIN.serial_number, TWIN.hardware_version, TWIN.factory_version)
-        fields = (Text(encode_text(text, 16)) for text in texts)
+        fields = (WireText(encode_text(text, 16)) for text in texts)
         frames = split(0x720, encode(catalogue.encode(answer, VersionInformation(*fields))))
         super().__init__(*frames, every_s=0.0006, begins_at=NEVER)
 

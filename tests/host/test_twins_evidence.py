@@ -13,7 +13,7 @@ from flasher.protocol.contents import (
     Status,
     VersionInformation,
 )
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     Ack,
@@ -55,7 +55,7 @@ ALTERNATELY = "two bootloaders announced themselves alternately"
 
 def version(serial: str = "W1", firmware: str = "V1r0r0_20220512") -> VersionInformation:
     texts = ("BM36", serial, "V1r2r0_20220512", firmware)
-    return VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+    return VersionInformation(*(WireText(encode_text(text, 16)) for text in texts))
 
 
 class Watch:

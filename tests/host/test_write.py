@@ -7,7 +7,7 @@ import pytest
 from flasher.errors import ErrorCode, UsageError
 from flasher.host.write import Written, plan_write
 from flasher.protocol.contents import CheckCode, ProductionInformation
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.spec import BMS
 from tests.loops import each
 
@@ -73,4 +73,7 @@ def test_only_the_manufacturer_writes_what_the_document_reserves_for_him() -> No
         plan_write("model", ["BM48"])
     plan = plan_write("model", ["BM48"], manufacturer=True)
     assert (plan.target, plan.content.data()) == (BMS, b"BM48.           ")
-    assert plan_write("model", [Text(b"BM48" * 4)], manufacturer=True).content.data() == b"BM48" * 4
+    assert (
+        plan_write("model", [WireText(b"BM48" * 4)], manufacturer=True).content.data()
+        == b"BM48" * 4
+    )

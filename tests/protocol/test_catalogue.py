@@ -20,7 +20,7 @@ from flasher.protocol.catalogue import (
     encode,
     has_message,
 )
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from flasher.protocol.spec import (
     DIALECTS,
     HEADER,
@@ -403,16 +403,16 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         ),
         (
             (0x720, 0x1410),
-            contents.DesignInformation(10000, 36, Text(b"21700A. ")),
+            contents.DesignInformation(10000, 36, WireText(b"21700A. ")),
             "design: 10000 mAh, 36 V, cell model 21700A",
         ),
         (
             (0x720, 0x1540),
             contents.VersionInformation(
-                Text(b"BM36.           "),
-                Text(b"W2605001.       "),
-                Text(b"V1r2r0_20220512."),
-                Text(b"V1r2r3_20220512."),
+                WireText(b"BM36.           "),
+                WireText(b"W2605001.       "),
+                WireText(b"V1r2r0_20220512."),
+                WireText(b"V1r2r3_20220512."),
             ),
             "version: BM36, W2605001, V1r2r0_20220512, V1r2r3_20220512",
         ),
@@ -428,7 +428,9 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         ),
         (
             (0x725, 0x5120),
-            contents.ProductionInformation(Text(b"WELLING."), Text(b"WUXI.   "), Text(b"20220512")),
+            contents.ProductionInformation(
+                WireText(b"WELLING."), WireText(b"WUXI.   "), WireText(b"20220512")
+            ),
             "production: WELLING, WUXI, 2022-05-12",
         ),
         (
@@ -450,7 +452,7 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         ((0x752, 0x3300), contents.Empty(), "CDL asks version"),
         (
             (0x752, 0x4110),
-            contents.SerialNumber(Text(b"W2605001.       ")),
+            contents.SerialNumber(WireText(b"W2605001.       ")),
             "CDL writes serial number W2605001",
         ),
         ((0x752, 0x4205), contents.Reset(), "bms reset"),
@@ -489,7 +491,7 @@ def test_the_content_of_another_message_is_refused(content: Content) -> None:
 
 
 def test_the_content_of_another_message_of_the_same_size_is_refused() -> None:
-    serial_number = contents.SerialNumber(Text(b"W2605001.       "))
+    serial_number = contents.SerialNumber(WireText(b"W2605001.       "))
     with pytest.raises(ValueError, match=r"carries Model, not SerialNumber"):
         encode(BY_KEY[0x752, 0x4010], serial_number)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.contents import Fault, Status
-from flasher.protocol.fields import Content, Text
+from flasher.protocol.fields import Content, WireText
 from tests.loops import each
 
 CONTENTS: Final = sorted({item.content for item in ITEMS}, key=lambda content: content.__name__)
@@ -83,31 +83,31 @@ EXAMPLES: Final[list[tuple[str, Content, bytes]]] = [
     ("faults with all bits set", contents.Faults(Fault(0xFFFFFFFF)), wire("FF FF FF FF")),
     (
         "design information",
-        contents.DesignInformation(14000, 48, Text(b"INR18. \x20")),
+        contents.DesignInformation(14000, 48, WireText(b"INR18. \x20")),
         wire("B0 36", "30", "49 4E 52 31 38 2E 20 20", "00 00 00 00 00"),
     ),
     (
         "design information, highest values, cell model without terminator",
-        contents.DesignInformation(65535, 255, Text(b"ABCDEFGH"), b"\x05\x04\x03\x02\x01"),
+        contents.DesignInformation(65535, 255, WireText(b"ABCDEFGH"), b"\x05\x04\x03\x02\x01"),
         wire("FF FF", "FF", "41 42 43 44 45 46 47 48", "05 04 03 02 01"),
     ),
     (
         "version information, both versions filling their fields to the terminator",
         contents.VersionInformation(
-            Text(b"BM36.           "),
-            Text(b"."+ b" " * 15),
-            Text(b"V1r2r0_20220512."),
-            Text(b"V9r9r9_20261231."),
+            WireText(b"BM36.           "),
+            WireText(b"."+ b" " * 15),
+            WireText(b"V1r2r0_20220512."),
+            WireText(b"V9r9r9_20261231."),
         ),
         b"BM36.           .               V1r2r0_20220512.V9r9r9_20261231.",
     ),
     (
         "version information, full field, no terminator, non-ASCII, zeros",
         contents.VersionInformation(
-            Text(b"ABCDEFGHIJKLMNOP"),
-            Text(b"W2605001        "),
-            Text(b"\xe9\x1b[2J" + b"\xff" * 11),
-            Text(bytes(16)),
+            WireText(b"ABCDEFGHIJKLMNOP"),
+            WireText(b"W2605001        "),
+            WireText(b"\xe9\x1b[2J" + b"\xff" * 11),
+            WireText(bytes(16)),
         ),
         b"ABCDEFGHIJKLMNOPW2605001        \xe9\x1b[2J" + b"\xff" * 11 + bytes(16),
     ),
@@ -144,23 +144,25 @@ EXAMPLES: Final[list[tuple[str, Content, bytes]]] = [
     ),
     (
         "production information",
-        contents.ProductionInformation(Text(b"WELLING."), Text(b"FOSHAN. "), Text(b"20240229")),
+        contents.ProductionInformation(
+            WireText(b"WELLING."), WireText(b"FOSHAN. "), WireText(b"20240229")
+        ),
         b"WELLING.FOSHAN. 20240229" + bytes(8),
     ),
     (
         "production information, full fields, a date that is none, reserved bytes set",
         contents.ProductionInformation(
-            Text(b"ABCDEFGH"), Text(b"\x00" * 8), Text(b"2024-2-9"), b"RESERVED"
+            WireText(b"ABCDEFGH"), WireText(b"\x00" * 8), WireText(b"2024-2-9"), b"RESERVED"
         ),
         b"ABCDEFGH\x00\x00\x00\x00\x00\x00\x00\x002024-2-9RESERVED",
     ),
     (
         "user string of 15 characters",
-        contents.UserString(Text(b"FIFTEEN LETTERS.")),
+        contents.UserString(WireText(b"FIFTEEN LETTERS.")),
         b"FIFTEEN LETTERS.",
     ),
-    ("model", contents.Model(Text(b"BM48.           ")), b"BM48.           "),
-    ("serial number", contents.SerialNumber(Text(b"W2605001.       ")), b"W2605001.       "),
+    ("model", contents.Model(WireText(b"BM48.           ")), b"BM48.           "),
+    ("serial number", contents.SerialNumber(WireText(b"W2605001.       ")), b"W2605001.       "),
     (
         "read memory, up to the last address",
         contents.ReadMemory(0xFFFFFF7F, 0xFFFFFFFF),
@@ -286,7 +288,12 @@ GOOD: Final[dict[type[Content], Content]] = {
         (contents.VersionInformation, "model", "A" * 16, "model: .*than 15 characters"),
         (contents.VersionInformation, "firmware_version", "V1.2", "firmware version: .*ends a"),
         (contents.VersionInformation, "hardware_version", "caf\xe9", "hardware version: .*ASCII"),
-        (contents.VersionInformation, "serial_number", Text(b"W."), "serial number: 2 bytes, not"),
+        (
+            contents.VersionInformation,
+            "serial_number",
+            WireText(b"W."),
+            "serial number: 2 bytes, not",
+        ),
         (contents.PhysicalId, "physical_id", bytes(11), "physical id: 11 bytes, not 12"),
         (contents.CheckCode, "check_code", bytes(13), "check code: 13 bytes, not 12"),
         (contents.History, "cycles", 65536, "cycles: 65536 does not fit 2 bytes"),
@@ -296,7 +303,7 @@ GOOD: Final[dict[type[Content], Content]] = {
         (contents.ProductionInformation, "date", "2022051", "date: '2022051' is not YYYYMMDD"),
         (contents.ProductionInformation, "date", "2022-5-1", "date: '2022-5-1' is not YYYYMMDD"),
         (contents.ProductionInformation, "date", "2022051\u0662", r"date: .* is not YYYYMMDD"),
-        (contents.ProductionInformation, "date", Text(b"2022051"), "date: 7 bytes, not 8"),
+        (contents.ProductionInformation, "date", WireText(b"2022051"), "date: 7 bytes, not 8"),
         (contents.UserString, "text", "a\x1b[2J", "text: .*not printable ASCII"),
         (contents.ReadMemory, "start", -1, "start: -1 does not fit 4 bytes"),
         (contents.ReadMemory, "end", 1 << 32, "end: 4294967296 does not fit 4 bytes"),

@@ -21,8 +21,8 @@ from flasher.protocol.fields import (
     Number,
     Numbers,
     Reserved,
-    Text,
     TextField,
+    WireText,
     flag_names,
     label,
 )
@@ -42,7 +42,7 @@ class Sample(Content):
 
     speed_c: int = fields.number(1, "°C", offset=40)
     depth_mv: int = fields.number(2, "mV", signed=True)
-    name: Text = fields.field(TextField(4))  # noqa: RUF009
+    name: WireText = fields.field(TextField(4))  # noqa: RUF009
     reserved: bytes = fields.reserved(2)
     mark: bytes = fields.constant(b"END")
 
@@ -68,10 +68,10 @@ class Sample(Content):
         (Numbers(3, Number(2)), (1, 2, 0x300), "01 00 02 00 00 03"),
         (Flags(1, Lamp), Lamp.FRONT | Lamp.REAR_LEFT, "05"),
         (Flags(2, Lamp), Lamp(0x8001), "01 80"),
-        (TextField(4), Text(b"AB. "), "41 42 2E 20"),
-        (TextField(4), Text(b"ABCD"), "41 42 43 44"),
-        (TextField(4), Text(b"\x00\xff\x80."), "00 FF 80 2E"),
-        (DateField(), Text(b"20220512"), "32 30 32 32 30 35 31 32"),
+        (TextField(4), WireText(b"AB. "), "41 42 2E 20"),
+        (TextField(4), WireText(b"ABCD"), "41 42 43 44"),
+        (TextField(4), WireText(b"\x00\xff\x80."), "00 FF 80 2E"),
+        (DateField(), WireText(b"20220512"), "32 30 32 32 30 35 31 32"),
         (Bytes(2), b"\xa5\x5a", "A5 5A"),
         (Reserved(2), b"\x00\x01", "00 01"),
         (Constant(b"OK"), b"OK", "4F 4B"),
@@ -100,12 +100,12 @@ def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str
         (Flags(1, Lamp), -1, "-1 does not fit 1 bytes"),
         (TextField(4), "ABCD", "longer than 3 characters"),
         (TextField(4), "A.", "ends a field"),
-        (TextField(4), Text(b"ABCDE"), "5 bytes, not 4"),
+        (TextField(4), WireText(b"ABCDE"), "5 bytes, not 4"),
         (DateField(), "", "'' is not YYYYMMDD"),
         (DateField(), "20220512 ", "is not YYYYMMDD"),
         (DateField(), "2022O512", "is not YYYYMMDD"),
         (DateField(), "2022051\u0662", "is not YYYYMMDD"),
-        (DateField(), Text(b"20220512."), "9 bytes, not 8"),
+        (DateField(), WireText(b"20220512."), "9 bytes, not 8"),
         (Bytes(2), b"\x00", "1 bytes, not 2"),
         (Reserved(2), b"\x00\x00\x00", "3 bytes, not 2"),
         (Constant(b"OK"), b"", "0 bytes, not 2"),
@@ -126,19 +126,19 @@ def test_a_codec_refuses_what_does_not_fit(codec: Codec, value: object, refusal:
         (Flags(1, Lamp), Lamp(0), "none"),
         (Flags(1, Lamp, none="dark"), Lamp(0), "dark"),
         (Flags(1, Lamp), Lamp(0x87), "front, reserved bit 1, rear left, reserved bit 7"),
-        (TextField(8), Text(b"AB.     "), "AB"),
-        (TextField(8), Text(b"ABCDEFGH"), "ABCDEFGH"),
-        (TextField(8), Text(b"AB      "), "AB"),
-        (TextField(8), Text(b"\x1b[2J.   "), r"\x1b[2J"),
-        (TextField(8), Text(b"caf\xe9.   "), r"caf\xe9"),
+        (TextField(8), WireText(b"AB.     "), "AB"),
+        (TextField(8), WireText(b"ABCDEFGH"), "ABCDEFGH"),
+        (TextField(8), WireText(b"AB      "), "AB"),
+        (TextField(8), WireText(b"\x1b[2J.   "), r"\x1b[2J"),
+        (TextField(8), WireText(b"caf\xe9.   "), r"caf\xe9"),
         (TextField(8), "\x1b[2J\xe9", r"\x1b[2J\xe9"),
-        (DateField(), Text(b"20220512"), "2022-05-12"),
+        (DateField(), WireText(b"20220512"), "2022-05-12"),
         (DateField(), "20220512", "2022-05-12"),
-        (DateField(), Text(b"99999999"), "9999-99-99"),
-        (DateField(), Text(b"2022051."), "2022051."),
-        (DateField(), Text(b"2022    "), "2022"),
-        (DateField(), Text(b"        "), ""),
-        (DateField(), Text(b"\x00\x1b[2J\xff\n\r"), r"\x00\x1b[2J\xff\n\r"),
+        (DateField(), WireText(b"99999999"), "9999-99-99"),
+        (DateField(), WireText(b"2022051."), "2022051."),
+        (DateField(), WireText(b"2022    "), "2022"),
+        (DateField(), WireText(b"        "), ""),
+        (DateField(), WireText(b"\x00\x1b[2J\xff\n\r"), r"\x00\x1b[2J\xff\n\r"),
         (DateField(), "2022051\u0662", r"2022051\u0662"),
         (Bytes(3), b"\x00\xa5\xff", "00 a5 ff"),
         (Constant(b"READY"), b"READY", "READY"),
@@ -160,10 +160,10 @@ def test_the_names_of_flags_are_in_the_order_of_their_bits() -> None:
 
 
 def test_text_reads_up_to_its_terminator_and_keeps_its_bytes() -> None:
-    text = Text(b"AB\xff.    ")
+    text = WireText(b"AB\xff.    ")
     assert str(text) == r"AB\xff"
     assert text.raw == b"AB\xff.    "
-    assert text != Text(b"AB\xff.\x00\x00\x00\x00")
+    assert text != WireText(b"AB\xff.\x00\x00\x00\x00")
 
 
 @each(
@@ -199,7 +199,7 @@ def test_a_declaration_yields_size_layout_and_both_directions() -> None:
         "reserved",
         "mark",
     ]
-    sample = Sample(-1, -2, Text(b"AB. "))
+    sample = Sample(-1, -2, WireText(b"AB. "))
     assert sample.data() == bytes.fromhex("27 FE FF 41 42 2E 20 00 00 45 4E 44")
     assert Sample.from_data(sample.data()) == sample
 
@@ -221,7 +221,7 @@ def test_data_of_another_size_is_refused(size_bytes: int) -> None:
 
 
 def test_reserved_bytes_are_shown_only_when_they_are_not_zero() -> None:
-    sample = Sample(20, 5, Text(b"AB. "))
+    sample = Sample(20, 5, WireText(b"AB. "))
     lines = [("speed", "20", "°C"), ("depth", "5", "mV"), ("name", "AB", ""), ("mark", "END", "")]
     assert list(sample.shown()) == lines
     with_reserved = dataclasses.replace(sample, reserved=b"\x00\x07")
@@ -229,7 +229,7 @@ def test_reserved_bytes_are_shown_only_when_they_are_not_zero() -> None:
 
 
 def test_a_content_is_a_value() -> None:
-    sample = Sample(20, 5, Text(b"AB. "))
+    sample = Sample(20, 5, WireText(b"AB. "))
     assert sample == Sample.from_data(sample.data())
     assert sample != dataclasses.replace(sample, depth_mv=6)
     assert len({sample, Sample.from_data(sample.data())}) == 1

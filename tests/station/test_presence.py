@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flasher.protocol.contents import VersionInformation
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, WMC, Mode
@@ -84,7 +84,7 @@ def test_after_a_time_in_which_nothing_could_be_heard_nothing_is_known(presence:
 
 def version_answer(serial: str) -> list[Frame]:
     texts = ("BM36", serial, "V1r2r0", "V1r0r0")
-    content = VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+    content = VersionInformation(*(WireText(encode_text(text, 16)) for text in texts))
     return split(0x720, encode(Message(0x720, Mode.REPORT, 0x1540, content.data())))
 
 

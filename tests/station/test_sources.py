@@ -14,7 +14,7 @@ from typing import Final
 import pytest
 
 from flasher.protocol.contents import VersionInformation
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, Mode
 from flasher.protocol.text import encode_text
@@ -66,7 +66,7 @@ class Unit:
         if round(age / STEP_S) % 5:
             return []
         texts = ("BM36", self.own, "V1r2r0", "V1r0r0")
-        content = VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+        content = VersionInformation(*(WireText(encode_text(text, 16)) for text in texts))
         return [Message(0x720, Mode.REPORT, 0x1540, content.data())]
 
 

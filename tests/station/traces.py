@@ -9,7 +9,7 @@ from pathlib import Path
 from flasher.image.image import Image
 from flasher.protocol import catalogue
 from flasher.protocol.contents import SerialNumber, VersionInformation
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.messages import Complete, EndOfTransfer, Packet, UpdateCommand
 from flasher.protocol.spec import BMS, PACKET_DATA_SIZE, Target, packet_count
 from flasher.protocol.text import encode_text
@@ -24,7 +24,7 @@ def run_messages(
         yield from transfer(BMS, image)
     if written:
         item = catalogue.BY_KEY[BMS.request_id, 0x4110]
-        yield catalogue.encode(item, SerialNumber(Text(encode_text(written, 16))))
+        yield catalogue.encode(item, SerialNumber(WireText(encode_text(written, 16))))
     yield version_answer(serial, version)
 
 
@@ -46,7 +46,7 @@ def version_answer(serial: str, version: str) -> Message:
     return catalogue.encode(
         item,
         VersionInformation(
-            *(Text(encode_text(each, 16)) for each in ("M", serial, "V1r0r0_1", version))
+            *(WireText(encode_text(each, 16)) for each in ("M", serial, "V1r0r0_1", version))
         ),
     )
 

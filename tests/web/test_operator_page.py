@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageChops, ImageStat
 from playwright.sync_api import Browser, Page, expect
 
-from flasher.said import say
+from flasher.i18n import text
 from flasher.station.events import (
     LineResumed,
     LineStopped,
@@ -221,14 +221,14 @@ def test_a_page_shows_what_came_of_its_own_scans_and_of_scanners(
     """A second browser is another source, and its operator is not disturbed."""
     other = browser.new_page()
     other.goto(f"{line.url}line")
-    for each, text in ((page, "SOCKET A"), (other, "SOCKET B"), (page, "W1")):
-        each.keyboard.type(text)
+    for each, sentence in ((page, "SOCKET A"), (other, "SOCKET B"), (page, "W1")):
+        each.keyboard.type(sentence)
         each.keyboard.press("Enter")
         each.wait_for_function("() => waiting.length === 0 && !isSending")
     one, two, again = line.sources
     assert one == again != two
-    reason = say("The unit was exchanged, or had no power.")
-    remedy = say("See which unit it is, then scan again.")
+    reason = text("The unit was exchanged, or had no power.")
+    remedy = text("See which unit it is, then scan again.")
     line.say(ScanRefused("SOCKET A", "UNIT_CHANGED", reason, remedy, "A", one.name, at=AT))
     line.say(ScanAccepted("SOCKET B", "socket", "B", two.name, at=AT))
     expect(page.locator("#spoken")).to_have_text(f"SOCKET A: {reason} {remedy}")

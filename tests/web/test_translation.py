@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from flasher.said import Said, in_language, say, with_value
+from flasher.i18n import Text, text, translate, with_value
 from flasher.station.scans import Word
 from flasher.web.translation import chosen, translator
 from tests import catalogue
@@ -20,7 +20,7 @@ _CARDS = re.compile(rf"\b({'|'.join(Word)})\b")
 @pytest.mark.slow
 def test_nothing_is_left_untranslated() -> None:
     """`python -m tests.catalogue` adds what is missing."""
-    everything = set(catalogue.said())  # it reads the whole package
+    everything = set(catalogue.sentences())  # it reads the whole package
     for language in catalogue.LANGUAGES:
         known = catalogue.messages(language)
         assert everything == known.keys(), language
@@ -37,22 +37,22 @@ def test_values_and_scans_stand_in_every_language(language: str) -> None:
 
 @pytest.mark.slow
 def test_a_sentence_is_said_by_its_template() -> None:
-    wanted = say("Put {label} into socket {socket}.", label="W1", socket="A")
+    wanted = text("Put {label} into socket {socket}.", label="W1", socket="A")
     assert wanted == "Put W1 into socket A."
     assert translator("de")(wanted) == "W1 auf Platz A setzen."
-    both = say("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
+    both = text("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
     assert translator("de")(both) == "W1 auf Platz A setzen. Oder CANCEL scannen."
     assert translator("en")(both) == both == "Put W1 into socket A. Or scan CANCEL."
 
 
 def test_a_value_is_never_taken_for_a_template() -> None:
-    said = say("Scan {label}.", label="{socket} %s {0}")
+    said = text("Scan {label}.", label="{socket} %s {0}")
     assert translator("de")(said) == "{socket} %s {0} scannen."
 
 
 def test_a_value_is_exchanged_wherever_it_stands() -> None:
-    inner = say("Put {label} into socket {socket}.", label=say("W1"), socket="A")
-    both = say("{wanted} Or scan CANCEL.", wanted=inner)
+    inner = text("Put {label} into socket {socket}.", label=text("W1"), socket="A")
+    both = text("{wanted} Or scan CANCEL.", wanted=inner)
     assert with_value(both, "W1", "W2") == "Put W2 into socket A. Or scan CANCEL."
     assert translator("de")(with_value(both, "W1", "W2")).startswith("W2 auf Platz A setzen.")
     assert with_value("W1", "W1", "W2") == "W2"
@@ -60,13 +60,13 @@ def test_a_value_is_exchanged_wherever_it_stands() -> None:
 
 
 def test_a_sentence_passes_from_process_to_process() -> None:
-    said = pickle.loads(pickle.dumps(say("Connect {label}.", label="W1")))  # noqa: S301  our own
-    assert isinstance(said, Said)
+    said = pickle.loads(pickle.dumps(text("Connect {label}.", label="W1")))  # noqa: S301  our own
+    assert isinstance(said, Text)
     assert translator("de")(said) == "W1 anschließen."
 
 
 def test_what_no_catalogue_knows_stays_as_it_is() -> None:
-    assert in_language("relay 3: no such file", lambda text: text) == "relay 3: no such file"
+    assert translate("relay 3: no such file", lambda text: text) == "relay 3: no such file"
     assert translator("zh")("relay 3: no such file") == "relay 3: no such file"
 
 

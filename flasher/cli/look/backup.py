@@ -24,12 +24,12 @@ from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ExitCode, UsageError
 from flasher.host.query import READ_MEMORY
+from flasher.i18n import text
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
 from flasher.procedures import DeviceInfo, two_devices
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import load_profile
 
@@ -113,7 +113,7 @@ class Backup:
     """What it answers; empty where it answers none."""
 
 
-DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, say("the device model"))
+DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, text("the device model"))
 
 
 @command(

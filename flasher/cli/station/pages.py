@@ -27,8 +27,8 @@ from flasher.cli.station.place import open_to_read
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.files import read
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.board import Board
 from flasher.station.config import StationConfig, load_config
 from flasher.station.events import RunEnded, StationEvent
@@ -87,9 +87,9 @@ class OperatorView:
             self._good = {str(run["serial"]): run["state"] == RunState.PASS for run in runs}
         self._lot = line.lot
         lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
-        operator = line.operator or say("nobody: scan a badge")
+        operator = line.operator or text("nobody: scan a badge")
         if not board.has_badges:
-            operator = say("{name} (no badges)", name=line.operator)
+            operator = text("{name} (no badges)", name=line.operator)
         self._screen.turn(board, operator=operator, lot=lot)
 
 

@@ -37,10 +37,10 @@ from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
 from flasher.host.options import DEFAULT_ATTEMPTS
+from flasher.i18n import text
 from flasher.procedures import DeviceInfo
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
@@ -229,7 +229,7 @@ class Adapters(_Place):
             merged = bus_config(self._bus.config, self._bus.fallback)
             name = printable(f"{merged['interface']} {merged.get('channel') or ''}".strip())
             self._buses[name] = self._bus
-            notes[name] = say("named on the command line or in the settings")
+            notes[name] = text("named on the command line or in the settings")
         found = [each for each in detected_until(cancelled).found if each.channel]
         maybe = {each.channel for each in ports() or ()}
         for each in (*found, *(ports() or ())):
@@ -239,7 +239,7 @@ class Adapters(_Place):
                 is_port = each.channel in maybe and each not in found
                 note = described(each, self.dialect)
                 notes[name] = (
-                    say("a serial port: perhaps an slcan adapter. {note}", note=note)
+                    text("a serial port: perhaps an slcan adapter. {note}", note=note)
                     if is_port
                     else note
                 )

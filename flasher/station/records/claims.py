@@ -12,8 +12,8 @@ from typing import Any, Final
 from sqlalchemy import func, select
 
 from flasher.errors import UsageError
+from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.said import say
 from flasher.station.recipe import Duplicate, Golden
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
@@ -67,15 +67,15 @@ class Order:
         except ValueError as error:
             raise ClaimRefusedError(
                 Refusal.WRONG_SERIAL,
-                say("No serial number of this recipe: {why}.", why=str(error)),
-                remedy=say("Scan the label of the unit again."),
+                text("No serial number of this recipe: {why}.", why=str(error)),
+                remedy=text("Scan the label of the unit again."),
             ) from error
         if not self.loaded.is_unchanged():
             path = printable(str(self.loaded.path))
             raise ClaimRefusedError(
                 Refusal.RECIPE_CHANGED,
-                say("The recipe {path}, or a file that it names, was changed.", path=path),
-                remedy=say("Check it with `flasher station check`, then start the station again."),
+                text("The recipe {path}, or a file that it names, was changed.", path=path),
+                remedy=text("Check it with `flasher station check`, then start the station again."),
             )
         if not self.operator.strip() or not self.socket.strip():
             raise UsageError("A run needs an operator and a socket.")
@@ -180,13 +180,13 @@ class Claiming:
         if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
             raise ClaimRefusedError(
                 Refusal.CLOCK,
-                say(
+                text(
                     "The clock says {now} UTC, but {station} has records of {last} UTC.",
                     now=utc_text(self._now)[:19],
                     station=self._trail.station,
                     last=last[:19],
                 ),
-                remedy=say(
+                remedy=text(
                     "Set the clock of this computer. If the clock is right and that record is"
                     " not: end the station, then flasher station accept clock."
                 ),
@@ -205,25 +205,25 @@ class Claiming:
         if by_unit is not None:
             raise ClaimRefusedError(
                 Refusal.UNIT_RUNNING,
-                say(
+                text(
                     "{serial} is running on socket {socket} of {station}.",
                     serial=self._order.serial,
                     socket=by_unit.socket_name,
                     station=by_unit.name,
                 ),
-                remedy=say("Wait for its end. If it is not there, check the label of this unit."),
+                remedy=text("Wait for its end. If it is not there, check the label of this unit."),
             )
         on_socket = running.where(run.c.socket_id == self._socket_id)
         by_socket: Any = self._connection.execute(on_socket).first()
         if by_socket is not None:
             raise ClaimRefusedError(
                 Refusal.SOCKET_BUSY,
-                say(
+                text(
                     "Socket {socket} is busy with {serial}.",
                     socket=self._order.socket,
                     serial=by_socket.serial,
                 ),
-                remedy=say("Wait for its end."),
+                remedy=text("Wait for its end."),
             )
 
     def _check_nature(self) -> None:
@@ -236,12 +236,12 @@ class Claiming:
             known = "real" if is_virtual else "virtual"
             raise ClaimRefusedError(
                 Refusal.OTHER_NATURE,
-                say(
+                text(
                     "{serial} is a {nature} unit in these records.",
                     serial=self._order.serial,
                     nature=known,
                 ),
-                remedy=say("Keep records of virtual units apart, in a database of their own."),
+                remedy=text("Keep records of virtual units apart, in a database of their own."),
             )
 
     def _kind(self, before: UnitState) -> RunKind:
@@ -276,8 +276,8 @@ class Claiming:
         if is_due(rule, utc_moment(last) if last else None, self._now.astimezone()):
             raise ClaimRefusedError(
                 Refusal.GOLDEN_DUE,
-                say("A golden unit has to pass on socket {socket} first.", socket=order.socket),
-                remedy=say(
+                text("A golden unit has to pass on socket {socket} first.", socket=order.socket),
+                remedy=text(
                     "Scan and connect one of: {serials}.", serials=", ".join(rule.serial_numbers)
                 ),
             )
@@ -290,17 +290,17 @@ class Claiming:
         if rule is Duplicate.BLOCK:
             raise ClaimRefusedError(
                 Refusal.DUPLICATE,
-                say("{serial} has passed already.", serial=order.serial),
-                remedy=say("Check the label: another unit may carry the same number."),
+                text("{serial} has passed already.", serial=order.serial),
+                remedy=text("Check the label: another unit may carry the same number."),
             )
         if not order.reason.strip():
             raise ClaimRefusedError(
                 Refusal.REASON_NEEDED,
-                say(
+                text(
                     "{serial} has passed already, and is done again only for a reason.",
                     serial=order.serial,
                 ),
-                remedy=say("Give the reason, then scan it again."),
+                remedy=text("Give the reason, then scan it again."),
             )
         return RunKind.REFLASH
 
@@ -309,8 +309,8 @@ class Claiming:
         if self._lot_id is None and rule.required:
             raise ClaimRefusedError(
                 Refusal.LOT_NEEDED,
-                say("The unit has no lot."),
-                remedy=say("Give the station the lot."),
+                text("The unit has no lot."),
+                remedy=text("Give the station the lot."),
             )
         if self._lot_id is None or rule.quantity_max is None:
             return
@@ -325,13 +325,13 @@ class Claiming:
         if used >= rule.quantity_max:
             raise ClaimRefusedError(
                 Refusal.LOT_FULL,
-                say(
+                text(
                     "Lot {lot} is full: {used} of {most} units.",
                     lot=order.lot,
                     used=used,
                     most=rule.quantity_max,
                 ),
-                remedy=say("Begin the next lot."),
+                remedy=text("Begin the next lot."),
             )
 
 

@@ -12,7 +12,7 @@ import pytest
 from flasher.mock.faults import AtTime, PowerCut
 from flasher.protocol import catalogue
 from flasher.protocol.contents import Reset, SerialNumber
-from flasher.protocol.fields import Text
+from flasher.protocol.fields import WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion, RequestTransfer, UpdateCommand
 from flasher.protocol.spec import BMS, WMC, Command, Mode, can_id
@@ -38,7 +38,7 @@ RESET = catalogue.encode(catalogue.BY_KEY[BMS.request_id, Command.RESET], Reset(
 UPDATE = UpdateCommand("BMS_UPD", 200).to_message(BMS.request_id)
 REQUEST = RequestTransfer().to_message(BMS.answer_id)
 NUMBER = catalogue.encode(
-    catalogue.BY_KEY[BMS.request_id, 0x4110], SerialNumber(Text(encode_text(SERIAL, 16)))
+    catalogue.BY_KEY[BMS.request_id, 0x4110], SerialNumber(WireText(encode_text(SERIAL, 16)))
 )
 QUESTION = Message(BMS.request_id, Mode.READ, Command.READ_VERSION, b"")
 DATA = Message(can_id(BMS.node, None), Mode.REPORT, 0x1410, bytes(16))

@@ -1,0 +1,61 @@
+"""Translatable sentences: an English text that keeps its template and values.
+
+`text("Put {serial} into socket {socket}.", serial="W1", socket="A")` is the English sentence, a
+`str`, wherever it is used. It keeps its template and values, so that a page can translate the
+template and fill in the values. A value that is a `Text` itself is translated too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+Gettext = Callable[[str], str]
+
+
+class Text(str):
+    """A sentence with its template and values."""
+
+    __slots__ = ("template", "values")
+    template: str
+    values: dict[str, Any]
+
+    def __new__(cls, template: str, values: dict[str, Any]) -> Text:
+        sentence = super().__new__(cls, template.format(**values) if values else template)
+        sentence.template, sentence.values = template, values
+        return sentence
+
+    def __reduce__(self) -> tuple[type[Text], tuple[str, dict[str, Any]]]:
+        return Text, (self.template, self.values)
+
+
+def text(template: str, **values: Any) -> Text:
+    """Fill an English template; the sentence can be translated later."""
+    return Text(template, values)
+
+
+def with_value(sentence: str, old: str, new: str) -> str:
+    """Replace the value `old`, at any depth, by `new`."""
+    if not isinstance(sentence, Text) or not sentence.values:
+        return new if sentence == old else sentence
+    values = {
+        name: with_value(value, old, new) if isinstance(value, str) else value
+        for name, value in sentence.values.items()
+    }
+    return Text(sentence.template, values)
+
+
+def translate(sentence: str, gettext: Gettext) -> str:
+    """Translate a sentence, and the values in it; `gettext` returns what it does not know."""
+    if not sentence:
+        return ""
+    if not isinstance(sentence, Text):
+        return gettext(sentence)
+    template = gettext(sentence.template)
+    if not sentence.values:
+        return template
+    values = {
+        name: translate(value, gettext) if isinstance(value, Text) else value
+        for name, value in sentence.values.items()
+    }
+    return template.format(**values)
