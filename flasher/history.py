@@ -27,7 +27,7 @@ from flasher.errors import UsageError, printable
 from flasher.events import Phase
 from flasher.files import opened, owner_only
 from flasher.i18n import text
-from flasher.prose import prose_of
+from flasher.wording import wording_of
 
 SIZE_MAX: Final = 2 * 1024 * 1024
 """In bytes: beyond it the older half is dropped, some thousand flashes."""
@@ -143,7 +143,7 @@ class Flash:
         """The state in which a flash without an end has left the device, in a sentence."""
         if self.reached is None:
             return text("as far as is known it was not told to erase anything")
-        return text(prose_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
+        return text(wording_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
 
     @property
     def left_device_open(self) -> bool:

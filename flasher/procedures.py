@@ -54,7 +54,6 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
 from flasher.image.sample import is_sample, refused_sample
 from flasher.log import log_event
-from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
 from flasher.protocol.engine import Engine
@@ -62,6 +61,7 @@ from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Command, Dialect, Target
 from flasher.settings.profile import Profile
+from flasher.wording import wording
 
 if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate
@@ -632,7 +632,7 @@ def _may_end(session: Session) -> Callable[[], bool]:
 
 def _say_what_is_left(error: FlasherError, session: Session) -> None:
     left = session.device_left
-    error.remedy = f"{error.remedy} State of the device: {prose(left)}.".lstrip()
+    error.remedy = f"{error.remedy} State of the device: {wording(left)}.".lstrip()
     error.needs_rescue = left.needs_rescue
 
 

@@ -28,13 +28,13 @@ from flasher.host.outcome import (
 )
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
-from flasher.prose import prose
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.contents import Fault
 from flasher.protocol.fields import flag_names, label
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
 from flasher.web.translation import NAMES
+from flasher.wording import wording
 
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "web" / "locale"
@@ -54,7 +54,7 @@ def sentences() -> Iterator[str]:
             if keyword == "_" or "flasher.i18n" in (ROOT / name).read_text("utf-8"):
                 assert isinstance(message, str)
                 yield message
-    yield from (prose(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
+    yield from (wording(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
     explained = [
         *_EXPLANATIONS.values(),
         _NO_SESSION_EITHER,

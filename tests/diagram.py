@@ -18,7 +18,7 @@ from typing import Final
 from flasher.host import table as host
 from flasher.host.table import Ending
 from flasher.mock import table as device
-from flasher.prose import prose
+from flasher.wording import wording
 
 _ROOT: Final = Path(__file__).parents[1]
 UPGRADE: Final = _ROOT / "docs" / "explanation" / "upgrade.md"
@@ -58,7 +58,7 @@ def host_arrows(*, is_overview: bool = False) -> Iterator[_Arrow]:
                 if isinstance(target, host.State):
                     yield state, event, words, target
                 elif not is_overview or target in _GOOD:
-                    yield state, event, f"ends, {prose(target)}", None
+                    yield state, event, f"ends, {wording(target)}", None
 
 
 def device_arrows() -> Iterator[_Arrow]:

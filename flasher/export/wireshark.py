@@ -12,7 +12,6 @@ from importlib.resources import files
 from typing import Any, Final
 
 from flasher.export.names import key
-from flasher.prose import prose
 from flasher.protocol import messages, spec
 from flasher.protocol.bittime import frame_tables
 from flasher.protocol.catalogue import ITEMS, UPGRADE_COMMANDS, Item, answer_of
@@ -36,6 +35,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import DamageReason
 from flasher.trace.decoder import ACCEPTED_SHARE, ROUTES, TITLES, Kind, remark
 from flasher.trace.observed_upgrade import AT_ONCE_S, IN_VAIN_S, NEXT_UPGRADE_S
+from flasher.wording import wording
 
 _SCRIPT: Final = "welling.lua"
 _MARK: Final = "{} --[[ tables ]]"
@@ -96,9 +96,9 @@ def _tables() -> dict[str, Any]:
         "commands": {command.name: command.value for command in spec.Command},
         "items": [_item(item) for item in ITEMS],
         "rows": [_row(row) for row in messages.ROWS.values()],
-        "titles": {kind.value: prose(kind) for kind in Kind},
+        "titles": {kind.value: wording(kind) for kind in Kind},
         "reasons": {reason.name: reason.value for reason in DamageReason},
-        "reason_texts": {reason.value: prose(reason) for reason in DamageReason},
+        "reason_texts": {reason.value: wording(reason) for reason in DamageReason},
     }
 
 

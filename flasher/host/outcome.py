@@ -29,8 +29,8 @@ from flasher.host.table import Ending
 from flasher.i18n import Text, text
 from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
-from flasher.prose import prose
 from flasher.protocol.spec import Target
+from flasher.wording import wording
 
 
 class DeviceLeft(Enum):
@@ -65,7 +65,7 @@ class Statistics:
 
 def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
     """Where an upgrade stands, in words."""
-    where = text(prose(phase))
+    where = text(wording(phase))
     if packet:
         where = text(
             "{where}, packet {packet} of {packets}",
@@ -141,7 +141,7 @@ class Outcome:
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
             explained = _TWO_TOLD_TO_UPDATE
         kind, cause, remedy, code = explained
-        node, ending = self.target.node.name, text(prose(self.ending))
+        node, ending = self.target.node.name, text(wording(self.ending))
         what = text("{node}: {ending}.", node=node, ending=ending)
         if self.detail:
             detail = self.detail
@@ -154,7 +154,7 @@ class Outcome:
             remedy=text(
                 "{remedy} State of the device: {state}.",
                 remedy=Text(remedy, names),
-                state=text(prose(self.device_left)),
+                state=text(wording(self.device_left)),
             ),
             code=code,
         )

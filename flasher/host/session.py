@@ -47,10 +47,10 @@ from flasher.host.verify import (
 )
 from flasher.i18n import text
 from flasher.image.plan import Plan
-from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Node, can_id
+from flasher.wording import wording
 
 _NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
 """Errors that a battery which switched off explains, or a computer that paused."""
@@ -151,7 +151,7 @@ class Session(Runner[Result]):
         if self._checking is not None:
             return f"verifying by {self._checking.value}"
         if self._identify is not None:
-            return prose(self._identify.phase)
+            return wording(self._identify.phase)
         return self._upgrade.standing
 
     @property

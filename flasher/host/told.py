@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher import events
-from flasher.prose import prose, prose_of
+from flasher.wording import wording, wording_of
 
 _MINUTES_FROM_S: Final = 180.0
 _TRIES_SHOWN: Final = 10
@@ -14,7 +14,7 @@ _TRIES_SHOWN: Final = 10
 
 def because(reason: str, what: str = "") -> str:
     """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
-    return prose_of("Reason", reason).replace("{what}", what)
+    return wording_of("Reason", reason).replace("{what}", what)
 
 
 def warning_of(event: object) -> str:
@@ -45,7 +45,7 @@ def line_of(event: object) -> tuple[str, int] | None:
     """A line and the level of verbosity that shows it; None for an event without a line."""
     match event:
         case events.PhaseEntered(phase, _):
-            return f"{prose(phase)} ...", 0
+            return f"{wording(phase)} ...", 0
         case events.AttemptStarted(attempt, reason, left_s):
             left = f" ({_span(left_s)} left)" if left_s else ""
             return f"{because(reason)}: beginning again, attempt {attempt}{left}", 0
@@ -67,7 +67,7 @@ def line_of(event: object) -> tuple[str, int] | None:
         case events.Reported(what):
             return f"note: {what}", 1
         case events.BytesDamaged(can_id, reason, data):
-            why = prose_of("DamageReason", reason)
+            why = wording_of("DamageReason", reason)
             return f"bytes on 0x{can_id:03X} ignored: {why}: {data[:24].hex(' ')}", 2
         case _:
             return None

@@ -25,9 +25,9 @@ from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLe
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_requests, piece_of
 from flasher.host.runner import Runner, Stage
 from flasher.image.plan import Plan
-from flasher.prose import prose
 from flasher.protocol.contents import Memory, ReadMemory
 from flasher.protocol.spec import Target
+from flasher.wording import wording
 
 
 class Level(Enum):
@@ -53,7 +53,7 @@ class Verdict(Enum):
     INTERRUPTED = "interrupted"
 
 
-_IT_HAS: Final = f"State of the device: {prose(DeviceLeft.NEW)}."
+_IT_HAS: Final = f"State of the device: {wording(DeviceLeft.NEW)}."
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}
 )
@@ -77,7 +77,7 @@ class Verification:
         """The error that stands for it; None when there is none."""
         if self.ok:
             return None
-        what = f"{target.node.name}: completed, but {prose(self.verdict)}"
+        what = f"{target.node.name}: completed, but {wording(self.verdict)}"
         what += f" ({self.detail})." if self.detail else "."
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(

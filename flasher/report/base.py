@@ -15,8 +15,8 @@ from typing import Any, Final
 
 from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 
-from flasher.prose import prose
 from flasher.report import scale
+from flasher.wording import wording
 
 TEXT_LIMIT: Final = 400
 """Characters of one text on a page; what is longer ends in an ellipsis."""
@@ -90,7 +90,7 @@ def environment(loader: BaseLoader) -> Environment:
     )
     made.filters["duration"] = scale.duration_text
     made.filters["counted"] = counted
-    made.filters["prose"] = prose
+    made.filters["prose"] = wording
     made.filters["percent"] = percent
     made.filters["shortened"] = shortened
     made.globals["Status"] = Status

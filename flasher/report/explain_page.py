@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
-from flasher.prose import prose
 from flasher.protocol.spec import Node
 from flasher.report import chart, sequence
 from flasher.report.base import Status, render_page
@@ -28,6 +27,7 @@ from flasher.trace.story import (
     StoryLine,
     UpgradeStory,
 )
+from flasher.wording import wording
 
 UPGRADES_SHOWN: Final = 8
 """Upgrades of one trace that are drawn; the others have a line in a table."""
@@ -191,7 +191,7 @@ def _phases(upgrade: UpgradeStory) -> Iterable[PhaseRow]:
         if whole_s > 0:
             begin, length = begin / whole_s, length / whole_s
         yield PhaseRow(
-            prose(span.phase), span.attempt, span.begin_s, length_s, _share(begin), _share(length)
+            wording(span.phase), span.attempt, span.begin_s, length_s, _share(begin), _share(length)
         )
 
 

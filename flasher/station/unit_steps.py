@@ -21,7 +21,6 @@ from flasher.host.session import Result
 from flasher.host.verify import Verdict, memory_check
 from flasher.host.write import WritePlan
 from flasher.i18n import text
-from flasher.prose import prose
 from flasher.protocol.fields import Content
 from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
@@ -50,6 +49,7 @@ from flasher.station.unit_checks import (
     wanted_text,
 )
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
+from flasher.wording import wording
 
 _OF_VERDICT: Final = {
     Verdict.VERSION_OTHER: codes.OTHER_VERSION,
@@ -267,7 +267,7 @@ class UnitSteps:
         measured.append(Measurement(f"{name} transfer", statistics.transfer_s or 0.0, "s"))
         self._journal.verified(write, result.running_version)
         self._flashed.add(name)
-        return f"{prose(result.outcome.ending)}; boot version {result.outcome.boot_version}"
+        return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}"
 
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""
@@ -308,7 +308,7 @@ class UnitSteps:
             options = replace(options, timings=watched)
         result = replace(target.job, options=options).run(target.device, on_event=hear)
         left = result.outcome.device_left
-        self.left_behind = f"State of the device: {prose(left)}." if left.needs_rescue else ""
+        self.left_behind = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()
         if result.ok:
             if was_away and not result.outcome.is_completed and not target.goes_on:
@@ -451,7 +451,7 @@ class UnitSteps:
         found = check.result
         if not found.ok:
             code = _OF_VERDICT.get(found.verdict, codes.MEMORY_DIFFERS)
-            raise StepFailedError(code, f"{name}: {prose(found.verdict)} {found.detail}".strip())
+            raise StepFailedError(code, f"{name}: {wording(found.verdict)} {found.detail}".strip())
         return Verified.MEMORY
 
     def _completed(self, target: UnitTarget) -> Verified:

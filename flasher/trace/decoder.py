@@ -21,7 +21,6 @@ from enum import Enum
 from math import inf
 from typing import Any, Final, NamedTuple
 
-from flasher.prose import prose
 from flasher.protocol import catalogue, messages
 from flasher.protocol.bittime import fixed_bits, frame_bits
 from flasher.protocol.contents import Faults
@@ -31,6 +30,7 @@ from flasher.protocol.spec import TARGETS, Dialect, Mode, Node, can_id
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, Message, Reassembler
+from flasher.wording import wording
 
 _TIMEOUT_S: Final = DEFAULT_TIMINGS.inter_frame_timeout_s
 _LONG_ID_BITS: Final = 20
@@ -161,7 +161,7 @@ class Decoder:
     def feed(self, frame: Frame, now: float) -> Sequence[BusEvent]:
         """What the frame completed, in order: usually nothing, sometimes more than one."""
         if frame.is_error:
-            return (BusEvent(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME)),)
+            return (BusEvent(now, Kind.ERROR_FRAME, frame.can_id, wording(Kind.ERROR_FRAME)),)
         stream = self._streams.get(frame.can_id)
         if stream is None or not frame.is_payload:
             return (_foreign(frame, now),)
@@ -185,9 +185,9 @@ class Decoder:
     def _describe(self, found: Message | Damage, now: float) -> BusEvent:
         sender, receiver = ROUTES[found.can_id]
         if isinstance(found, Damage):
-            reason = Field("reason", found.reason.value, "reason", prose(found.reason))
+            reason = Field("reason", found.reason.value, "reason", wording(found.reason))
             fields = (reason, _raw("bytes", found.data))
-            title = prose(Kind.DAMAGED)
+            title = wording(Kind.DAMAGED)
             return BusEvent(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
         kind, title, shown, alarm = _judge(found)
         return BusEvent(
@@ -210,14 +210,14 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
     if message.can_id in _TO_DEVICE | _TO_TOOL:
         row = messages.decode(message)
         if isinstance(row, messages.Malformed):
-            return Kind.MALFORMED, prose(Kind.MALFORMED), _undecoded(message, row.problem), False
+            return Kind.MALFORMED, wording(Kind.MALFORMED), _undecoded(message, row.problem), False
         # Devices report, the tool reads and writes (2.2.1).
         if not isinstance(row, messages.Unknown) and message.can_id in (
             _TO_TOOL if row.MODE == Mode.REPORT else _TO_DEVICE
         ):
             alarm = isinstance(row, messages.Nak)
             return Kind.MESSAGE, TITLES[type(row)], _row_fields(row), alarm
-    return Kind.UNKNOWN, prose(Kind.UNKNOWN), _undecoded(message), False
+    return Kind.UNKNOWN, wording(Kind.UNKNOWN), _undecoded(message), False
 
 
 # -- fields ---------------------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def _foreign(frame: Frame, now: float) -> BusEvent:
     if frame.is_remote:
         fields.insert(0, _plain("frame", "remote request"))
     sender, receiver = ("", "") if frame.is_extended else ROUTES.get(frame.can_id, ("", ""))
-    title = prose(Kind.FOREIGN)
+    title = wording(Kind.FOREIGN)
     return BusEvent(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from flasher.prose import explanation
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import (
     BMS,
@@ -39,6 +38,7 @@ from flasher.trace.story import (
     UpgradeStory,
 )
 from flasher.trace.verdict import judge, remarks
+from flasher.wording import explanation
 
 MAX_TALKERS: Final = 100
 """Different ids that are listed; more of them are only counted."""

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from flasher.errors import FlasherError, UsageError
 from flasher.files import JSON_MAX_SIZE, opened, parse_json, read
-from flasher.prose import explanation
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
@@ -18,6 +17,7 @@ from flasher.trace.explain import explain
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, TraceVerdict
+from flasher.wording import explanation
 
 _HEAD_SIZE: Final = 100
 _RATE_MAX_BPS: Final = 10_000_000

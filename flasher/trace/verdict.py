@@ -10,10 +10,10 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from flasher.events import Phase
-from flasher.prose import explanation
 from flasher.protocol.text import BOOT_VERSION_FORM
 from flasher.trace.observed_upgrade import ObservedUpgrade
 from flasher.trace.story import Cause, TraceVerdict
+from flasher.wording import explanation
 
 _SILENT_S: Final = 1.0
 """A tool that says nothing for so long, while it is its turn, has stopped."""

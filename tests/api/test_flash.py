@@ -25,11 +25,11 @@ from flasher.errors import BusError, ExitCode, FlasherError, UsageError
 from flasher.host.options import UpgradeOptions
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.prose import prose
 from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
 from flasher.protocol.timing import Timings
+from flasher.wording import wording
 from tests.firmware import VECTORS
 from tests.loops import each
 
@@ -177,7 +177,7 @@ def test_each_bad_ending_is_raised_as_its_own_error_with_its_exit_code(
         flasher.flash(IMAGE, "bms", mock=True, options=options)
     assert type(caught.value) is kind
     assert caught.value.exit_code == code
-    assert prose(flasher.Ending[ending]) in caught.value.what
+    assert wording(flasher.Ending[ending]) in caught.value.what
     assert caught.value.where
     assert caught.value.cause
     assert "State of the device:" in caught.value.remedy

@@ -12,8 +12,8 @@ from flasher.bus.health import (
     decode_error_frame,
 )
 from flasher.errors import ExitCode
-from flasher.prose import prose
 from flasher.protocol.frame import Frame
+from flasher.wording import wording
 from tests.loops import each
 
 ORDINARY = Frame(0x725, b"\x01")
@@ -158,7 +158,7 @@ def test_the_state_follows_the_error_frames() -> None:
     active_again = error_frame(0x204, "00 40 00 00 00 00 00 00")
     for frame in (PASSIVE, BUS_OFF, restarted, PASSIVE, active_again):
         kept.hear(frame)
-        states.append(prose(kept.state))
+        states.append(wording(kept.state))
     assert states == [
         "error-passive", "bus-off", "error-active", "error-passive", "error-active"
     ]  # fmt: skip

@@ -21,8 +21,8 @@ from typing import Final
 
 from flasher import events
 from flasher.errors import ExitCode
-from flasher.prose import prose
 from flasher.protocol.frame import Frame
+from flasher.wording import wording
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
 from tests.end_to_end.stranger import QUERY, Stranger
@@ -110,7 +110,7 @@ def on_the_simulated_bus(
     counts["messages sent again"] += len(stage.seen(events.MessageRepeated))
     counts["attempts more"] += len(stage.seen(events.AttemptStarted))
     if not result.ok:
-        return f"{prose(result.outcome.ending)} ({result.outcome.where})"
+        return f"{wording(result.outcome.ending)} ({result.outcome.where})"
     return "" if stage.has == image.data else "the device has another image"
 
 

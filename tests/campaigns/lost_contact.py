@@ -16,7 +16,7 @@ from enum import Enum
 from typing import Final
 
 from flasher.errors import FlasherError
-from flasher.prose import prose
+from flasher.wording import wording
 from tests.end_to_end.stage import SMALL, Stage, image_of
 
 AWAY_S: Final = 0.3
@@ -119,7 +119,7 @@ def trial(fault: Fault, seed: int, away_s: float = AWAY_S) -> Trial:
         ending = f"{type(error).__name__}: {error.what} ({error.where})"
     else:
         attempts, is_ok = result.outcome.statistics.attempts, result.exit_code == 0
-        ending = f"{prose(result.outcome.ending)} ({result.outcome.where})"
+        ending = f"{wording(result.outcome.ending)} ({result.outcome.where})"
     has_it = stage.has == image.data
     return Trial(
         seed, at_s, ending, attempts, stage.clock.now(), is_ok and has_it, has_it or not is_ok

@@ -52,7 +52,7 @@ OWN_TESTS: Final = {
         "tests/cli/test_progress.py",
         "tests/cli/test_read_write.py",
         "tests/cli/test_two_devices.py",
-        "tests/test_prose.py",
+        "tests/test_wording.py",
     ),
     "flasher/image": ("tests/image",),
     "flasher/protocol": ("tests/protocol", "tests/peers"),

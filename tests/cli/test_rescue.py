@@ -16,7 +16,7 @@ from flasher import events
 from flasher.cli.upgrade.flash import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
-from flasher.prose import prose
+from flasher.wording import wording
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.stage import IMAGE, SMALL, Stage
 
@@ -224,7 +224,7 @@ def test_ctrl_c_in_every_phase_says_what_the_device_has_and_how_to_repair_it(
     assert run.code == ExitCode.INTERRUPTED, run.err
     error = run.document["error"]
     if phase is not Phase.RESET:
-        assert prose(phase) in error["where"]
+        assert wording(phase) in error["where"]
     if times == 1:
         assert f"State of the device: {state}" in error["remedy"]
         assert error["command"].startswith("flasher rescue ") is needs_repair

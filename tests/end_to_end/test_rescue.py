@@ -19,9 +19,9 @@ from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.mock.profile import DeviceProfile
-from flasher.prose import prose
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BOOT_VERSION_BURST
+from flasher.wording import wording
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of
 from tests.loops import each
 
@@ -332,7 +332,7 @@ def test_an_adapter_that_is_lost_for_good_in_any_phase_is_exit_4(phase: Phase) -
     when(stage, phase, stage.bus.unplug)
     with pytest.raises(BusError) as caught:
         stage.flash()
-    assert prose(phase) in caught.value.where
+    assert wording(phase) in caught.value.where
     assert "State of the device: " in caught.value.remedy
     assert caught.value.needs_rescue is (phase in PHASES[4:])
     assert stage.has in (None, IMAGE.data) or phase in PHASES[:5]
@@ -386,7 +386,7 @@ def test_an_adapter_that_is_gone_while_the_version_is_asked_for_says_that_the_im
     with pytest.raises(BusError) as caught:
         stage.flash()
     assert "verifying by version" in caught.value.where
-    assert prose(DeviceLeft.NEW) in caught.value.remedy
+    assert wording(DeviceLeft.NEW) in caught.value.remedy
     assert not caught.value.needs_rescue
 
 

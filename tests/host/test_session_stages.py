@@ -19,7 +19,6 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verdict
 from flasher.mock.model import MockDevice
-from flasher.prose import prose
 from flasher.protocol import catalogue
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.fields import WireText
@@ -28,6 +27,7 @@ from flasher.protocol.spec import WELLING
 from flasher.protocol.text import encode_text
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, encode, split
+from flasher.wording import wording
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
 from tests.host.twins import Slow
 from tests.loops import each
@@ -110,7 +110,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
         assert result.outcome.device_left is DeviceLeft.UNTOUCHED
     if phase == VERIFICATION:
         assert "completed, but a second tool speaks" in error.what
-        assert prose(DeviceLeft.NEW) in error.remedy
+        assert wording(DeviceLeft.NEW) in error.remedy
 
 
 def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() -> None:

@@ -24,13 +24,13 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
 from flasher.mock.variants import VARIANTS, find, make
-from flasher.prose import prose_of
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect, Target
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.device_model import describe_options, set_options
+from flasher.wording import wording_of
 
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
@@ -298,7 +298,7 @@ class _Watcher:
             case events.DeviceReported(what):
                 self._say("note", what, event)
             case events.BytesDamaged(can_id, reason, data):
-                why = prose_of("DamageReason", reason)
+                why = wording_of("DamageReason", reason)
                 self._say("damage", f"0x{can_id:03X}: {why}: {data[:16].hex(' ')} ...", event)
 
     def _say(self, kind: str, text: str, event: object) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Final
 
 from flasher.cli.output import byte_count, counted, duration, spread_ms
-from flasher.prose import prose
 from flasher.trace.figures import Distribution, LinkReport
 from flasher.trace.story import (
     BusFigures,
@@ -19,6 +18,7 @@ from flasher.trace.story import (
     TraceVerdict,
     UpgradeStory,
 )
+from flasher.wording import wording
 
 _TALKERS_SHOWN: Final = 12
 
@@ -46,11 +46,11 @@ def story_lines(story: Story, *, packets: bool = False) -> Iterator[str]:
 
 
 def _verdict_lines(verdict: TraceVerdict, indent: str = "") -> Iterator[str]:
-    where = [] if verdict.phase is None else [prose(verdict.phase)]
+    where = [] if verdict.phase is None else [wording(verdict.phase)]
     where += [f"packet {verdict.packet}"] if verdict.packet else []
     where += [f"attempt {verdict.attempt}"] if verdict.attempt > 1 else []
     at = f" ({', '.join(where)})" if where and not verdict.cause.is_good else ""
-    yield f"{indent}verdict: {prose(verdict.cause)}{at}"
+    yield f"{indent}verdict: {wording(verdict.cause)}{at}"
     yield f"{indent}  {verdict.text}"
     if verdict.likely:
         yield f"{indent}  likely cause: {verdict.likely}"
@@ -87,7 +87,7 @@ def _upgrade_lines(upgrade: UpgradeStory, *, packets: bool, is_only: bool) -> It
     for span in upgrade.phases:
         attempt = f" (attempt {span.attempt})" if upgrade.attempts > 1 else ""
         took = f"{span.end_s - span.begin_s:9.3f} s"
-        yield f"    {span.begin_s:10.3f}  {took}  {prose(span.phase)}{attempt}"
+        yield f"    {span.begin_s:10.3f}  {took}  {wording(span.phase)}{attempt}"
     yield "  steps"
     yield from _step_lines(upgrade.steps, upgrade.steps_left_out, "  ")
     if packets:
@@ -172,7 +172,7 @@ def _talker_lines(talkers: tuple[Talker, ...], left_out: int) -> Iterator[str]:
     yield "others on the bus"
     for talker in talkers[:_TALKERS_SHOWN]:
         can_id = f"{talker.can_id:08X}" if talker.is_extended else f"{talker.can_id:03X}"
-        name = talker.name or prose(talker.kind)
+        name = talker.name or wording(talker.kind)
         yield f"  {can_id:<8}  {name:<10}  {counted(talker.frames, 'frame')}"
     more = len(talkers[_TALKERS_SHOWN:]) + left_out
     if more:

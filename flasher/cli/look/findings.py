@@ -30,12 +30,12 @@ from flasher.bus.opening import needed_extra
 from flasher.cli.output import counted
 from flasher.errors import BusError, hide_passwords
 from flasher.host.survey import Survey
-from flasher.prose import prose
 from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import FRAMES_PER_PACKET, Dialect, Node
 from flasher.protocol.text import printable
 from flasher.trace.decoder import bits_of
+from flasher.wording import wording
 
 _SHOWN_AT_MOST: Final = 20
 """Adapters listed."""
@@ -256,7 +256,7 @@ def health(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[
     if health.tx_errors is not None:
         counters = f", error counters: transmit {health.tx_errors}, receive {health.rx_errors}"
     restart = restart_commands(channel) if is_socketcan else ()
-    what = f"the controller is {prose(health.state)}{counters}"
+    what = f"the controller is {wording(health.state)}{counters}"
     if health.state is ControllerState.ACTIVE:
         yield _ok("bus", what)
     elif health.state is ControllerState.BUS_OFF:

@@ -18,11 +18,11 @@ from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
-from flasher.prose import prose
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.trace.decoder import Kind, message_titles
 from flasher.trace.watcher import Filter, Watcher, replay
+from flasher.wording import wording
 
 REFRESH_S: Final = 0.25
 """Time between two refreshes of the table: slow enough to read, quick enough to follow."""
@@ -154,7 +154,7 @@ def monitor(
 
 def check_messages(wanted: Iterable[str]) -> None:
     """Raises UsageError for words that are in no title."""
-    titles = message_titles() + tuple(map(prose, Kind))
+    titles = message_titles() + tuple(map(wording, Kind))
     for words in wanted:
         if not any(words.lower() in title.lower() for title in titles):
             raise UsageError(

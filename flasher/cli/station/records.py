@@ -23,7 +23,6 @@ from flasher.cli.station.documents import (
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
 from flasher.errors import ErrorCode, ExitCode, UsageError
-from flasher.prose import prose
 from flasher.protocol.text import printable
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.model import (
@@ -43,6 +42,7 @@ from flasher.station.records.store import Store
 from flasher.station.reports import Report
 from flasher.station.stories import explained
 from flasher.trace.story import Story
+from flasher.wording import wording
 
 _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 
@@ -271,7 +271,7 @@ def _story_lines(story: Story | str, *, full: bool) -> Iterator[str]:
         yield from (f"  | {line}".rstrip() for line in story_lines(story))
         return
     frames = f"{counted(story.frames, 'frame')} in {duration(story.duration_s)}"
-    yield f"  trace:    {frames}: {prose(story.verdict.cause)}"
+    yield f"  trace:    {frames}: {wording(story.verdict.cause)}"
     yield f"            {story.verdict.text}"
     if story.verdict.likely:
         yield f"            likely cause: {story.verdict.likely}"

@@ -13,9 +13,9 @@ from flasher.cli.options import target_option
 from flasher.cli.output import Output, byte_count, counted
 from flasher.errors import ExitCode
 from flasher.history import Began, Flash, History, left_open, matching, working_folder
-from flasher.prose import prose_of
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
+from flasher.wording import wording_of
 
 _EXAMPLES: Final = """\
 examples:
@@ -127,7 +127,7 @@ def reached(flash: Flash) -> str:
     if found is None:
         return "nothing that erases, as far as is known"
     packet = f", packet {found.packet} acknowledged" if found.packet else ""
-    return f"{prose_of('Phase', found.phase)}{packet}"
+    return f"{wording_of('Phase', found.phase)}{packet}"
 
 
 def again(began: Began) -> str:

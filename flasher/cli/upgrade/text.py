@@ -26,10 +26,10 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan
 from flasher.image.release import names_of
 from flasher.image.sample import is_sample
-from flasher.prose import prose
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkReport
+from flasher.wording import wording
 
 _NO_QUERY = ": the document gives this target no query for it"
 
@@ -189,7 +189,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
         f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
         f"              {faults}, {whole}",
         f"boot version: {outcome.boot_version or 'not announced: it sat in an open session'}",
-        f"completed:    {prose(outcome.ending)}",
+        f"completed:    {wording(outcome.ending)}",
         f"running:      {_running(result)}",
     ]
 
@@ -218,7 +218,7 @@ def _running(result: Result) -> str:
     if verification.verdict is Verdict.NOT_ASKED:
         no_query = "" if _has_query(result) else _NO_QUERY
         return result.running_version or f"not asked{no_query}"
-    return f"{result.running_version or 'unknown'} ({prose(verification.verdict)})"
+    return f"{result.running_version or 'unknown'} ({wording(verification.verdict)})"
 
 
 def _has_query(result: Result) -> bool:

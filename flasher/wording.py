@@ -139,12 +139,12 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
 }
 
 
-def prose(word: Enum) -> str:
+def wording(word: Enum) -> str:
     """The text for a member of an enumeration."""
     return _TEXTS[type(word).__name__][word.value]
 
 
-def prose_of(enumeration: str, word: str) -> str:
+def wording_of(enumeration: str, word: str) -> str:
     """The text for a word of the enumeration of this name; the word itself where there is none."""
     return _TEXTS[enumeration].get(word, word)
 

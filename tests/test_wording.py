@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from flasher import prose
+from flasher import wording
 from flasher.bus.health import ControllerState
 from flasher.events import Phase
 from flasher.host.outcome import DeviceLeft
@@ -33,15 +33,15 @@ TOLD: tuple[type[Enum], ...] = (
 def test_every_member_has_a_word_and_a_text(told: type[Enum]) -> None:
     for member in told:
         assert member.value == member.name.lower()
-        assert prose.prose(member)
-    assert prose._TEXTS[told.__name__].keys() == {member.value for member in told}
+        assert wording.prose(member)
+    assert wording._TEXTS[told.__name__].keys() == {member.value for member in told}
 
 
 def test_nothing_else_is_in_the_catalogue() -> None:
-    assert prose._TEXTS.keys() == {told.__name__ for told in TOLD}
-    assert prose._EXPLANATIONS.keys() <= {cause.value for cause in Cause}
+    assert wording._TEXTS.keys() == {told.__name__ for told in TOLD}
+    assert wording._EXPLANATIONS.keys() <= {cause.value for cause in Cause}
 
 
 def test_a_word_that_is_not_known_stands_for_itself() -> None:
-    assert prose.prose_of("DamageReason", "bad_crc") == "wrong CRC"
-    assert prose.prose_of("DamageReason", "cut short") == "cut short"
+    assert wording.wording_of("DamageReason", "bad_crc") == "wrong CRC"
+    assert wording.wording_of("DamageReason", "cut short") == "cut short"
