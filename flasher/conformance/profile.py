@@ -27,8 +27,8 @@ from pydantic import AfterValidator, Field, model_validator
 from flasher.conformance.wire import IMAGE_BYTES_MAX, RESET, RESET_TEXT
 from flasher.errors import Fault, did_you_mean, printable
 from flasher.files import read_toml
-from flasher.form import Bounds, Form
 from flasher.settings.reading import Key, Reader, Table
+from flasher.validation import NumberRange, Parsed
 
 DEVIATIONS: Final = "deviations"
 _TABLES: Final = ("limits", "device")
@@ -55,8 +55,8 @@ def _check_deviations(deviations: dict[str, str]) -> dict[str, str]:
     return deviations
 
 
-Limit = Annotated[float, Bounds(ge=0, le=3600)]
-Ascii = Annotated[str, Form("a text in ASCII", _ascii)]
+Limit = Annotated[float, NumberRange(ge=0, le=3600)]
+Ascii = Annotated[str, Parsed("a text in ASCII", _ascii)]
 
 
 class Limits(Table):
@@ -97,21 +97,21 @@ class Limits(Table):
 class DeviceFacts(Table):
     """Sizes and words of the product."""
 
-    application_bytes: Annotated[int, Bounds(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
+    application_bytes: Annotated[int, NumberRange(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
     """Size of the application area."""
-    largest_image_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
+    largest_image_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
     """The largest image that is taken."""
-    application_address: Annotated[int, Bounds(ge=0, le=0xFFFF_FFFF)] = 0
+    application_address: Annotated[int, NumberRange(ge=0, le=0xFFFF_FFFF)] = 0
     """Where the application area begins in the memory that a BMS tells (4308), by which the flash
     is compared on a bench without readback; 0: unknown.
     """
-    reset_command: Annotated[int, Bounds(ge=0, le=0xFFFF)] = RESET
+    reset_command: Annotated[int, NumberRange(ge=0, le=0xFFFF)] = RESET
     """Command that restarts into the bootloader (R3)."""
     reset_data: Ascii = RESET_TEXT.decode()
     """Data of that command."""
-    versions: Annotated[int, Bounds(ge=1, le=100)] = 4
+    versions: Annotated[int, NumberRange(ge=1, le=100)] = 4
     """Boot versions in a burst."""
-    buffer_bytes: Annotated[int, Bounds(ge=0, le=IMAGE_BYTES_MAX)] = 0
+    buffer_bytes: Annotated[int, NumberRange(ge=0, le=IMAGE_BYTES_MAX)] = 0
     """What it has acknowledged and may not have written yet, until the end of transfer."""
 
     @model_validator(mode="after")

@@ -12,7 +12,6 @@ from fnmatch import fnmatchcase
 from typing import Annotated
 
 from flasher.errors import ErrorCode, ImageError, WrongDeviceError
-from flasher.form import Bounds, Form
 from flasher.image.image import Image
 from flasher.protocol.spec import IMAGE_MAX_SIZE, TARGETS, Target, find_target
 from flasher.protocol.text import (
@@ -22,6 +21,7 @@ from flasher.protocol.text import (
     boot_version_number,
     printable,
 )
+from flasher.validation import NumberRange, Parsed
 
 
 def _text(value: object) -> str:
@@ -58,14 +58,14 @@ def _boot_version(value: object) -> str:
     return _text(value)
 
 
-DeviceText = Annotated[str, Form("a text of printable ASCII", _text)]
+DeviceText = Annotated[str, Parsed("a text of printable ASCII", _text)]
 TargetName = Annotated[
-    Target, Form(f"one of {', '.join(TARGETS)}", _target, lambda target: target.name)
+    Target, Parsed(f"one of {', '.join(TARGETS)}", _target, lambda target: target.name)
 ]
 FirmwareText = Annotated[
-    str, Form(f"a text of the form {FIRMWARE_VERSION_FORM}", _firmware_version)
+    str, Parsed(f"a text of the form {FIRMWARE_VERSION_FORM}", _firmware_version)
 ]
-BootText = Annotated[str, Form(f"a text of the form {BOOT_VERSION_FORM}", _boot_version)]
+BootText = Annotated[str, Parsed(f"a text of the form {BOOT_VERSION_FORM}", _boot_version)]
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ class Release:
     """The device that the image is for."""
     firmware_version: FirmwareText | None = None
     """The version inside the image."""
-    size_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_MAX_SIZE)]
+    size_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)]
     """Bytes to be sent."""
-    sha256: Annotated[str, Form("64 hex digits", _sha256)]
+    sha256: Annotated[str, Parsed("64 hex digits", _sha256)]
     """Of the bytes to be sent, lower-case hex digits."""
     hardware_versions: tuple[DeviceText, ...] = ()
     """Hardware that it fits; `*` stands for any text, and none means any."""

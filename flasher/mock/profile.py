@@ -12,7 +12,6 @@ from functools import cache, cached_property
 from typing import Annotated, Literal, Self, get_args, get_origin, get_type_hints
 
 from flasher.errors import UsageError, did_you_mean
-from flasher.form import Form
 from flasher.protocol.spec import (
     IMAGE_MAX_SIZE,
     PACKET_DATA_SIZE,
@@ -20,6 +19,7 @@ from flasher.protocol.spec import (
     Dialect,
 )
 from flasher.protocol.text import encode_text
+from flasher.validation import Parsed
 
 _NO_QUERIES = "none"
 _SUFFIXES = {"K": 1024, "M": 1024 * 1024}
@@ -46,10 +46,10 @@ def _read_number_or_none(value: str | int | None) -> int | None:
     return None if value is None or is_none else _read_number(value)
 
 
-Seconds = Annotated[float, Form("a number from 0 on, as 0.05", _read_seconds)]
-Number = Annotated[int, Form("a number from 0 on, as 2048, 0x800 or 2K", _read_number)]
+Seconds = Annotated[float, Parsed("a number from 0 on, as 0.05", _read_seconds)]
+Number = Annotated[int, Parsed("a number from 0 on, as 2048, 0x800 or 2K", _read_number)]
 NumberOrNone = Annotated[
-    int | None, Form("a number from 0 on, as 2048, 0x800 or 2K, or none", _read_number_or_none)
+    int | None, Parsed("a number from 0 on, as 2048, 0x800 or 2K, or none", _read_number_or_none)
 ]
 
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from flasher.form import Bounds
+from flasher.validation import NumberRange
 
-Timeout = Annotated[float, Bounds(gt=0, le=3600)]
+Timeout = Annotated[float, NumberRange(gt=0, le=3600)]
 """A timeout of zero would fail at once."""
-Pause = Annotated[float, Bounds(ge=0, le=3600)]
-Tries = Annotated[int, Bounds(ge=1, le=1000)]
+Pause = Annotated[float, NumberRange(ge=0, le=3600)]
+Tries = Annotated[int, NumberRange(ge=1, le=1000)]
 
 
 @dataclass(frozen=True)

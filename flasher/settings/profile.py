@@ -27,7 +27,6 @@ from platformdirs import user_config_path
 
 from flasher.errors import ErrorCode, Fault, ImageError, UsageError
 from flasher.files import read_toml
-from flasher.form import Bounds, Form
 from flasher.host.identity import Identity
 from flasher.host.options import DEFAULT_ATTEMPTS, PACKET_GAP_MAX_S, UpgradeOptions
 from flasher.host.query import Request
@@ -55,6 +54,7 @@ from flasher.protocol.spec import (
 )
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings, Tries
+from flasher.validation import NumberRange, Parsed
 
 if TYPE_CHECKING:
     from flasher.bus.fallback import Fallback
@@ -73,9 +73,9 @@ _TABLES: Final = ("timings", "application_area", "version_query")
 _DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
 _DAY_S: Final = 24 * 3600
 
-Time = Annotated[float, Bounds(gt=0, le=_DAY_S)]
-Number16 = Annotated[int, Bounds(ge=0, le=0xFFFF)]
-Number32 = Annotated[int, Bounds(ge=0, le=0xFFFF_FFFF)]
+Time = Annotated[float, NumberRange(gt=0, le=_DAY_S)]
+Number16 = Annotated[int, NumberRange(ge=0, le=0xFFFF)]
+Number32 = Annotated[int, NumberRange(ge=0, le=0xFFFF_FFFF)]
 
 
 def _data(value: object) -> bytes:
@@ -91,7 +91,7 @@ def _data(value: object) -> bytes:
 
 
 Data = Annotated[
-    bytes, Form(f"a text in ASCII, or a list of bytes, of {_DATA_MAX} bytes at most", _data)
+    bytes, Parsed(f"a text in ASCII, or a list of bytes, of {_DATA_MAX} bytes at most", _data)
 ]
 
 
@@ -107,7 +107,7 @@ class ApplicationArea:
 
     start: Number32
     """Address of the application."""
-    size_bytes: Annotated[int, Bounds(ge=1, le=0xFFFF_FFFF)]
+    size_bytes: Annotated[int, NumberRange(ge=1, le=0xFFFF_FFFF)]
     """Size of the application's area."""
 
     @property
@@ -124,13 +124,13 @@ class VersionQuery:
 
     command: Number16
     """Asks for the version."""
-    answer_id: Annotated[int, Bounds(ge=0, le=0x7FF)]
+    answer_id: Annotated[int, NumberRange(ge=0, le=0x7FF)]
     """CAN id of the answer."""
     answer_command: Number16
     """Command of the answer."""
-    offset: Annotated[int, Bounds(ge=0, le=_DATA_MAX)]
+    offset: Annotated[int, NumberRange(ge=0, le=_DATA_MAX)]
     """Where the text begins in the data."""
-    size_bytes: Annotated[int, Bounds(ge=1, le=_DATA_MAX)]
+    size_bytes: Annotated[int, NumberRange(ge=1, le=_DATA_MAX)]
     """Size of the text."""
 
     def request(self, target: Target) -> Request:
@@ -192,8 +192,8 @@ class Profile:
     project), "document", or the path of a file for each name of `values()`.
     """
 
-    target: Annotated[Target, Form("a target", TARGETS.__getitem__)]
-    dialect: Annotated[Dialect, Form("a dialect", DIALECTS.__getitem__)] = WELLING
+    target: Annotated[Target, Parsed("a target", TARGETS.__getitem__)]
+    dialect: Annotated[Dialect, Parsed("a dialect", DIALECTS.__getitem__)] = WELLING
     has_upgrade: bool = WELLING.has_upgrade
     """Upgrade, even where the document has cancelled it (section 6)."""
     timings: Timings = DEFAULT_TIMINGS
@@ -203,17 +203,19 @@ class Profile:
     """Overall deadline; without it one is computed from the plan."""
     power_up_timeout_s: Time = UpgradeOptions.power_up_timeout_s
     """Wait for a power cycle."""
-    adapter_return_s: Annotated[float, Bounds(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
+    adapter_return_s: Annotated[float, NumberRange(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
     """Wait for a lost adapter."""
     cpu: Cpu = Identity.cpu
     """The device's processor; other: no vector table is looked for in images."""
-    low_charge_percent: Annotated[int, Bounds(ge=0, le=100)] = Identity.low_charge_percent
+    low_charge_percent: Annotated[int, NumberRange(ge=0, le=100)] = Identity.low_charge_percent
     """Warn before an upgrade below this state of charge."""
-    in_use_ma: Annotated[int, Bounds(ge=0, le=0x7FFF)] = Identity.in_use_ma
+    in_use_ma: Annotated[int, NumberRange(ge=0, le=0x7FFF)] = Identity.in_use_ma
     """A discharge beyond this is a vehicle in use."""
-    frame_gap_s: Annotated[float, Bounds(ge=0, le=1)] = UpgradeOptions.frame_gap_s
+    frame_gap_s: Annotated[float, NumberRange(ge=0, le=1)] = UpgradeOptions.frame_gap_s
     """Silence between the frames of a message."""
-    packet_gap_s: Annotated[float, Bounds(ge=0, le=PACKET_GAP_MAX_S)] = UpgradeOptions.packet_gap_s
+    packet_gap_s: Annotated[float, NumberRange(ge=0, le=PACKET_GAP_MAX_S)] = (
+        UpgradeOptions.packet_gap_s
+    )
     """Silence before each packet."""
     nak_next_is_ack: bool = UpgradeOptions.nak_next_is_ack
     """NAK n+1 after a repeated packet n is ACK n (R10)."""
@@ -221,7 +223,7 @@ class Profile:
     """Restarts the application into the bootloader (R3)."""
     reset_data: Data = b"RESET"
     """The data of reset_command."""
-    image_limit_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_MAX_SIZE)] | None = None
+    image_limit_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)] | None = None
     """The largest image that the device takes."""
     application_area: ApplicationArea | None = None
     version_query: VersionQuery | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from flasher.form import LowerInJson
 from flasher.station.records.model import (
     Figures,
     RunId,
@@ -19,9 +18,10 @@ from flasher.station.records.model import (
     StepState,
     Verified,
 )
+from flasher.validation import LowerCaseInJson
 
 
-class SocketState(LowerInJson, StrEnum):
+class SocketState(LowerCaseInJson, StrEnum):
     """What a socket shows; the word is for people."""
 
     STARTING = "STARTING"

@@ -12,14 +12,14 @@ from pydantic import PydanticUserError
 
 from flasher.cli.documents import as_json
 from flasher.cli.schema import schema_of
-from flasher.form import LowerInJson
+from flasher.validation import LowerCaseInJson
 
 
 class Colour(Enum):
     DARK_RED = "dark_red"
 
 
-class State(LowerInJson, StrEnum):
+class State(LowerCaseInJson, StrEnum):
     PASS = "PASS"  # noqa: S105
     FAIL = "FAIL"
 

@@ -9,7 +9,7 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Final, NewType, Protocol
 
-from flasher.form import LowerInJson
+from flasher.validation import LowerCaseInJson
 
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
@@ -43,7 +43,7 @@ def utc_moment(text: str) -> datetime:
     return datetime.fromisoformat(text)
 
 
-class RunState(LowerInJson, StrEnum):
+class RunState(LowerCaseInJson, StrEnum):
     """Where a run is, or how it ended."""
 
     RUNNING = "RUNNING"
@@ -99,7 +99,7 @@ class AuditEvent(StrEnum):
     """By a supervisor, by its own person at another browser, or by its limits."""
 
 
-class UnitState(LowerInJson, StrEnum):
+class UnitState(LowerCaseInJson, StrEnum):
     """What is known of a unit: derived from its last run."""
 
     NEW = "NEW"
@@ -148,7 +148,7 @@ class Verified(IntEnum):
         return ("completed, not read back", "version read back", "memory read back")[self]
 
 
-class StepState(LowerInJson, StrEnum):
+class StepState(LowerCaseInJson, StrEnum):
     """How one try of a step ended."""
 
     PASS = "PASS"  # noqa: S105

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Form:
+class Parsed:
     """The form of a value; `read` raises ValueError or TypeError for what has another."""
 
     words: str
@@ -47,7 +47,7 @@ class Form:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class NumberRange:
     """The range of a number: above `gt` or from `ge` on, up to `le`."""
 
     ge: float | None = None
@@ -62,7 +62,7 @@ class Bounds:
         return {**schema, **given}
 
 
-class LowerInJson:
+class LowerCaseInJson:
     """For an enumeration whose words are upper case where people and records have them: in JSON,
     where all words are lower case, stand its names.
     """
