@@ -33,7 +33,7 @@ from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, is_secret
 from flasher.events import TwoDevicesSeen
-from flasher.host.told import warning_of
+from flasher.host.event_text import warning_text
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkMeter, LinkReport
@@ -112,7 +112,7 @@ class Recording:
         """Print and keep what a command reports beside its result."""
         if isinstance(event, TwoDevicesSeen):
             self.two_devices = event.what
-            output.error_line(f"warning: {warning_of(event)}")
+            output.error_line(f"warning: {warning_text(event)}")
 
     def opened(self, connection: Connection) -> None:
         """The bus is open."""

@@ -20,10 +20,10 @@ from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
 from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
+from flasher.host.event_text import progress_line, warning_text
 from flasher.host.identity import Check, DeviceAnswers, judge_device, new_version
 from flasher.host.outcome import AGAIN
 from flasher.host.query import piece_of
-from flasher.host.told import line_of, warning_of
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, refused_sample
@@ -515,8 +515,8 @@ class Bench:
 
 def _note_of(event: object) -> str:
     """What is told of an event; checks have a place of their own."""
-    line = line_of(event)
-    said = warning_of(event) or (line[0] if line and line[1] < 2 else "")
+    line = progress_line(event)
+    said = warning_text(event) or (line[0] if line and line[1] < 2 else "")
     return "" if isinstance(event, events.CheckMade) else said
 
 

@@ -19,8 +19,8 @@ from flasher.cli.output import Output
 from flasher.cli.upgrade.progress import Progress
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
+from flasher.host.event_text import reason_text
 from flasher.host.table import Reason
-from flasher.host.told import because
 from flasher.image.image import Image
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment
@@ -311,7 +311,7 @@ def test_verbosity_decides_how_much_is_said(
 def test_everything_that_is_sent_again_has_a_sentence() -> None:
     reasons = {reason.value for reason in Reason}
     assert len(reasons) >= 9
-    assert {reason for reason in reasons if because(reason, "packet 3") == reason} == set()
+    assert {reason for reason in reasons if reason_text(reason, "packet 3") == reason} == set()
 
 
 def test_tqdm_is_loaded_only_for_a_bar(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from flasher import events
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output
 from flasher.cli.terminal import painted
-from flasher.host.told import line_of, warning_of
+from flasher.host.event_text import progress_line, warning_text
 from flasher.image.plan import Plan
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
@@ -60,10 +60,10 @@ class Progress:
                 text = f"power-cycle the device now (waiting {limit_s:.0f} s)"
                 bold = painted(text, "yellow") if self._output.colour else text
                 self._output.error_line(f">>> {bold}")
-        if warning := warning_of(event):
+        if warning := warning_text(event):
             self._bar.close()
             self._output.error_line(f"warning: {warning}")
-        elif line := line_of(event):
+        elif line := progress_line(event):
             text, level = line
             self._output.progress(text, level=level)
 
@@ -73,4 +73,4 @@ def _is_shown(event: object) -> bool:
     has_more = isinstance(
         event, events.PacketAcknowledged | events.AdapterAwaited | events.PowerCycleAwaited
     )
-    return has_more or bool(warning_of(event) or line_of(event))
+    return has_more or bool(warning_text(event) or progress_line(event))

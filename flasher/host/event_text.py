@@ -12,12 +12,12 @@ _TRIES_SHOWN: Final = 10
 """Every so many tries of a message, 5 s of them without an answer, it is seen without -v."""
 
 
-def because(reason: str, what: str = "") -> str:
+def reason_text(reason: str, what: str = "") -> str:
     """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
     return wording_of("Reason", reason).replace("{what}", what)
 
 
-def warning_of(event: object) -> str:
+def warning_text(event: object) -> str:
     """What nobody should miss, in words; empty for any other event."""
     match event:
         case events.ShutdownHeard(sender):
@@ -41,21 +41,21 @@ def warning_of(event: object) -> str:
             return ""
 
 
-def line_of(event: object) -> tuple[str, int] | None:
+def progress_line(event: object) -> tuple[str, int] | None:
     """A line and the level of verbosity that shows it; None for an event without a line."""
     match event:
         case events.PhaseEntered(phase, _):
             return f"{wording(phase)} ...", 0
         case events.AttemptStarted(attempt, reason, left_s):
             left = f" ({_span(left_s)} left)" if left_s else ""
-            return f"{because(reason)}: beginning again, attempt {attempt}{left}", 0
+            return f"{reason_text(reason)}: beginning again, attempt {attempt}{left}", 0
         case events.UpgradeLeftOpen(at, image, has_end):
             left = "left the device without an application" if has_end else "has no end"
             text = f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
             return f"{text}update command if it stays silent", 0
         case events.MessageRepeated(what, reason, tries):
             level = 1 if tries % _TRIES_SHOWN else 0
-            return f"{because(reason, what)}: sending {what} again, try {tries}", level
+            return f"{reason_text(reason, what)}: sending {what} again, try {tries}", level
         case events.BootVersionSeen(name, version):
             return f"boot version: {name} {version}", 0
         case events.CheckMade(_, verdict, text):

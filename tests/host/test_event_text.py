@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flasher import events
 from flasher.events import Phase
-from flasher.host.told import because, line_of, warning_of
+from flasher.host.event_text import progress_line, reason_text, warning_text
 from tests.loops import each
 
 LINES: list[tuple[object, int, str]] = [
@@ -58,19 +58,19 @@ LINES: list[tuple[object, int, str]] = [
 def test_an_event_has_a_line_from_its_verbosity_on(
     event: object, verbosity: int, line: str
 ) -> None:
-    assert line_of(event) == (line, verbosity)
+    assert progress_line(event) == (line, verbosity)
 
 
 @each("tries, verbosity", [(2, 1), (9, 1), (10, 0), (11, 1), (20, 0)])
 def test_every_tenth_try_of_a_message_is_seen_by_everybody(tries: int, verbosity: int) -> None:
     again = "the device did not answer packet 7 in time: sending packet 7 again"
     event = events.MessageRepeated("packet 7", "packet_unanswered", tries)
-    assert line_of(event) == (f"{again}, try {tries}", verbosity)
+    assert progress_line(event) == (f"{again}, try {tries}", verbosity)
 
 
 @each("event", [events.PacketAcknowledged(1, 2, 1), events.MemoryRead(1, 2), object()])
 def test_an_event_that_other_means_show_has_no_line(event: object) -> None:
-    assert line_of(event) is None
+    assert progress_line(event) is None
 
 
 @each(
@@ -103,8 +103,8 @@ def test_an_event_that_other_means_show_has_no_line(event: object) -> None:
     ],
 )
 def test_what_nobody_should_miss_is_a_warning(event: object, words: str) -> None:
-    assert warning_of(event) == words
+    assert warning_text(event) == words
 
 
 def test_a_reason_names_what_is_sent_again() -> None:
-    assert because("end_refused", "end of transfer") == "the device refused the end of transfer"
+    assert reason_text("end_refused", "end of transfer") == "the device refused the end of transfer"
