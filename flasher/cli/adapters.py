@@ -12,7 +12,7 @@ import click
 from flasher.api import Device, Watch
 from flasher.bus.detect import SLOW, SOCKETCAN, Detected, Detection, Found, serial_ports
 from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface, start_command
-from flasher.cli.framework import retyped
+from flasher.cli.framework import rebuild_command_line
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -79,7 +79,7 @@ def described(found: Found, dialect: Dialect) -> str:
 # -- the one that a command uses -------------------------------------------------------------------
 
 
-def settled(bus: Bus, output: Output) -> Bus:
+def choose_adapter(bus: Bus, output: Output) -> Bus:
     """The bus with an adapter: the only one found where nothing names one, which is said.
 
     Raises UsageError when several are found, BusError when none is.
@@ -131,7 +131,7 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[Watch]
         )
         ctx = click.get_current_context()
         name = ctx.info_name or ""
-        words = retyped(ctx, name)
+        words = rebuild_command_line(ctx, name)
         behind = words.index(name) + 1
         error.command = shlex.join(["flasher", *words[:behind], *bus.found.words, *words[behind:]])
         raise error

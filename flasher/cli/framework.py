@@ -172,7 +172,7 @@ def typed_values(*, but: str) -> list[str]:
     return found
 
 
-def retyped(
+def rebuild_command_line(
     ctx: click.Context,
     command: str,
     *,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 from platformdirs import user_state_path
 
 from flasher.api import Connection, Device, Watch
-from flasher.cli.adapters import settled
+from flasher.cli.adapters import choose_adapter
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
@@ -180,7 +180,7 @@ def recorded_connection(
     """The bus that the options name, else the only adapter found, and a recording of it: for
     commands that ask one thing.
     """
-    bus = settled(bus, output)
+    bus = choose_adapter(bus, output)
     with (
         recording(options, bus, output, target=target) as record,
         bus.connect(target) as connection,

@@ -128,7 +128,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     """Ask one question; the query says how it went. See the module for the times."""
     title = query.request.item.title
     run.tx.all_left(run.now)
-    run.hear_too(query.answer_item.can_id, *_others_ask(query))
+    run.also_listen_on(query.answer_item.can_id, *_others_ask(query))
     query.repeat_at = run.now
     query.ends_at = run.now + run.timings.command_timeout_s
     came: Came = Signal.TIME

@@ -97,7 +97,7 @@ class Runner(Generic[T]):
         self._always = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = dict(self._always)
 
-    def hear_too(self, *can_ids: int) -> None:
+    def also_listen_on(self, *can_ids: int) -> None:
         """Hear messages on these ids as well."""
         for can_id in can_ids:
             if can_id not in self._always:

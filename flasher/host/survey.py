@@ -142,7 +142,7 @@ class Survey(Runner[None]):
         heard.frames += 1
         if frame.can_id not in self._ids:
             self._ids.add(frame.can_id)
-            self.hear_too(frame.can_id)
+            self.also_listen_on(frame.can_id)
         return False
 
     def _take(self, came: Came) -> Came:

@@ -96,7 +96,7 @@ OPERATORS: Final[dict[type[ast.operator], type[ast.operator]]] = {
     ast.LShift: ast.RShift,
     ast.RShift: ast.LShift,
 }
-UNORDERED: Final = ("_do", "run.hear_too", "run.listen_always")
+UNORDERED: Final = ("_do", "run.also_listen_on", "run.listen_always")
 """Functions whose arguments may stand in any order."""
 OPPOSITES: Final = {"min": "max", "max": "min", "any": "all", "all": "any"}
 CONDITIONS: Final = ("test", "ifs", "guard")

@@ -72,7 +72,7 @@ def test_what_is_on_other_ids_or_is_no_payload_is_not_heard() -> None:
 def test_what_is_heard_always_stays_when_something_else_is_listened_for() -> None:
     made, came = runner()
     made.listen_always(0x720)
-    made.hear_too(0x730)
+    made.also_listen_on(0x730)
     made.listen(0x721)
     for can_id in (0x720, 0x721, 0x730):
         for part in parts(can_id):

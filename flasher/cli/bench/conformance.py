@@ -36,7 +36,14 @@ from flasher.cli.bench.conformance_text import (
 )
 from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.framework import argument, group, option, option_set, retyped, typed_values
+from flasher.cli.framework import (
+    argument,
+    group,
+    option,
+    option_set,
+    rebuild_command_line,
+    typed_values,
+)
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.conformance.catalogue import (
@@ -371,7 +378,10 @@ def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:
     case id and repeat.
     """
     ctx = click.get_current_context()
-    bench = ["flasher", *retyped(ctx, "conformance", without=_RUN_OPTIONS.__contains__)]
+    bench = [
+        "flasher",
+        *rebuild_command_line(ctx, "conformance", without=_RUN_OPTIONS.__contains__),
+    ]
     found = {}
     for result in report.results:
         words = [*bench, "--case", result.case_id, "--seed", report.seed]

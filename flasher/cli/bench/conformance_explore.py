@@ -23,7 +23,7 @@ from flasher.cli.bench.conformance_bench import (
 )
 from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.framework import command, option, retyped, typed_values
+from flasher.cli.framework import command, option, rebuild_command_line, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.errors import ExitCode
@@ -154,7 +154,7 @@ def explore(
 
 def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> int:
     ctx, finding = click.get_current_context(), explored.finding
-    words = ["flasher", *retyped(ctx, "conformance", without=_REPLACED.__contains__)]
+    words = ["flasher", *rebuild_command_line(ctx, "conformance", without=_REPLACED.__contains__)]
     words.insert(words.index("conformance") + 1, "explore")
     met = sum(bool(count) for _, _, count in explored.coverage)
     output.result(

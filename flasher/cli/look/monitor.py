@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from flasher.cli import values
-from flasher.cli.adapters import settled
+from flasher.cli.adapters import choose_adapter
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, TableView, View
 from flasher.cli.options import Bus, bus_options, target_option
@@ -129,7 +129,7 @@ def monitor(
     )
     with ExitStack() as stack:
         if trace is None:
-            bus = settled(bus, output)
+            bus = choose_adapter(bus, output)
             connection = stack.enter_context(bus.connect(target or BMS, asks=False))
             view.name = printable(connection.name)
             cancelled = stack.enter_context(stop_on_signal())

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Final, Literal
 
 from flasher.bus.bit_rate import BitRate
-from flasher.cli.adapters import settled
+from flasher.cli.adapters import choose_adapter
 from flasher.cli.documents import HeardDocument
 from flasher.cli.framework import command
 from flasher.cli.look.content import heard_document, heard_lines
@@ -60,7 +60,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
     """Find out who is on the bus, and which dialect is spoken. Sends one round of queries to the
     battery, and nothing else: no bit rate is tried, since a wrong one disturbs a live bus.
     """
-    bus = settled(bus, output)
+    bus = choose_adapter(bus, output)
     dialect, rate = bus.dialect, bus.bit_rate
     with (
         recorded_connection(recorded, bus, output, target or BMS) as (connection, record),

@@ -9,7 +9,7 @@ import click
 
 from flasher.api import as_dialect
 from flasher.cli import values
-from flasher.cli.adapters import check_heard, settled
+from flasher.cli.adapters import check_heard, choose_adapter
 from flasher.cli.framework import argument, command, option
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
@@ -136,7 +136,7 @@ def write(
             remedy="Add --yes.",
             code=ErrorCode.NOT_CONFIRMED,
         )
-    bus = settled(bus, output)
+    bus = choose_adapter(bus, output)
     with recorded_connection(recorded, bus, output, target) as (connection, record):
         device = connection.device(target, dialect=bus.dialect, taps=record.taps)
         with stop_on_signal() as stopped:

@@ -12,8 +12,8 @@ import click
 
 from flasher import api
 from flasher.cli import values
-from flasher.cli.adapters import check_heard, settled
-from flasher.cli.framework import command, option, option_set, retyped
+from flasher.cli.adapters import check_heard, choose_adapter
+from flasher.cli.framework import command, option, option_set, rebuild_command_line
 from flasher.cli.options import (
     Bus,
     ImageOptions,
@@ -288,7 +288,7 @@ class _Upgrade:
         profile.check_fits(image)
         self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
-            self.bus = settled(self.bus, output)
+            self.bus = choose_adapter(self.bus, output)
         waived = [name for name in OF_DEVICE if choices.allows(name)]
         waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
         job = api.prepare(
@@ -333,7 +333,7 @@ class _Upgrade:
     def _carry_out(self, job: api.Job) -> int:
         output = self.output
         ctx = click.get_current_context()
-        again = shlex.join(["flasher", *retyped(ctx, str(ctx.info_name))])
+        again = shlex.join(["flasher", *rebuild_command_line(ctx, str(ctx.info_name))])
         carried = Carried(job, self.bus, self.recorded, output, self._add_repair, again)
         result = carried.carry_out(
             lambda: self._connect(at_power_up=job.options.at_power_up),
@@ -427,4 +427,6 @@ def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
         return name in _LEFT_OUT or (is_refused and of_the_image)
 
     replaced = {"image": OTHER_IMAGE} if is_refused else {}
-    return shlex.join(["flasher", *retyped(ctx, "rescue", without=is_left_out, replaced=replaced)])
+    return shlex.join(
+        ["flasher", *rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)]
+    )
