@@ -1,8 +1,7 @@
-"""What a type says of its values beyond its name: the bounds of a number, the form of a text, the
-words of an enumeration.
+"""Type annotations that validate: ranges of numbers, parsed texts, enumerations in lower case.
 
-It stands in an annotation: `Annotated[int, Bounds(ge=1, le=100)]`, `Annotated[str, Form("64 hex
-digits", read_sha256)]`. The validation library is needed only by who reads or writes files.
+`Annotated[int, NumberRange(ge=1, le=100)]`, `Annotated[str, Parsed("64 hex digits", read_sha256)]`.
+Only modules that read or write files need the validation library.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parsed:
-    """The form of a value; `read` raises ValueError or TypeError for what has another."""
+    """A value that `read` parses; it raises ValueError or TypeError for any other."""
 
     words: str
-    """What it is, as "64 hex digits"."""
+    """Describes the value to people: "64 hex digits"."""
     read: Callable[[Any], object]
     write: Callable[[Any], str] = str
-    """The text of a value in a document."""
+    """Returns the text of a value for a document."""
 
     def __get_pydantic_core_schema__(self, source: object, handler: object) -> CoreSchema:
         from pydantic_core import core_schema  # noqa: PLC0415
@@ -48,7 +47,7 @@ class Parsed:
 
 @dataclass(frozen=True)
 class NumberRange:
-    """The range of a number: above `gt` or from `ge` on, up to `le`."""
+    """Limits of a number: greater than `gt`, at least `ge`, at most `le`."""
 
     ge: float | None = None
     gt: float | None = None
@@ -63,9 +62,7 @@ class NumberRange:
 
 
 class LowerCaseInJson:
-    """For an enumeration whose words are upper case where people and records have them: in JSON,
-    where all words are lower case, stand its names.
-    """
+    """Writes the lower-case names of an enumeration in JSON, where its values are upper case."""
 
     @classmethod
     def __get_pydantic_core_schema__(

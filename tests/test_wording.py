@@ -33,7 +33,7 @@ TOLD: tuple[type[Enum], ...] = (
 def test_every_member_has_a_word_and_a_text(told: type[Enum]) -> None:
     for member in told:
         assert member.value == member.name.lower()
-        assert wording.prose(member)
+        assert wording.wording(member)
     assert wording._TEXTS[told.__name__].keys() == {member.value for member in told}
 
 

@@ -90,7 +90,7 @@ def environment(loader: BaseLoader) -> Environment:
     )
     made.filters["duration"] = scale.duration_text
     made.filters["counted"] = counted
-    made.filters["prose"] = wording
+    made.filters["wording"] = wording
     made.filters["percent"] = percent
     made.filters["shortened"] = shortened
     made.globals["Status"] = Status
