@@ -268,6 +268,8 @@ class Continuity:
                 # A burst that the reset before it has caused may still come: it was lost then.
                 self._requested_s = None
             elif found.command == Command.END_OF_TRANSFER:
+                # The burst before the transfer is over.
+                self._announced_s = self._announced_s if self._requested_s is None else None
                 self._requested_s = None
                 self._burst_until, self._awaits_complete = inf, True
                 self._announced_on = _ANNOUNCED_ON

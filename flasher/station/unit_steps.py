@@ -240,6 +240,7 @@ class UnitSteps:
             and found.seen.firmware_version == target.loaded.version
         ):
             return "flashed before the interruption, and the device names the version"
+        self._check_flashed()
         value = flash_value(target.loaded.version, target.job.plan.image.sha256)
         write = self._journal.intent(name, FLASH, value)
         self._progress(0.0)
@@ -268,6 +269,15 @@ class UnitSteps:
         self._journal.verified(write, result.running_version)
         self._flashed.add(name)
         return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}"
+
+    def _check_flashed(self) -> None:
+        """A target that was in its bootloader can report its serial number since its flash, before
+        anything is sent to the next one. Raises StepFailedError.
+        """
+        for target in self.targets:
+            if target.name in self._flashed and target.version_request is not None:
+                self._await(target)
+        self._check_label()
 
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""

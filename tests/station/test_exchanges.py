@@ -551,6 +551,17 @@ def test_only_where_the_unit_is_held_a_person_is_asked_to_switch_it(
     assert result.code == ("OK" if is_held else "NO_ANSWER"), result.text
 
 
+def test_a_battery_that_bears_another_label_costs_nothing_but_its_own_flash(tmp_path: Path) -> None:
+    """In its bootloader it could not say so; after its flash it does, and the controller beside it
+    is not touched.
+    """
+    bench = UnitBench(tmp_path, USUAL + target_table(WMC), targets=(BMS, WMC))
+    bench.put(without_application(serial_number="W2605009"))
+    result = bench.run()
+    assert (result.outcome, result.code) == (RunState.ERROR, "WRONG_UNIT"), result
+    assert bench.units[WMC].device.erase_count == 0
+
+
 # -- what is recorded -----------------------------------------------------------------------------
 
 

@@ -1,0 +1,75 @@
+"""What speaks for another unit, from the messages of a run and their times alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flasher.protocol.messages import (
+    BootVersion,
+    Complete,
+    EndOfTransfer,
+    GeneralFeedback,
+    RequestTransfer,
+    Reset,
+    UpdateCommand,
+)
+from flasher.protocol.spec import BMS
+from flasher.protocol.wire import encode, split
+from flasher.station.continuity import Continuity
+from flasher.station.presence import TargetWatcher
+from tests.loops import each
+from tests.station.test_presence import version_answer
+from tests.station.unit_bench import UnitBench
+
+BLIND_S = 0.15
+ANNOUNCEMENT = BootVersion("BMS", "V1.0.0")
+
+
+class Watched:
+    """A battery of a run, identified at 1.0 s."""
+
+    def __init__(self, folder: Path) -> None:
+        loaded = UnitBench(folder).recipe.targets[0]
+        self.watcher = TargetWatcher(loaded)
+        self.continuity = Continuity(loaded, self.watcher, blind_s=BLIND_S)
+        self.now = 1.0
+        for frame in version_answer("NONE"):
+            self.continuity(frame, sent=False, now=self.now)
+        self.continuity.begin(self.watcher.answer)
+
+    def go_to(self, now: float) -> None:
+        while self.now < now:
+            self.now = min(self.now + 0.05, now)
+            self.continuity.listened(self.now)
+
+    def hear(self, now: float, message: object, *, sent: bool = False) -> None:
+        self.go_to(now)
+        can_id = BMS.request_id if sent else BMS.answer_id
+        for frame in split(can_id, encode(message.to_message(can_id))):  # type: ignore[attr-defined]
+            self.continuity(frame, sent=sent, now=self.now)
+
+    def send(self, now: float, message: object) -> None:
+        self.hear(now, message, sent=True)
+
+    def announce(self, now: float, times: int = 4) -> None:
+        for number in range(times):
+            self.hear(now + 0.05 * number, ANNOUNCEMENT)
+
+
+@each("silence_s", [0.35, 1.0])
+def test_a_second_burst_after_the_complete_image_is_of_another_unit(
+    tmp_path: Path, silence_s: float
+) -> None:
+    """A small image is stored before the burst that preceded it could be over."""
+    run = Watched(tmp_path)
+    run.send(1.1, Reset())
+    run.hear(1.11, GeneralFeedback())
+    run.announce(1.2, 1)
+    run.send(1.21, UpdateCommand(BMS.update_text, 256))
+    run.hear(1.22, RequestTransfer())
+    run.send(1.23, EndOfTransfer())
+    run.hear(1.24, Complete())
+    run.announce(1.45)
+    assert not run.continuity.lost, "it may start by its bootloader"
+    run.announce(1.6 + silence_s)
+    assert "announced its bootloader" in run.continuity.lost
