@@ -13,8 +13,8 @@ import random
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final
 
-from flasher.conformance.host import UPDATES_MAX, PatientHost
 from flasher.conformance.judge import Judge, Times
+from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import BY_BUS, Subject, readback_source

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from flasher.conformance.decoded import Excerpt, excerpt, frame_lines
 from flasher.conformance.reports import ByResult, distribution, group_title
 from flasher.conformance.results import (
     CaseResult,
@@ -20,6 +19,7 @@ from flasher.conformance.results import (
     RunReport,
 )
 from flasher.conformance.side_by_side import SideBySide
+from flasher.conformance.trace_excerpt import Excerpt, excerpt, frame_lines
 from flasher.report import chart
 from flasher.report.base import Status, render_page
 from flasher.trace.figures import Distribution

@@ -16,6 +16,7 @@ from typing import Any, Final
 import pytest
 
 from flasher.conformance.bench import Bench
+from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.conformance.catalogue import (
     CASES,
     Case,
@@ -26,9 +27,7 @@ from flasher.conformance.catalogue import (
     known_cases,
     what_is_missing,
 )
-from flasher.conformance.decoded import excerpt, frame_lines
 from flasher.conformance.json_report import report_document, to_bytes
-from flasher.conformance.opening import BenchOptions, open_bench
 from flasher.conformance.profile import ConformanceProfile, check_deviations
 from flasher.conformance.real import HOST_UNCERTAINTY_S, PowerCommand, ReadbackCommand
 from flasher.conformance.reports import (
@@ -52,6 +51,7 @@ from flasher.conformance.results import (
 )
 from flasher.conformance.runner import Run, RunObserver, RunOptions
 from flasher.conformance.subject import Subject
+from flasher.conformance.trace_excerpt import excerpt, frame_lines
 from flasher.errors import FlasherError, printable, without_password
 from flasher.files import make_private
 from flasher.trace.figures import Distribution

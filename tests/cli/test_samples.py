@@ -15,7 +15,7 @@ import pytest
 import flasher as library
 from flasher import api
 from flasher.bus.simulated import SimulatedLink
-from flasher.conformance.opening import BenchOptions, open_bench
+from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.errors import ErrorCode, ExitCode, ImageError
 from flasher.host.waivers import WAIVERS
 from flasher.web.bench import Bench

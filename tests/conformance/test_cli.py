@@ -60,7 +60,7 @@ def test_the_replay_has_what_is_about_the_bench_and_nothing_about_the_run(
     def mock_instead(_options: object) -> Iterator[tuple[MockSubject, ConformanceProfile]]:
         yield MockSubject(), PROFILE
 
-    monkeypatch.setattr("flasher.conformance.opening.open_bench", mock_instead)
+    monkeypatch.setattr("flasher.conformance.bench_options.open_bench", mock_instead)
     monkeypatch.chdir(tmp_path)
     words = shlex.split(
         "conformance -t bms --profile 'my p.toml' --case RS-04 -i socketcan --seed 9 --repeat 2 "

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from flasher.conformance.explore import Explored, Explorer
-from flasher.conformance.explore.refused import REFUSED, Place, make
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
+from flasher.conformance.explore.stimuli import REFUSED, Place, make
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.restore import BY_NOTHING, restore

@@ -15,7 +15,7 @@ from flasher.conformance.explore.steps import next_step
 from flasher.conformance.explore.walk import Walk
 from flasher.conformance.init.answers import Trial
 from flasher.conformance.init.session import Session
-from flasher.conformance.init.transferring import in_forms
+from flasher.conformance.init.transfer_questions import in_forms
 from flasher.conformance.profile import words
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run

@@ -18,7 +18,6 @@ from flasher.conformance.html_report import MESSAGES_BAD, html_page
 from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes, to_json
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.release import summary_page
 from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
 from flasher.conformance.results import (
     CaseResult,
@@ -29,6 +28,7 @@ from flasher.conformance.results import (
     RunReport,
 )
 from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.summary_page import summary_page
 from flasher.mock.store import AREA_START
 from tests.loops import each
 from tests.report.pages import Page, assert_self_contained, assert_visible

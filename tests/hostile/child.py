@@ -25,8 +25,8 @@ import flasher.cli.upgrade.flash
 import flasher.cli.upgrade.image_info
 import flasher.cli.upgrade.manifest
 import flasher.cli.upgrade.profile
+import flasher.conformance.bench_options
 import flasher.conformance.diff
-import flasher.conformance.opening
 import flasher.conformance.runner
 import flasher.trace.source  # noqa: F401
 from flasher.cli.main import main

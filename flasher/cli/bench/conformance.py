@@ -352,7 +352,7 @@ def _tell(
 
 def _content(name: str, report: RunReport, document: ReportDocument) -> bytes:
     """What is written into the file of this name."""
-    from flasher.conformance import html_report, json_report, release, reports  # noqa: PLC0415
+    from flasher.conformance import html_report, json_report, reports, summary_page  # noqa: PLC0415
 
     started_at = document.started_at
     replays = {(one.id, one.repeat): one.replay for one in document.results}
@@ -367,9 +367,9 @@ def _content(name: str, report: RunReport, document: ReportDocument) -> bytes:
                 report, started_at=started_at, replays=replays, trace_files=traces
             )
         case "badge":
-            text = release.badge(report)
+            text = summary_page.badge(report)
         case _:
-            text = release.summary_page(report, started_at=started_at)
+            text = summary_page.summary_page(report, started_at=started_at)
     return text.encode("utf-8")
 
 
@@ -498,8 +498,8 @@ def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
 
     found = ConformanceProfile()
     if mock or choices:
+        from flasher.conformance.bench_options import device_profile  # noqa: PLC0415
         from flasher.conformance.mock import profile_of_mock  # noqa: PLC0415
-        from flasher.conformance.opening import device_profile  # noqa: PLC0415
 
         found = profile_of_mock(device_profile(choices))
     toml = found.to_toml()

@@ -19,7 +19,7 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.spec import Target
 
 if TYPE_CHECKING:
-    from flasher.conformance.opening import BenchOptions
+    from flasher.conformance.bench_options import BenchOptions
     from flasher.conformance.profile import ConformanceProfile
     from flasher.conformance.subject import Subject
 
@@ -46,7 +46,7 @@ class BenchChoices:
 
     def described(self, bus: Bus) -> BenchOptions:
         """The bench. Raises UsageError for one that makes no sense."""
-        from flasher.conformance.opening import BenchOptions, check_bench  # noqa: PLC0415
+        from flasher.conformance.bench_options import BenchOptions, check_bench  # noqa: PLC0415
         from flasher.conformance.real import PowerCommand, ReadbackCommand  # noqa: PLC0415
 
         if self.target is None:
@@ -86,7 +86,7 @@ def opened(
     described: BenchOptions, output: Output
 ) -> Iterator[tuple[Subject, ConformanceProfile, Stop]]:
     """The device, its profile, and whether the user has enough of it."""
-    from flasher.conformance.opening import open_bench  # noqa: PLC0415  much is loaded
+    from flasher.conformance.bench_options import open_bench  # noqa: PLC0415  much is loaded
 
     def stopping() -> None:
         output.progress("stopping: the device gets its good image back; press again to end at once")

@@ -1,4 +1,4 @@
-"""CR: checksum. Most stimuli are sent in a transfer that is never ended (`probing`)."""
+"""CR: checksum. Most stimuli are sent in a transfer that is never ended (`cases.probe`)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import Probe
+from flasher.conformance.cases.probe import Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
-from flasher.conformance.host import UPDATE_SPACING_S, UPDATES_MAX
+from flasher.conformance.patient_host import UPDATE_SPACING_S, UPDATES_MAX
 from flasher.conformance.tester import Fault, FaultKind
 from flasher.conformance.wire import (
     BOOT_VERSION,

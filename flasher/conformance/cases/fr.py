@@ -1,4 +1,4 @@
-"""FR: framing. Most stimuli are sent in a transfer that is never ended (`probing`)."""
+"""FR: framing. Most stimuli are sent in a transfer that is never ended (`cases.probe`)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as
+from flasher.conformance.cases.probe import ACCEPTED, EITHER, REJECTED, Probe, is_as
 from flasher.conformance.catalogue import DESTRUCTIVE, case
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import words

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import ACCEPTED, EITHER, Probe
+from flasher.conformance.cases.probe import ACCEPTED, EITHER, Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.judge import Times
 from flasher.conformance.wire import (

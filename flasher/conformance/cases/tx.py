@@ -10,8 +10,8 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
-from flasher.conformance.host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.judge import Times
+from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (

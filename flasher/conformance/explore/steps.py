@@ -7,7 +7,7 @@ import re
 from typing import Final, NamedTuple
 
 from flasher.conformance.cases.fr import forms
-from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES
+from flasher.conformance.explore.stimuli import ENDS, NO_CONCERN, PACKETS, UPDATES
 from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
 from flasher.conformance.wire import Encoder
 from flasher.errors import UsageError, did_you_mean

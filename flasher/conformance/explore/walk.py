@@ -18,8 +18,8 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.fr import forms
-from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place, make
-from flasher.conformance.host import LEFTOVER_S, UPDATE_SPACING_S
+from flasher.conformance.explore.stimuli import PACKETS, REFUSED, UPDATES, Place, make
+from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.profile import words
 from flasher.conformance.wire import (
     PACKET_BYTES,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from flasher.conformance.init import entering, transferring
+from flasher.conformance.init import entry_questions, transfer_questions
 from flasher.conformance.init.answers import Answer, Findings, Trial, decided, limit
 from flasher.conformance.init.session import Session
 from flasher.conformance.judge import Times
@@ -25,7 +25,7 @@ UPGRADES: Final = 100
 Question = Callable[[Session], Findings]
 QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (
-        entering.burst,
+        entry_questions.burst,
         (
             "device.reset_command",
             "device.reset_data",
@@ -34,31 +34,31 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
             "limits.version_spacing_tolerance_s",
         ),
     ),
-    (entering.upgrade, ("en_03",)),
-    (entering.in_burst, ("up_04_burst",)),
-    (entering.window, ("limits.window_s", "limits.window_tolerance_s", "up_04")),
-    (entering.reset_in_bootloader, ("rs_02",)),
-    (entering.rejected_update, ("up_02",)),
-    (entering.application, ("up_03",)),
-    (entering.feedback, ("fr_10",)),
-    (entering.update_twice, ("up_05",)),
-    (transferring.repeated_packet, ("tx_02",)),
-    (transferring.pause, ("tx_12", "limits.pause_s")),
-    (transferring.reset_again, ("tx_13",)),
-    (transferring.update_again, ("up_08",)),
-    (transferring.bad_packet, ("tx_01",)),
-    (transferring.lost_frame, ("tx_01_lost_frame",)),
-    (transferring.older_packet, ("tx_03",)),
-    (transferring.filler, ("tx_08",)),
-    (transferring.splits, ("fr_01",)),
-    (partial(transferring.in_forms, key="fr_02"), ("fr_02",)),
-    (partial(transferring.in_forms, key="fr_04"), ("fr_04",)),
-    (transferring.padded, ("fr_07",)),
-    (transferring.gaps, ("tm_02",)),
-    (transferring.end_again, ("en_02",)),
-    (entering.without_application, ("rs_03",)),
-    (transferring.buffer, ("device.buffer_bytes",)),
-    (entering.largest_image, ("device.largest_image_bytes",)),
+    (entry_questions.upgrade, ("en_03",)),
+    (entry_questions.in_burst, ("up_04_burst",)),
+    (entry_questions.window, ("limits.window_s", "limits.window_tolerance_s", "up_04")),
+    (entry_questions.reset_in_bootloader, ("rs_02",)),
+    (entry_questions.rejected_update, ("up_02",)),
+    (entry_questions.application, ("up_03",)),
+    (entry_questions.feedback, ("fr_10",)),
+    (entry_questions.update_twice, ("up_05",)),
+    (transfer_questions.repeated_packet, ("tx_02",)),
+    (transfer_questions.pause, ("tx_12", "limits.pause_s")),
+    (transfer_questions.reset_again, ("tx_13",)),
+    (transfer_questions.update_again, ("up_08",)),
+    (transfer_questions.bad_packet, ("tx_01",)),
+    (transfer_questions.lost_frame, ("tx_01_lost_frame",)),
+    (transfer_questions.older_packet, ("tx_03",)),
+    (transfer_questions.filler, ("tx_08",)),
+    (transfer_questions.splits, ("fr_01",)),
+    (partial(transfer_questions.in_forms, key="fr_02"), ("fr_02",)),
+    (partial(transfer_questions.in_forms, key="fr_04"), ("fr_04",)),
+    (transfer_questions.padded, ("fr_07",)),
+    (transfer_questions.gaps, ("tm_02",)),
+    (transfer_questions.end_again, ("en_02",)),
+    (entry_questions.without_application, ("rs_03",)),
+    (transfer_questions.buffer, ("device.buffer_bytes",)),
+    (entry_questions.largest_image, ("device.largest_image_bytes",)),
 )
 """The questions in their order, each with the keys that it answers: a later one may build on what
 an earlier one found.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import Transfer
+from flasher.conformance.cases.probe import Transfer
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported

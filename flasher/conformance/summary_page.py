@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from flasher import __version__
-from flasher.conformance.decoded import boot_versions
 from flasher.conformance.profile import profile_keys
 from flasher.conformance.reports import distribution, group_title
 from flasher.conformance.results import CaseResult, CaseText, CaseVerdict, RunReport
+from flasher.conformance.trace_excerpt import boot_versions
 from flasher.report.base import Status, render_page
 
 _LISTED: Final = 6

@@ -6,8 +6,8 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
-from flasher.conformance.release import badge, summary_page
 from flasher.conformance.results import CaseVerdict
+from flasher.conformance.summary_page import badge, summary_page
 from tests.cli.conftest import Flasher
 from tests.report.pages import Page, assert_self_contained, assert_visible
 

@@ -7,10 +7,10 @@ from math import ceil
 from statistics import median
 from typing import Final
 
-from flasher.conformance.host import UPDATE_SPACING_S
 from flasher.conformance.init.answers import Answer, Findings, Trial
 from flasher.conformance.init.session import REPEATS, Session, told
 from flasher.conformance.judge import Times
+from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import (
     IMAGE_BYTES_MAX,
