@@ -11,8 +11,8 @@ _PACKAGE = Path(flasher.conformance.__file__).parent
 _EDGES = {"mock", "simulated", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
-    *("decoded", "diff", "html_report", "json_report", "reports"),
-    *("opening", "plugin", "release", "side_by_side"),
+    *("trace_excerpt", "diff", "html_report", "json_report", "reports"),
+    *("bench_options", "plugin", "summary_page", "side_by_side"),
 }
 """What opens a bench, and what tells about a run: neither makes nor judges a byte."""
 
