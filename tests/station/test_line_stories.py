@@ -15,10 +15,12 @@ from typing import cast
 
 import pytest
 
+from flasher.mock.table import State
 from flasher.station import codes
 from flasher.station.continuity import Continuity
 from flasher.station.line import Line
 from flasher.station.presence import Presence
+from flasher.station.records.model import StepName
 from flasher.station.scans import Word
 from flasher.station.socket import UNNAMED, Socket, Source
 from flasher.station.station import Station
@@ -26,7 +28,9 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.unit_target import StepFailedError
 from tests.campaigns import line_world
+from tests.campaigns.line_world import undetectable
 from tests.campaigns.line_world.play import Played, draw, play, shrink
+from tests.campaigns.line_world.promises import Violation
 from tests.campaigns.line_world.stories import CLAUSES, Story
 from tests.campaigns.line_world.world import STUCK
 
@@ -66,6 +70,10 @@ EXCHANGED_AFTER_ITS_FLASH = (
     " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @10.1 pull unit=1 ;"
     " @10.5 put unit=2 socket=A"
 )
+NOT_OBSERVED_AFTER_ITS_FLASH = (
+    "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+    " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @9.9 stall socket=A seconds=1.0"
+)
 STORIES = {
     "pulled in its flash": PULLED_IN_ITS_FLASH,
     "card here, label there": CARD_HERE_LABEL_THERE,
@@ -82,7 +90,7 @@ STORIES = {
     ),
     "the number of the unit before": (
         "line sockets=2 ; unit label=2 number=own ; unit label=3 ; person name=jo ;"
-        " @3.0 put unit=2 socket=A ; @4.8 pull unit=2 ; @5.0 put unit=3 socket=A ;"
+        " @3.0 put unit=2 socket=A ; @4.75 pull unit=2 ; @5.0 put unit=3 socket=A ;"
         " @5.1 label by=jo unit=2"
     ),
     "exchanged after the card": (
@@ -92,7 +100,7 @@ STORIES = {
     ),
     "exchanged just before the label": (
         "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 ; person name=jo ;"
-        " @3.0 put unit=2 socket=A ; @3.1 card by=jo unit=2 ; @6.5 pull unit=2 ;"
+        " @3.0 put unit=2 socket=A ; @3.1 card by=jo unit=2 ; @6.35 pull unit=2 ;"
         " @6.6 put unit=1 socket=A ; @6.64 label by=jo unit=2"
     ),
     "exchanged while it is identified": (
@@ -113,7 +121,7 @@ STORIES = {
     "exchanged where identify ends": (
         "line sockets=3 recipe=plain ; unit label=3 ; unit label=4 number=own ; person name=al ;"
         " @3.0 card by=al unit=3 socket=C ; @3.5 label by=al unit=3 ; @3.7 put unit=3 socket=C ;"
-        " @4.269 pull unit=3 ; @4.5 put unit=4 socket=C"
+        " @4.25 pull unit=3 ; @4.5 put unit=4 socket=C"
     ),
     "a bootloader for an application": (
         "line sockets=2 recipe=plain ; unit label=1 ; unit label=3 application=none ;"
@@ -123,12 +131,12 @@ STORIES = {
     "a bootloader for an application, fast": (
         "line sockets=1 recipe=plain ; unit label=2 ; unit label=4 application=none ;"
         " person name=jo ; @3.0 put unit=4 socket=A ; @5.0 card by=jo unit=4 ;"
-        " @15.6 pull unit=4 ; @15.7 put unit=2 socket=A ; @18.0 label by=jo unit=4"
+        " @15.45 pull unit=4 ; @15.7 put unit=2 socket=A ; @18.0 label by=jo unit=4"
     ),
     "an application for a bootloader that sleeps": (
         "line sockets=1 ; unit label=3 application=none ; unit label=4 ; person name=jo ;"
         " @3.0 put unit=3 socket=A ; @3.5 card by=jo unit=3 socket=A ; @4.5 label by=jo unit=3 ;"
-        " @5.0 sleep unit=3 seconds=4.0 ; @8.0 pull unit=3 ; @8.1 put unit=4 socket=A"
+        " @5.0 sleep unit=3 seconds=4.0 ; @7.85 pull unit=3 ; @8.1 put unit=4 socket=A"
     ),
     "its label again, and cancelled": (
         "line sockets=2 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=B ;"
@@ -213,7 +221,17 @@ STORIES = {
     "exchanged for a bootloader while the process is away": (
         "line sockets=1 ; unit label=1 application=none ; unit label=3 ; person name=al source=al ;"
         " @3.6 put unit=3 socket=A ; @5.0 card by=al unit=3 ; @6.0 label by=al unit=3 ;"
-        " @31.5 worker socket=A ; @32.0 pull unit=3 ; @32.2 put unit=1 socket=A ; @38.0 look"
+        " @31.5 worker socket=A ; @31.9 pull unit=3 ; @32.2 put unit=1 socket=A ; @38.0 look"
+    ),
+    "a unit that answers nothing is pulled": (
+        "line sockets=1 ; unit label=1 answers=false ; person name=jo ; @3.0 put unit=1 socket=A ;"
+        " @6.0 label by=jo unit=1 ; @8.8 card by=jo unit=1 ; @9.0 label by=jo unit=1 ;"
+        " @10.0 pull unit=1"
+    ),
+    "pulled before the process of its socket stands still": (
+        "line sockets=2 ; unit label=1 pace=slow ; person name=mo ; @3.0 put unit=1 socket=B ;"
+        " @4.0 card by=mo unit=1 ; @5.0 label by=mo unit=1 ; @32.0 pull unit=1 ;"
+        " @33.0 stall socket=B seconds=4.0 ; @36.5 look"
     ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
@@ -361,31 +379,98 @@ def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
 
 # -- what nobody can detect ------------------------------------------------------------------------
 
+RESET = "between the confirmed reset and the announcement"
+COMPLETE = "between the complete image and the first answer"
+SILENT = "silent when its label was scanned"
 UNDETECTABLE = {
-    "as fast as the next announcement": (
-        "line sockets=2 ; unit label=1 ; unit label=3 application=none ; person name=mo ;"
-        " @2.0 card by=mo unit=3 socket=B ; @2.4 label by=mo unit=3 ; @2.5 put unit=3 socket=B ;"
-        " @3.0 pull unit=3 ; @3.1 put unit=1 socket=B"
+    "restarts for the run": (
+        RESET,
+        (
+            "line sockets=2 ; unit label=2 ; unit label=3 ; person name=al ;"
+            " @31.1 label by=al unit=3 ; @31.5 put unit=3 socket=A ; @33.55 card by=al unit=3 ;"
+            " @34.0 pull unit=3 ; @34.5 put unit=2 socket=A"
+        ),
     ),
-    "between the confirmed reset and the announcement": (
-        "line sockets=2 ; unit label=2 ; unit label=3 ; person name=al ;"
-        " @31.1 label by=al unit=3 ; @31.5 put unit=3 socket=A ; @33.55 card by=al unit=3 ;"
-        " @34.0 pull unit=3 ; @34.5 put unit=2 socket=A"
+    "two change places, of which one restarts for its run": (
+        RESET,
+        (
+            "line sockets=2 recipe=plain ; unit label=1 ; unit label=2 ; person name=jo ;"
+            " @21.9 put unit=2 socket=B ; @23.9 put unit=1 socket=A ;"
+            " @24.2 card by=jo unit=1 ; @24.8 label by=jo unit=1 ; @38.8 card by=jo unit=2 ;"
+            " @42.1 label by=jo unit=2 ; @42.8 pull unit=1 ; @42.9 pull unit=2 ;"
+            " @43.15 put unit=1 socket=B ; @43.25 put unit=2 socket=A"
+        ),
     ),
-    "silent when its label was scanned": (
-        "line sockets=2 ; unit label=1 ; unit label=2 ; person name=mo ;"
-        " @2.0 dip socket=B seconds=4.0 ; @3.0 put unit=1 socket=B ;"
-        " @3.1 card by=mo unit=1 socket=B ; @3.5 pull unit=1 ; @4.0 put unit=2 socket=B ;"
-        " @7.0 label by=mo unit=1"
+    "starts, and answers nothing": (
+        COMPLETE,
+        (
+            "line sockets=2 ; unit label=2 application=new ; unit label=5 answers=false ;"
+            " person name=jo ; @3.0 card by=jo unit=5 socket=B ; @3.5 label by=jo unit=5 ;"
+            " @4.0 put unit=5 socket=B ; @12.0 pull unit=5 ; @13.0 put unit=2 socket=B"
+        ),
+    ),
+    "without power": (
+        SILENT,
+        (
+            "line sockets=2 ; unit label=1 ; unit label=2 ; person name=mo ;"
+            " @2.0 dip socket=B seconds=4.0 ; @3.0 put unit=1 socket=B ;"
+            " @3.1 card by=mo unit=1 socket=B ; @3.5 pull unit=1 ; @4.0 put unit=2 socket=B ;"
+            " @7.0 label by=mo unit=1"
+        ),
+    ),
+    "the label of an empty socket is scanned twice": (
+        SILENT,
+        (
+            "line sockets=1 ; unit label=3 ; unit label=4 ; person name=al ;"
+            " @13.0 label by=al unit=3 ; @21.0 card by=al unit=3 socket=A ;"
+            " @21.5 label by=al unit=3 ; @22.0 put unit=4 socket=A"
+        ),
+    ),
+    "silent since the process of its socket began": (
+        SILENT,
+        (
+            "line sockets=2 ; unit label=1 pace=slow ; unit label=3 ; person name=jo ;"
+            " @3.0 put unit=1 socket=B ; @3.5 card by=jo unit=1 socket=B ;"
+            " @7.0 label by=jo unit=1 ; @8.0 worker socket=B ; @10.0 card by=jo unit=1 ;"
+            " @10.5 pull unit=1 ; @10.78 put unit=3 socket=B ; @11.0 label by=jo unit=1"
+        ),
+    ),
+    "a target that tells nothing, when its image is complete": (
+        "exchanged when its image was complete",
+        (
+            "line sockets=2 recipe=wmc ; unit label=1 pace=slow ; unit label=2 ; person name=jo ;"
+            " person name=al source=mounted ; @2.0 put unit=1 socket=B ; @2.03 label by=al unit=1 ;"
+            " @2.5 pull unit=1 ; @3.0 put unit=2 socket=B ; @6.0 pull unit=2 ;"
+            " @23.24 put unit=1 socket=A ; @31.0 card by=jo unit=1 ; @31.13 label by=jo unit=1 ;"
+            " @31.17 pull unit=1 ; @35.0 put unit=2 socket=A"
+        ),
     ),
 }
 
 
-@pytest.mark.parametrize("reason", UNDETECTABLE)
-def test_what_nobody_can_detect_is_counted_by_its_name(reason: str) -> None:
-    played = told(UNDETECTABLE[reason])
+@pytest.mark.parametrize("name", UNDETECTABLE)
+def test_what_nobody_can_detect_is_counted_by_its_reason(name: str) -> None:
+    reason, story = UNDETECTABLE[name]
+    played = told(story)
     assert played.seen is not None
-    assert (played.kind, played.seen[f"undetectable: {reason}"]) == ("", 1)
+    assert (played.text, played.seen[f"undetectable: {reason}"]) == ("", 1)
+
+
+def test_each_reason_is_of_a_story() -> None:
+    assert set(undetectable.UNDETECTABLE) <= {reason for reason, _ in UNDETECTABLE.values()}
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_a_unit_that_answers_something_else_can_be_detected(state: State) -> None:
+    exchanges = undetectable.Exchanges()
+    pulled = undetectable.Pulled("W2605001", 3.0, state, StepName.FLASH, was_silent=False)
+    for socket, is_alike in (("A", True), ("B", False)):
+        exchanges.pull(socket, pulled)
+        exchanges.put(socket, "W2605002", 3.5, is_new=True, is_alike=is_alike)
+    text = "the unit with the label W2605002 now says that it is W2605001"
+    alike = exchanges.reason_of(Violation("NUMBER", text, "A"))
+    assert bool(alike) == (state in (State.RESTARTING, State.STARTING))
+    assert exchanges.reason_of(Violation("NUMBER", text, "B")) == ""
 
 
 def test_what_somebody_could_detect_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -469,6 +554,7 @@ def trust_every_run(patch: pytest.MonkeyPatch) -> None:
         (need_no_card, WITHOUT_CARD, "UNIDENTIFIED"),
         (forget_the_interrupted, INTERRUPTED, "FORGOTTEN"),
         (trust_every_run, EXCHANGED_AFTER_ITS_FLASH, "TRUSTED"),
+        (trust_every_run, NOT_OBSERVED_AFTER_ITS_FLASH, "TRUSTED"),
     ],
 )
 def test_a_fault_of_the_station_is_found(

@@ -215,13 +215,17 @@ class PaperUnit:
 
     @property
     def memory(self) -> tuple[object, int]:
-        """The number of its battery, and how often the flash of a device was erased or written."""
-        number, operations = None, 0
+        """The number of its battery, and `operations`."""
+        number = None
         for part in self.parts:
-            operations += part.engine.operations_done
             if isinstance(part.engine.application, BmsApplication):
                 number = part.engine.application.kept["serial number"]
-        return number, operations
+        return number, self.operations
+
+    @property
+    def operations(self) -> int:
+        """How often the flash of its devices was erased or written."""
+        return sum(part.engine.operations_done for part in self.parts)
 
     def has_not_changed(self) -> bool:
         """Since it was asked last, as far as `memory` goes."""

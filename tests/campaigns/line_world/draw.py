@@ -14,12 +14,12 @@ from flasher.station.events import SocketState
 from flasher.station.records.model import StepName
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.stories import Story
-from tests.campaigns.line_world.world import Bay, World, last_look
+from tests.campaigns.line_world.world import HAND_S, Bay, World, last_look
 
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
 _RECIPES: Final = {"writes": 10, "plain": 3, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
-_GAPS_S: Final = (0.1, 0.3, 0.3, 0.5, 1.0, 3.5)
+_GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
 _IN_HAND: Final = (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)

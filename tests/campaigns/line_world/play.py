@@ -72,7 +72,7 @@ def _played(
         go(world.way_home() if goes_home else world.end_of_runs())
     except Violation as violation:
         kind, text = violation.kind, str(violation)
-        if reason := world.exchanges.reason_of(kind, text):
+        if reason := world.exchanges.reason_of(violation):
             world.seen[f"undetectable: {reason}"] += 1
             kind = text = ""
         has_acted = not is_on_its_way or len(tried) > len(kept[0])

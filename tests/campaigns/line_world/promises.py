@@ -22,16 +22,22 @@ from flasher.station.records.model import RunState, StepName, StepState
 from flasher.station.socket import SCANNER
 from tests.campaigns.line_world.clockwork import PaperUnit
 
+_AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
 SETTLED_S: Final = 4.0
 """So long after its start a station knows what is in its sockets."""
 
 
-class Violation(Exception):  # noqa: N818
-    """What must never be: its kind, and what happened."""
+_OF_ANOTHER: Final = ("UNIT_CHANGED", "NOT_OBSERVED")
+"""Codes of runs in which another unit may have been in the socket."""
 
-    def __init__(self, kind: str, text: str) -> None:
+
+class Violation(Exception):  # noqa: N818
+    """What must never be: its kind, and what happened, in which socket."""
+
+    def __init__(self, kind: str, text: str, socket: str = "") -> None:
         super().__init__(f"{kind}: {text}")
         self.kind = kind
+        self.socket = socket
 
 
 @dataclass
@@ -42,16 +48,21 @@ class _Run:
     unit: PaperUnit
     number: str
     """What the unit said that it is."""
-    operations: int
-    """Of its flash, until then."""
     had_application: bool
+    operations: list[tuple[PaperUnit, int]]
+    """All units that were in its socket, and how often each had been erased or written then."""
     is_identified: bool = False
     was_running: bool = False
     """It was pulled after it had answered and before its flash, while its application ran."""
 
     @property
     def is_flashed(self) -> bool:
-        return bool(self.unit.engine.operations_done != self.operations)
+        return self.unit.operations != self.operations[0][1]
+
+    @property
+    def has_flashed(self) -> bool:
+        """A unit was flashed in it, perhaps another one."""
+        return any(unit.operations != before for unit, before in self.operations)
 
 
 class Promises:
@@ -69,7 +80,8 @@ class Promises:
         self._carded: set[str] = set()
         """Labels that were scanned with a card."""
         self._changed: set[str] = set()
-        """Labels whose last run ended since the unit may have been another one."""
+        """Labels that were not flashed since a run in which the unit may have become another one.
+        """
         self._runs: dict[str, _Run] = {}
         self._interrupted: dict[str, tuple[str, float | None]] = {}
         """Labels of runs that a dead station left, by socket, and when that has to be shown."""
@@ -135,31 +147,52 @@ class Promises:
                 label,
                 unit,
                 self._number_of(unit),
-                engine.operations_done,
                 # One that nobody can ask is not identified with an application either.
                 engine.stored_image is not None or not engine.target.has_version_query,
+                [(unit, unit.operations)],
             )
 
-    def pulled(self, socket: str, *, was_calm: bool) -> None:
+    def put(self, socket: str, unit: PaperUnit) -> None:
+        self.touched(socket)
+        if socket in self._runs:
+            self._runs[socket].operations.append((unit, unit.operations))
+
+    def pulled(self, socket: str, *, answers: bool, was_calm: bool) -> None:
         """`was_calm`: it was in the socket and heard for some time before the run."""
         self.touched(socket)
         run = self._runs.get(socket)
-        if run is not None and (run.is_identified or was_calm) and not run.is_flashed:
+        if run is None or not answers:
+            return
+        if (run.is_identified or was_calm) and not run.is_flashed:
             run.was_running = run.was_running or run.unit.engine.state is State.APPLICATION
+
+    def numbers_known(self, socket: str, step: StepName | None) -> frozenset[str]:
+        """What the unit of the run that goes on in a socket may report in this step, without being
+        another one; empty where it has not reported anything yet.
+        """
+        run = self._runs.get(socket)
+        if run is None or step is None:
+            return frozenset()
+        if step in _AFTER_FLASH:
+            return frozenset({run.number, run.label})
+        return frozenset({run.number} if run.had_application and run.is_identified else ())
 
     def _ended(self, event: RunEnded) -> None:
         run = self._runs.pop(event.socket, None)
         was_changed = event.serial in self._changed
-        self._changed.discard(event.serial)
-        if event.code == "UNIT_CHANGED":
+        if event.code in _OF_ANOTHER:
             self._changed.add(event.serial)
+        elif run is None or run.has_flashed:
+            self._changed.discard(event.serial)
         if run is None:
             return
         label = run.label
         says_other = run.number.startswith("W") and run.number != label
         if run.is_flashed and run.had_application and says_other:
             raise Violation(
-                "TOUCHED", f"a unit that says that it is {run.number} was flashed as {label}"
+                "TOUCHED",
+                f"a unit that says that it is {run.number} was flashed as {label}",
+                event.socket,
             )
         if run.is_flashed and not run.had_application and label not in self._carded:
             raise Violation(
@@ -171,7 +204,7 @@ class Promises:
             raise Violation(
                 "BLAMED", f"{label} was pulled before its flash, and is recorded as {event.code}"
             )
-        if event.outcome is RunState.PASS and was_changed and not run.is_flashed:
+        if event.outcome is RunState.PASS and was_changed and not run.has_flashed:
             raise Violation(
                 "TRUSTED", f"{label} passes without a flash, after a run with a changed unit"
             )
@@ -181,7 +214,7 @@ class Promises:
     def died(self) -> None:
         """The station: what it worked on is to be rechecked."""
         self._interrupted = {socket: (run.label, None) for socket, run in self._runs.items()}
-        self._changed -= {run.label for run in self._runs.values() if run.is_flashed}
+        self._changed -= {run.label for run in self._runs.values() if run.has_flashed}
         self._runs.clear()
         self._cards.clear()
         self._labels.clear()

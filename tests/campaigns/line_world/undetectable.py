@@ -14,11 +14,12 @@ from typing import Final
 from flasher.mock.table import State
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.station.records.model import StepName
+from tests.campaigns.line_world.promises import Violation
 
-FASTEST_S: Final = 0.25
-"""A unit that is put in sooner after the one before may announce itself as if it were that one."""
 _LABEL: Final = re.compile(r"\bW2605\d{3}\b")
-_KINDS: Final = ("NUMBER", "TOUCHED", "FALSE PASS")
+_AFTER_ITS_ANSWER: Final = ("NUMBER", "FALSE PASS")
+"""Before these a unit is asked who it is."""
+_KINDS: Final = (*_AFTER_ITS_ANSWER, "TOUCHED")
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,9 @@ class Pulled:
     step: StepName | None
     """Of the run; None: none went on."""
     was_silent: bool
-    """It had sent nothing for some time, before the run began if there was one."""
+    """Its socket had heard nothing for some time, before the run began if there was one."""
+    is_mute: bool = False
+    """Its application answers no question."""
 
 
 @dataclass(frozen=True)
@@ -40,32 +43,32 @@ class Exchange:
     """One unit was pulled out of a socket, and then another one was put in."""
 
     pulled: Pulled
+    socket: str
     label: str
     """Of the other one."""
     gap_s: float
     is_new: bool
     """The other one runs the version of the recipe already."""
+    is_alike: bool
+    """What the other one answers is no evidence."""
 
 
-def _may_announce_itself(pulled: Pulled) -> bool:
-    """It announces itself, has just done so, or is just being reset."""
-    may_be_reset = pulled.step in (StepName.FLASH, StepName.RESTART)
-    is_reset = pulled.state is State.APPLICATION and may_be_reset
-    return is_reset or pulled.state in (State.ANNOUNCING, State.ERASING)
+def _awaits_its_answer(pulled: Pulled) -> bool:
+    """It has confirmed its image, and its new application has not answered."""
+    is_mute = pulled.is_mute and pulled.state is State.APPLICATION and pulled.step is StepName.FLASH
+    return is_mute or pulled.state is State.STARTING
 
 
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
     "silent when its label was scanned": lambda each: each.pulled.was_silent,
-    "as fast as the next announcement": lambda each: (
-        each.gap_s <= FASTEST_S and _may_announce_itself(each.pulled)
-    ),
     "between the confirmed reset and the announcement": lambda each: (
         each.pulled.state is State.RESTARTING
         and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
     ),
     "between the complete image and the first answer": lambda each: (
-        each.pulled.state is State.STARTING
+        _awaits_its_answer(each.pulled)
         and each.is_new
+        and each.is_alike
         and each.gap_s <= DEFAULT_TIMINGS.application_start_timeout_s
     ),
 }
@@ -83,18 +86,25 @@ class Exchanges:
     def pull(self, socket: str, pulled: Pulled) -> None:
         self._pulled[socket] = pulled
 
-    def put(self, socket: str, label: str, now: float, *, is_new: bool) -> None:
+    def put(self, socket: str, label: str, now: float, *, is_new: bool, is_alike: bool) -> None:
         pulled = self._pulled.get(socket)
         if pulled is not None and pulled.label != label:
-            self._all.append(Exchange(pulled, label, now - pulled.at_s, is_new))
+            gap_s = now - pulled.at_s
+            self._all.append(Exchange(pulled, socket, label, gap_s, is_new, is_alike))
 
-    def reason_of(self, kind: str, text: str) -> str:
+    def reason_of(self, violation: Violation) -> str:
         """Why nobody could detect what a violation comes from; empty where somebody could. It comes
-        from the last exchange of the two units that it names.
+        from the last exchange in its socket of the two units that it names.
         """
-        labels = set(_LABEL.findall(text))
-        of_both = [each for each in self._all if {each.pulled.label, each.label} <= labels]
-        if kind not in _KINDS or not of_both:
+        labels = set(_LABEL.findall(str(violation)))
+        of_both = [
+            each
+            for each in self._all
+            if each.socket == violation.socket and {each.pulled.label, each.label} <= labels
+        ]
+        if violation.kind not in _KINDS or not of_both:
             return ""
         last = of_both[-1]
+        if violation.kind in _AFTER_ITS_ANSWER and not last.is_alike:
+            return ""
         return next((name for name, is_so in UNDETECTABLE.items() if is_so(last)), "")

@@ -18,6 +18,7 @@ from sqlalchemy import event
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.mock.table import State
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Command
 from flasher.station.events import (
     LineResumed,
@@ -61,8 +62,10 @@ WINDOW_S: Final = 0.1
 """The station looks at its processes at least so often, at multiples of this time: so a story is
 played as it was drawn.
 """
-HAND_S: Final = 0.1
-"""The fastest hand takes so long from pulling a unit to putting another one in."""
+HAND_S: Final = 0.25
+"""The fastest hand takes so long from pulling a unit to putting another one in, as the station
+assumes.
+"""
 CALM_S: Final = 3.0
 """After this time a unit that was put in runs its application, or announces itself for good."""
 GREEN_S: Final = 5.0
@@ -113,7 +116,11 @@ class Bay:
     process: Process | None = None
     unit: PaperUnit | None = None
     changed_at: float = 0.0
-    """Since when the same unit is in it, and the station can see it."""
+    """Since when the same unit is in it, and the station runs."""
+    blind_until: float = float("-inf")
+    """Its process stands still, or has no adapter."""
+    launched_at: float = 0.0
+    """When its process began to listen."""
     emptied_at: float = float("-inf")
     disturbed_at: float = 0.0
     """When a hand, a failure or sleep last touched its unit or its process."""
@@ -316,7 +323,7 @@ class World:
     def _launch(self, setup: WorkerSetup) -> Process:
         bay = self.bays[setup.socket]
         bay.is_working = False
-        bay.changed_at = bay.disturbed_at = self.now
+        bay.changed_at = bay.disturbed_at = bay.launched_at = self.now
         bay.process = Process(
             setup, self.bench.recipe, bay.bus, lambda message: self._sent(bay, message)
         )
@@ -419,14 +426,21 @@ class World:
         is_new = engine.profile.factory_version == BMS_VERSION
         is_new = is_new or engine.stored_image == IMAGES[BMS].data
         if self.setup.line.tells:
-            self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
+            if bay.run and bay.emptied_at < bay.run_at:
+                # The run waits for the first unit that is heard.
+                awaited = Pulled(bay.run, bay.run_at, State.OFF, None, was_silent=True)
+                self.exchanges.pull(bay.name, awaited)
+            known = self.promises.numbers_known(bay.name, bay.step if bay.is_working else None)
+            number = _stored(unit).number
+            is_alike = number in known if known else not number.startswith("W")
+            self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new, is_alike=is_alike)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.spoke_at = float("-inf")
         bay.put_at = self.now
         bay.disturbed_at = (
             self.now if bay.process is None else max(self.now, bay.process.stalled_until)
         )
-        self.promises.touched(bay.name)
+        self.promises.put(bay.name, unit)
 
         def sent(now: float) -> None:
             bay.has_spoken, bay.spoke_at = True, now
@@ -460,7 +474,8 @@ class World:
         if self._holds(bay):
             return False
         if self.setup.line.tells:
-            self.promises.pulled(bay.name, was_calm=_is_calm(bay))
+            answers = self._setup_of(act.unit).answers
+            self.promises.pulled(bay.name, answers=answers, was_calm=_is_calm(bay))
         else:
             self.promises.touched(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
@@ -471,7 +486,8 @@ class World:
             self.now,
             unit.engine.state,
             bay.step if bay.is_working else None,
-            was_silent=bay.spoke_at < awaited_at - SILENCE_S,
+            was_silent=bay.spoke_at < max(awaited_at - SILENCE_S, bay.launched_at),
+            is_mute=not self._setup_of(act.unit).answers,
         )
         self.exchanges.pull(bay.name, pulled)
         bay.bus.pull(unit)
@@ -479,6 +495,9 @@ class World:
         unit.sleeps_until = float("-inf")
         unit.power_cut(self.now)
         return True
+
+    def _setup_of(self, unit: int) -> stories.UnitSetup:
+        return next(each for each in self.setup.units if each.label == unit)
 
     def where(self, unit: int) -> Bay | None:
         """The socket that a unit is in."""
@@ -636,6 +655,7 @@ class World:
         if bay is None or bay.process is None or bay.process.is_over:
             return False
         bay.process.stalled_until = self.now + act.seconds
+        bay.blind_until = max(bay.blind_until, bay.process.stalled_until)
         if bay.disturbed_at > self.now - CALM_S:
             bay.disturbed_at = bay.process.stalled_until  # it hears what came before only then
         self.promises.touched(bay.name)
@@ -665,7 +685,7 @@ class World:
         if bay is None or not bay.bus.faults.is_plugged:
             return False
         bay.bus.unplug(back_after_s=act.seconds)
-        bay.changed_at = max(bay.changed_at, self.now + act.seconds)
+        bay.blind_until = max(bay.blind_until, self.now + act.seconds)
         self.promises.touched(bay.name)
         bay.disturbed_at = max(bay.disturbed_at, self.now + act.seconds)
         return True
@@ -752,6 +772,7 @@ class World:
             raise Violation(
                 "FALSE PASS",
                 f"PASS of {event.serial} in {bay.name}, and in its run {_words(heard)} was heard",
+                bay.name,
             )
         unit = next(each for each in self.units.values() if each.label == event.serial)
         stored = _stored(unit)
@@ -790,11 +811,12 @@ class World:
                 continue
             self._stored[number] = after
             bay = self.where(number)
-            label = "" if bay is None else bay.run
+            label, socket = ("", "") if bay is None else (bay.run, bay.name)
             if after.number not in self._allowed[number]:
                 raise Violation(
                     "NUMBER",
                     f"the unit with the label {unit.label} now says that it is {after.number}",
+                    socket,
                 )
             is_own = before.number.startswith("W")
             if is_own and label not in ("", before.number, unit.label):
@@ -802,6 +824,7 @@ class World:
                     "TOUCHED",
                     f"unit {unit.label}, which says that it is {before.number}, was flashed or"
                     f" written under the label {label}",
+                    socket,
                 )
         for bay in self.bays.values():
             self._look_at_green(bay)
@@ -810,7 +833,7 @@ class World:
         shown = bay.shown
         if shown is None or shown.state is not SocketState.PASS or self.station is None:
             return
-        if self.now - bay.changed_at < GREEN_S or shown.serial == bay.unseen:
+        if self.now - max(bay.changed_at, bay.blind_until) < GREEN_S or shown.serial == bay.unseen:
             return
         unit = bay.unit
         if unit is None and self.setup.line.writes:
@@ -906,7 +929,7 @@ class World:
 
     def _has_to_pass(self, number: int) -> bool:
         """A good unit passes, whatever befell it before."""
-        unit = next(each for each in self.setup.units if each.label == number)
+        unit = self._setup_of(number)
         writes = self.setup.line.writes
         numbers = ("none", "empty", "own", "maker") if writes else ("none", "empty", "own")
         if not self.setup.line.tells:
