@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flasher.conformance.bench import Bench
     from flasher.conformance.plugin import BenchTrace, Measurements, PluginRun
     from flasher.conformance.profile import ConformanceProfile
-    from flasher.conformance.subject import Port, Subject
+    from flasher.conformance.subject import BusPort, Subject
 
 _MARKERS = (
     "destructive: erases the application of the device under test, which is put back afterwards",
@@ -126,7 +126,7 @@ def btl_device(btl_run: PluginRun) -> Subject:
 
 
 @pytest.fixture(scope="session")
-def btl_bus(btl_device: Subject) -> Port:
+def btl_bus(btl_device: Subject) -> BusPort:
     """The way to the bus: single frames, with their times."""
     return btl_device.port
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from flasher.conformance import cases  # noqa: F401  registers them
 from flasher.conformance.catalogue import CASES, in_order
-from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, Reading, contents
+from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, ClauseReading, contents
 
 ROOT: Final = Path(__file__).parents[1]
 DOCUMENT: Final = ROOT / "docs" / "explanation" / "readings.md"
@@ -183,7 +183,7 @@ def readings_document() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _reading(number: str, reading: Reading) -> Iterator[str]:
+def _reading(number: str, reading: ClauseReading) -> Iterator[str]:
     asks = reading.asks[0].upper() + reading.asks[1:]
     yield from (f"## {number}", "", f"**{asks}.** {reading.why}", "")
     options = {

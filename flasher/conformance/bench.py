@@ -23,7 +23,7 @@ from flasher.conformance.wire import (
     MEMORY_BYTES,
     PACKET_FRAMES,
     Encoder,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -109,18 +109,18 @@ class Bench:
         """Reset the device; returns the first boot version. General feedback is not judged here."""
         self.forget()
         self.send(self.encoder.reset())
-        return self.await_message(Kind.BOOT_VERSION)
+        return self.await_message(MessageKind.BOOT_VERSION)
 
     def reset_measured(self, within_s: float) -> Received:
         """The same, with the times of general feedback, if it comes, and boot version measured."""
         self.forget()
         with self.tester.hearing_feedback():
             sent = self.send(self.encoder.reset())
-            heard = self.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=within_s)
-        if heard is not None and heard.kind is Kind.FEEDBACK:
+            heard = self.wait_for(MessageKind.FEEDBACK, MessageKind.BOOT_VERSION, within_s=within_s)
+        if heard is not None and heard.kind is MessageKind.FEEDBACK:
             self.measure(Times.FEEDBACK, heard.at - sent.left_at)
-            heard = self.wait_for(Kind.BOOT_VERSION, within_s=within_s)
-        found = self.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+            heard = self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+        found = self.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
         self.measure(Times.FIRST, found.at - sent.left_at)
         return found
 
@@ -137,7 +137,7 @@ class Bench:
         spacing_s = self.limit("version_spacing_s") + self.limit("version_spacing_tolerance_s")
         last_at = self.now + gaps * spacing_s
         for _ in range(gaps):
-            self.wait_for(Kind.BOOT_VERSION, within_s=last_at - self.now)
+            self.wait_for(MessageKind.BOOT_VERSION, within_s=last_at - self.now)
         self.wait(self.limit("window_s") / 2)
         self.forget()
 
@@ -148,7 +148,7 @@ class Bench:
 
     def next_version(self) -> Received:
         """The next boot version of the burst."""
-        return self.expect(Kind.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
+        return self.expect(MessageKind.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
 
     def update(self, size_bytes: int) -> Received:
         """Get request transfer: the update command now, and at every boot version that follows
@@ -159,11 +159,11 @@ class Bench:
         for _ in range(UPDATES_MAX):
             sent = self.send(self.encoder.update(size_bytes))
             heard = self.host.request_or_version(sent.left_at, limit_s)
-            if heard is None or heard.kind is Kind.REQUEST:
+            if heard is None or heard.kind is MessageKind.REQUEST:
                 break
-        if heard is not None and heard.kind is not Kind.REQUEST:
+        if heard is not None and heard.kind is not MessageKind.REQUEST:
             heard = None
-        found = self.require_received(heard, Kind.REQUEST.value, limit_s)
+        found = self.require_received(heard, MessageKind.REQUEST.value, limit_s)
         self.measure(Times.REQUEST, found.at - sent.left_at)
         return found
 
@@ -177,7 +177,7 @@ class Bench:
     def packet(self, image: bytes, number: int) -> None:
         """Send a packet of `image`; its ACK has to come."""
         sent = self.send_packet(image, number)
-        heard = self.expect(Kind.ACK, number=number)
+        heard = self.expect(MessageKind.ACK, number=number)
         self.measure(Times.ANSWER, heard.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
@@ -202,7 +202,9 @@ class Bench:
         heard = self.answers()
         known = sorted({number for number in numbers if number is not None})
         is_open = None in numbers
-        right = [one for one in heard if one.kind is Kind.NAK and (is_open or one.number in known)]
+        right = [
+            one for one in heard if one.kind is MessageKind.NAK and (is_open or one.number in known)
+        ]
         nak = "NAK" if is_open else f"NAK {' or '.join(map(str, known))}"
         expected = {"silence": {0: "silence"}, "either": {1: nak, 0: "silence"}}
         wanted = expected.get(choice, {1: nak})
@@ -234,7 +236,7 @@ class Bench:
     def end_transfer(self) -> None:
         """End of transfer; complete has to come."""
         sent = self.send(self.encoder.end())
-        heard = self.expect(Kind.COMPLETE)
+        heard = self.expect(MessageKind.COMPLETE)
         self.measure(Times.COMPLETE, heard.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
@@ -367,7 +369,7 @@ class Bench:
         if self.choice("up_08") == "either" and not self.subject.has_power:
             sent = self.send(self.encoder.update(size_bytes))
             heard = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
-            if heard is not None and heard.kind is Kind.REQUEST:
+            if heard is not None and heard.kind is MessageKind.REQUEST:
                 return
         if self.choice("up_08") != "starts_over":
             self.leave_transfer()
@@ -392,16 +394,16 @@ class Bench:
         elif "either" in (pause, reset):
             self.send(self.encoder.reset())
             within_s += _PAUSES * self.limit("pause_s")
-            if self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:
+            if self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is None:
                 raise Unsupported("no power control, and neither reset nor a pause ends a transfer")
             return
         else:
             raise Unsupported("no power control, and nothing else ends a transfer (tx_12, tx_13)")
         if not self.subject.has_power:
-            self.await_message(Kind.BOOT_VERSION, within_s=within_s)
-        elif self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:
+            self.await_message(MessageKind.BOOT_VERSION, within_s=within_s)
+        elif self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is None:
             self.power_cycle()
-            self.await_message(Kind.BOOT_VERSION)
+            self.await_message(MessageKind.BOOT_VERSION)
 
     def without_application(self) -> None:
         """Erase the application, and let the bootloader announce itself."""

@@ -55,7 +55,7 @@ _DOCUMENT: Final = {
 }
 
 
-class Reading(NamedTuple):
+class ClauseReading(NamedTuple):
     """How this project reads a place where the documents are silent or contradict themselves."""
 
     asks: str
@@ -69,12 +69,12 @@ class Reading(NamedTuple):
 
 
 READINGS: Final = {
-    "R1": Reading(
+    "R1": ClauseReading(
         "running information has 16 bytes, 4 of them reserved",
         "Welling lists 5 reserved bytes, but the command says 16 bytes of data, which leaves 4; "
         "MOTINOVA lists 4.",
     ),
-    "R2": Reading(
+    "R2": ClauseReading(
         "the tool answers every boot version with the update command until request transfer "
         "comes; a device may listen during the announcements or only after them",
         "The flow chart does not tell when the device listens. A device that waits for the end of "
@@ -86,22 +86,22 @@ READINGS: Final = {
         host=("timings.update_spacing_s",),
         model=("window_s", "update_in_transfer"),
     ),
-    "R3": Reading(
+    "R3": ClauseReading(
         "reset and general feedback of WMC and OBC are those of the BMS on their own ids",
         "They are said to stand in chapter 3, which has them for the BMS alone.",
         suite=("device.reset_command", "device.reset_data"),
         host=("reset_command", "reset_data"),
     ),
-    "R4": Reading(
+    "R4": ClauseReading(
         "packet numbers are sent low byte first in packet, ACK and NAK alike",
         "The tables do not say it of these numbers; all data are sent so (2.2.1 (7)).",
     ),
-    "R5": Reading(
+    "R5": ClauseReading(
         "a memory query names the first byte and the one behind the last",
         "The answer is filled up where the end less the start is below 128: so that difference "
         "is the number of bytes.",
     ),
-    "R6": Reading(
+    "R6": ClauseReading(
         "a NAK after end of transfer may be a damaged message: the tool sends it once more, and "
         "a second NAK means that the image was refused",
         "The flow chart has two branches there, one for a message that was not received rightly "
@@ -110,7 +110,7 @@ READINGS: Final = {
         host=("timings.end_tries",),
         model=("repeated_end", "refused_hold_s"),
     ),
-    "R7": Reading(
+    "R7": ClauseReading(
         "no CRC of the image is sent: the device checks that all packets are there and fit the "
         "size, and the image's own checksum where the product has one",
         "The document calls it a CRC32 check of what was received, but gives the device nothing "
@@ -118,7 +118,7 @@ READINGS: Final = {
         suite=("en_04",),
         model=("image_checksum",),
     ),
-    "R8": Reading(
+    "R8": ClauseReading(
         "the image has no address: it is sent from its lowest byte on, gaps filled with FF, and "
         "has to fit the application area",
         "No message carries an address. A file with bootloader and application in one would be "
@@ -127,7 +127,7 @@ READINGS: Final = {
         host=("application_area.start", "application_area.size_bytes", "image_limit_bytes", "cpu"),
         model=("application_area_bytes", "largest_image_bytes"),
     ),
-    "R9": Reading(
+    "R9": ClauseReading(
         "the update command has the true size, 1 to 65535 x 128 bytes; the last packet is filled "
         "with FF",
         "The document's example, 78351 bytes, is no multiple of 128; packet numbers end at 65535; "
@@ -136,7 +136,7 @@ READINGS: Final = {
         host=("image_limit_bytes",),
         model=("largest_image_bytes",),
     ),
-    "R10": Reading(
+    "R10": ClauseReading(
         "a packet that is stored and comes again is acknowledged again and not stored again",
         "A lost ACK makes every tool repeat the packet. Some bootloaders answer NAK n+1 then "
         '("I want the next one"), which is an ACK only where a profile says so and the packet was '
@@ -147,7 +147,7 @@ READINGS: Final = {
         host=("nak_next_is_ack", "timings.quiet_after_repeat_s"),
         model=("repeated_packet", "older_packet"),
     ),
-    "R11": Reading(
+    "R11": ClauseReading(
         "a boot version in the midst of a transfer is a restart; after end of transfer it is "
         "not answered",
         "A device that announces itself has left the transfer, so the upgrade begins again, a "
@@ -158,7 +158,7 @@ READINGS: Final = {
         host=("attempts", "timings.leftover_boot_version_s", "timings.announcing_on_s"),
         model=("after_complete",),
     ),
-    "R12": Reading(
+    "R12": ClauseReading(
         "the limits of the upgrade are not in the document: they are values of the profile; the "
         "frames of a message are at most 100 ms apart",
         "The 200 ms and 1 s of chapter 3 are about queries and writes of the application. A limit "
@@ -181,12 +181,12 @@ READINGS: Final = {
         ),
         model=("transfer_timeout_s",),
     ),
-    "R13": Reading(
+    "R13": ClauseReading(
         "a short physical ID may be filled with FF or with 01",
         'The document fills it "with 1", by a word that means bit or place: a reader shows all 12 '
         "bytes.",
     ),
-    "R14": Reading(
+    "R14": ClauseReading(
         "without a valid application the bootloader announces itself until an update command comes",
         "The document does not describe such a device. One that is silent after its burst can be "
         "upgraded too, but only after power-up.",
@@ -194,32 +194,32 @@ READINGS: Final = {
         host=("power_up_timeout_s",),
         model=("without_application", "pause_in_transfer"),
     ),
-    "R15": Reading(
+    "R15": ClauseReading(
         "the bootloader answers update command, packet and end of transfer with its own "
         "messages; general feedback beside them, or to an unknown write, is right too",
         "2.2.1 (2) has every device confirm a write by general feedback, appendix 3 gives the "
         "bootloader answers of its own. Both devices are right.",
     ),
-    "R16": Reading(
+    "R16": ClauseReading(
         "request transfer again before the first ACK: the tool sends packet 1 again",
         "An update command would make the device erase again; later than that it is a restart "
         "(R11).",
     ),
-    "R17": Reading(
+    "R17": ClauseReading(
         "an application that runs answers upgrade messages with general feedback or nothing, "
         "and erases nothing",
         "They are writes, but belong to the bootloader.",
         suite=("up_03",),
         model=("upgrade_in_application",),
     ),
-    "R18": Reading(
+    "R18": ClauseReading(
         "the bootloader ignores reset, which belongs to the application",
         "The document places the command in the application (5.2). A bootloader that restarts is a "
         "choice.",
         suite=("rs_02", "tx_13"),
         model=("reset_in_bootloader", "reset_in_transfer"),
     ),
-    "R19": Reading(
+    "R19": ClauseReading(
         "power-up passes through the bootloader; without update command it starts the "
         "application, after complete the new one; a message begins at the beginning of a frame",
         "Not said in words, but nothing else makes sense of the flow chart and of the way in which "
@@ -228,37 +228,37 @@ READINGS: Final = {
         suite=("fr_02", "en_03", "limits.start_s"),
         model=("after_complete", "start_delay_s"),
     ),
-    "R20": Reading(
+    "R20": ClauseReading(
         "texts that break the rule of the terminator are shown as they are",
         "Real devices fill a field to its last byte; control characters are shown escaped. The "
         "project itself writes only texts that keep the rule.",
     ),
-    "R21": Reading(
+    "R21": ClauseReading(
         "status 00 of the battery means that no flag is set",
         "The table calls 00 asleep, and the byte flags joined by or: an awake battery without a "
         "charger is 00 too.",
     ),
-    "R22": Reading(
+    "R22": ClauseReading(
         "state of health 0 may be that of an older device",
         "The byte was one of five reserved zero bytes before (R1). It is shown as received; more "
         "than 100 % is marked.",
         model=("older_battery",),
     ),
-    "R23": Reading(
+    "R23": ClauseReading(
         "SHUTDOWN is repeated every 200 ms, for 1 s at most",
         "The document gives this rhythm for the tool's commands and none for SHUTDOWN.",
         model=("idle_shutdown",),
     ),
-    "R24": Reading(
+    "R24": ClauseReading(
         "fault bits 25 to 31 have no meaning",
         "They are not in the document, and not called reserved either: shown by their numbers.",
     ),
-    "R25": Reading(
+    "R25": ClauseReading(
         "a second update command before the first packet may be answered by a second request "
         "transfer, or not",
         "The device may erase again, or see that it has done so.",
     ),
-    "R26": Reading(
+    "R26": ClauseReading(
         "a device that sits silent in a broken transfer gets one update command into the silence",
         "No end of a transfer is given, so a device whose tool was lost may wait for ever, without "
         "an announcement and without knowing reset. When both stayed unanswered and the erase "
@@ -271,7 +271,7 @@ READINGS: Final = {
         host=("attempts", "timings.request_transfer_timeout_s"),
         model=("pause_in_transfer",),
     ),
-    "R27": Reading(
+    "R27": ClauseReading(
         "a question that is answered twice, a packet with more answers than copies, announcements "
         "that overlap: two devices of one kind are on the bus",
         "The document has one device of a kind. Nothing is written then, and in a transfer no "
@@ -279,7 +279,7 @@ READINGS: Final = {
         "apart, and one that is silent cannot be found.",
         host=("timings.boot_watch_s",),
     ),
-    "R28": Reading(
+    "R28": ClauseReading(
         "an announcement that the tool did not cause means another unit, or a lost supply",
         "The announcement after power-up is that after a reset, and names no unit. An upgrade "
         "takes it for a restart of the device that it has reset (R11); a run of the station ends.",

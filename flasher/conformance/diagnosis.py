@@ -8,7 +8,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 from flasher.conformance.results import TraceEntry
-from flasher.conformance.wire import Decoder, Encoder, Kind, RawFrame, Received, crc
+from flasher.conformance.wire import DeviceDecoder, Encoder, MessageKind, RawFrame, Received, crc
 
 _SHOWN: Final = 6
 _OTHER_HEADER: Final = b"\xaa\x55"
@@ -79,10 +79,10 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
         return [f"{errors}no frame at all was received{why}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
         return [_who_speaks(frames, encoder)]
-    decoder = Decoder(encoder)
+    decoder = DeviceDecoder(encoder)
     messages = [found for frame, at in heard for found in decoder.feed(frame, at)]
     to_tool = [message for message in messages if message.can_id == encoder.to_tool]
-    damaged = [message for message in to_tool if message.kind is Kind.DAMAGED]
+    damaged = [message for message in to_tool if message.kind is MessageKind.DAMAGED]
     if damaged:
         return [_what_would_fit(damaged, own)]
     return _what_is_strange(to_tool, own, encoder) or [
@@ -140,15 +140,15 @@ def _what_would_fit(damaged: Sequence[Received], own: str) -> str:
 
 def _what_is_strange(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
     """The messages are whole; what about them does not belong to the protocol."""
-    names = {one.boot_name for one in messages if one.kind is Kind.BOOT_VERSION}
+    names = {one.boot_name for one in messages if one.kind is MessageKind.BOOT_VERSION}
     for other in encoder.others():
         if other.boot_name in names:
             return [f"{own} announces itself as {other.boot_name}: the name of another device"]
-    numbers = {one.number for one in messages if one.kind in (Kind.ACK, Kind.NAK)}
+    numbers = {one.number for one in messages if one.kind in (MessageKind.ACK, MessageKind.NAK)}
     if numbers and all(number and not number & 0xFF for number in numbers):
         shown = ", ".join(str(number) for number in sorted(numbers)[:_SHOWN])
         return [f"{own} speaks; the numbers of its ACK and NAK are sent high byte first: {shown}"]
-    if names and not any(one.kind is Kind.REQUEST for one in messages):
+    if names and not any(one.kind is MessageKind.REQUEST for one in messages):
         why = "does it check another CRC, or listen elsewhere (up_04_burst in the profile)?"
         return [f"{own} announces itself, and answers no update command: {why}"]
     return []

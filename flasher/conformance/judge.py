@@ -19,7 +19,7 @@ from flasher.conformance.results import (
     Measurement,
 )
 from flasher.conformance.tester import BusTester
-from flasher.conformance.wire import Kind, Received, describe
+from flasher.conformance.wire import MessageKind, Received, describe
 
 
 class Times:
@@ -103,7 +103,7 @@ class Judge:
             raise CaseStopped(expected)
         return received
 
-    def await_message(self, kind: Kind, *, within_s: float | None = None) -> Received:
+    def await_message(self, kind: MessageKind, *, within_s: float | None = None) -> Received:
         """The next message of `kind`, others skipped, by default within the profile's limit for
         that kind; without one the case ends.
         """
@@ -113,11 +113,11 @@ class Judge:
 
     def expect(
         self,
-        kind: Kind,
+        kind: MessageKind,
         *,
         within_s: float | None = None,
         number: int | None = None,
-        ignoring: Sequence[Kind] = (),
+        ignoring: Sequence[MessageKind] = (),
     ) -> Received:
         """The next message has to be of `kind` (with that packet number) and come `within_s`, by
         default the profile's limit for that kind; messages of the kinds `ignoring` do not count.
@@ -134,14 +134,18 @@ class Judge:
         return found
 
     def expect_silence(
-        self, for_s: float | None = None, *, ignoring: Sequence[Kind] = (), why: str = "no answer"
+        self,
+        for_s: float | None = None,
+        *,
+        ignoring: Sequence[MessageKind] = (),
+        why: str = "no answer",
     ) -> bool:
         """Nothing is heard for that long (`limits.silence_s`), but for the kinds `ignoring`."""
         silence_s = self._tester.profile.limit("silence_s") if for_s is None else for_s
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
 
-    def check_only(self, received: Sequence[Received], *kinds: Kind, why: str) -> bool:
+    def check_only(self, received: Sequence[Received], *kinds: MessageKind, why: str) -> bool:
         """Nothing but messages of these kinds was received."""
         others = [one for one in received if one.kind not in kinds]
         return self.check(not others, why, describe(others))

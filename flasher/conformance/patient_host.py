@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
-from flasher.conformance.wire import MEMORY_BYTES, Kind, Received, packet_count, told_version
+from flasher.conformance.wire import MEMORY_BYTES, MessageKind, Received, packet_count, told_version
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
@@ -33,10 +33,15 @@ _WINDOW_MAX_S: Final = 1.0
 """How long the window lasts at the most where the profile does not know it (up_04)."""
 LEFTOVER_S: Final = 0.06
 """A boot version so soon after request transfer was sent before it (R11)."""
-_PACKET_ANSWERS: Final = (Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, Kind.COMPLETE)
+_PACKET_ANSWERS: Final = (
+    MessageKind.ACK,
+    MessageKind.NAK,
+    MessageKind.BOOT_VERSION,
+    MessageKind.COMPLETE,
+)
 
 
-class Upgraded(NamedTuple):
+class UpgradeResult(NamedTuple):
     """How an upgrade ended; `reason` is empty for a good end."""
 
     ok: bool
@@ -77,7 +82,7 @@ class PatientHost:
         """The first answer to the version query, which is sent `every_s`. Raises as above."""
         if not self._encoder.has_version_query:
             raise Unsupported("the document has no version query for this target")
-        tester, kind = self._tester, Kind.VERSION_INFORMATION
+        tester, kind = self._tester, MessageKind.VERSION_INFORMATION
         deadline, unanswered = tester.now + within_s, 0
         while tester.now < deadline:
             tester.send(self._encoder.query_version())
@@ -106,16 +111,19 @@ class PatientHost:
         while True:
             with tester.hearing_feedback():
                 tester.send(self._encoder.reset())
-                runs = tester.wait_for(Kind.FEEDBACK) is not None
+                runs = tester.wait_for(MessageKind.FEEDBACK) is not None
             if runs or tester.now >= deadline:
                 # What is sent before the burst that the reset may have begun is over would be lost.
-                if tester.wait_for(Kind.BOOT_VERSION) is not None:
+                if tester.wait_for(MessageKind.BOOT_VERSION) is not None:
                     tester.wait(self.burst_s + _SETTLE_S)
                     tester.forget()
                 return runs
             # The reset may have begun a burst (RS-02): another one in it would do so again.
             quiet_s = self.burst_s + _SETTLE_S
-            while tester.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
+            while (
+                tester.wait_for(MessageKind.BOOT_VERSION, within_s=quiet_s)
+                and tester.now < deadline
+            ):
                 pass
 
     def read_memory(self, start: int, size_bytes: int) -> bytes | None:
@@ -129,7 +137,7 @@ class PatientHost:
             for _ in range(_QUERY_TRIES):
                 tester.send(self._encoder.query_memory(at, at + piece))
                 heard = tester.wait_for(
-                    Kind.MEMORY,
+                    MessageKind.MEMORY,
                     within_s=_QUERY_PERIOD_S,
                     unlike=lambda one, wanted=wanted: not one.data.startswith(wanted),  # type: ignore[misc]
                 )
@@ -146,13 +154,13 @@ class PatientHost:
 
     # -- upgrade ----------------------------------------------------------------------------------
 
-    def upgrade(self, image: bytes, *, reset: bool = True, blind: bool = False) -> Upgraded:
+    def upgrade(self, image: bytes, *, reset: bool = True, blind: bool = False) -> UpgradeResult:
         """Upgrade the device as a patient tool does, from whatever state it is in.
 
         Without `reset` it waits for a device that announces itself. With `blind` a silent device
         gets the update command all the same: it may be in the midst of a transfer.
         """
-        ended = Upgraded(ok=False, reason="no boot version")
+        ended = UpgradeResult(ok=False, reason="no boot version")
         self._tester.forget()
         for attempt in range(ATTEMPTS):
             if reset and not attempt:
@@ -160,7 +168,7 @@ class PatientHost:
             if not self._ask_for_transfer(len(image), blind=blind and not attempt):
                 return ended
             ended = self.transfer(image)
-            if ended.ok or not ended.reason.startswith(Kind.BOOT_VERSION.value):
+            if ended.ok or not ended.reason.startswith(MessageKind.BOOT_VERSION.value):
                 return ended
         return ended
 
@@ -169,7 +177,7 @@ class PatientHost:
         limit = self._profile.limit
         limit_s = limit("first_version_s")
         first_s = min(_BLIND_S, limit_s) if blind else limit_s
-        heard = self._tester.wait_for(Kind.BOOT_VERSION, within_s=first_s)
+        heard = self._tester.wait_for(MessageKind.BOOT_VERSION, within_s=first_s)
         for _ in range(UPDATES_MAX):
             if heard is None and not blind:
                 return False
@@ -177,7 +185,7 @@ class PatientHost:
             # A boot version may have been the last one before a restart (RS-02).
             within_s = max(limit("erase_s"), limit("pause_s") + limit_s if blind else limit_s)
             heard = self.request_or_version(sent.left_at, within_s)
-            if heard is None or heard.kind is Kind.REQUEST:
+            if heard is None or heard.kind is MessageKind.REQUEST:
                 return heard is not None
             blind = False
         return False
@@ -188,36 +196,36 @@ class PatientHost:
         """
         not_before = asked_at + UPDATE_SPACING_S
         return self._tester.wait_for(
-            Kind.REQUEST,
-            Kind.BOOT_VERSION,
+            MessageKind.REQUEST,
+            MessageKind.BOOT_VERSION,
             within_s=within_s,
-            unlike=lambda one: one.kind is Kind.BOOT_VERSION and one.at < not_before,
+            unlike=lambda one: one.kind is MessageKind.BOOT_VERSION and one.at < not_before,
         )
 
-    def transfer(self, image: bytes) -> Upgraded:
+    def transfer(self, image: bytes) -> UpgradeResult:
         """All packets and the end, after request transfer; repeats what is lost."""
         began_at = self._tester.now
         for number in range(1, packet_count(len(image)) + 1):
             trouble = self.insist_on_packet(image, number, began_at)
             if trouble:
-                return Upgraded(ok=False, reason=f"{trouble} (packet {number})")
+                return UpgradeResult(ok=False, reason=f"{trouble} (packet {number})")
         return self.insist_on_end(image)
 
-    def insist_on_end(self, image: bytes) -> Upgraded:
+    def insist_on_end(self, image: bytes) -> UpgradeResult:
         """End of transfer until there is a final answer, or the version of `image` is told."""
         refusals = 0
         for _ in range(END_TRIES):
             self._tester.send(self._encoder.end())
-            heard = self._tester.wait_for(Kind.COMPLETE, Kind.NAK)
-            if heard is not None and heard.kind is Kind.COMPLETE:
-                return Upgraded(ok=True)
+            heard = self._tester.wait_for(MessageKind.COMPLETE, MessageKind.NAK)
+            if heard is not None and heard.kind is MessageKind.COMPLETE:
+                return UpgradeResult(ok=True)
             refusals += heard is not None
             if refusals == 2:
-                return Upgraded(ok=False, reason="the image was refused")
+                return UpgradeResult(ok=False, reason="the image was refused")
         wanted = told_version(self._encoder.target, image)
         if wanted is None or self.application_version(self._profile.limit("start_s")) != wanted:
-            return Upgraded(ok=False, reason="no final answer")
-        return Upgraded(ok=True)
+            return UpgradeResult(ok=False, reason="no final answer")
+        return UpgradeResult(ok=True)
 
     def insist_on_packet(self, image: bytes, number: int, began_at: float) -> str:
         """Send a packet until it is acknowledged; returns what went wrong in the end, or "". The
@@ -225,27 +233,27 @@ class PatientHost:
         """
 
         def is_stale(one: Received) -> bool:
-            if one.kind is Kind.BOOT_VERSION:
+            if one.kind is MessageKind.BOOT_VERSION:
                 return one.at < began_at + LEFTOVER_S
-            return one.kind is Kind.ACK and one.number != number
+            return one.kind is MessageKind.ACK and one.number != number
 
         last = "no answer"
         for tries in range(1, PACKET_TRIES + 1):
             self.send_packet(image, number)
             # It may erase once more, for an update command that was sent twice (R25, R16).
-            kinds = (*_PACKET_ANSWERS, Kind.REQUEST) if number == 1 else _PACKET_ANSWERS
+            kinds = (*_PACKET_ANSWERS, MessageKind.REQUEST) if number == 1 else _PACKET_ANSWERS
             heard = self._tester.wait_for(*kinds, unlike=is_stale)
             if heard is None and number == 1 and tries == PACKET_TRIES - 1:
                 erase_s = self._profile.limit("erase_s")
-                self._tester.wait_for(Kind.REQUEST, within_s=erase_s)
-            if heard is None or heard.kind is Kind.REQUEST:
+                self._tester.wait_for(MessageKind.REQUEST, within_s=erase_s)
+            if heard is None or heard.kind is MessageKind.REQUEST:
                 continue
             last = str(heard)
-            if heard.kind is Kind.BOOT_VERSION:
+            if heard.kind is MessageKind.BOOT_VERSION:
                 return last
-            is_next = heard.kind is Kind.NAK and heard.number == number + 1
+            is_next = heard.kind is MessageKind.NAK and heard.number == number + 1
             by_profile = is_next and tries > 1 and self._profile.choice("tx_02") != "ack"
-            if not by_profile and heard.kind is not Kind.ACK:
+            if not by_profile and heard.kind is not MessageKind.ACK:
                 continue
             # The other copies are answered too; the next message waits until that is over.
             quiet_after = PACKET_TRIES if tries > 1 else 0

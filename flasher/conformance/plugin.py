@@ -29,7 +29,7 @@ from flasher.conformance.catalogue import (
 )
 from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.profile import ConformanceProfile, check_deviations
-from flasher.conformance.real import HOST_UNCERTAINTY_S, PowerCommand, ReadbackCommand
+from flasher.conformance.real import HOST_UNCERTAINTY_S, DevicePowerCommand, ReadbackCommand
 from flasher.conformance.reports import (
     TRACED,
     candump,
@@ -49,7 +49,7 @@ from flasher.conformance.results import (
     TraceEntry,
     Unsupported,
 )
-from flasher.conformance.runner import Run, RunObserver, RunOptions
+from flasher.conformance.runner import RunObserver, RunOptions, SuiteRun
 from flasher.conformance.subject import Subject
 from flasher.conformance.trace_excerpt import excerpt, frame_lines
 from flasher.errors import FlasherError, printable, without_password
@@ -125,7 +125,7 @@ class PluginRun:
         self._is_strict: bool = config.getoption("btl_strict")
         options = RunOptions(self._seed, strict=self._is_strict)
         self._started_at = datetime.now(UTC).isoformat(timespec="seconds")
-        self._run = Run(subject, profile, options, RunObserver(), stopped=lambda: False)
+        self._run = SuiteRun(subject, profile, options, RunObserver(), stopped=lambda: False)
         self._traces: dict[tuple[str, int], str] = {}
         self._has_begun = False
 
@@ -286,7 +286,7 @@ def _options(
     named = {name: given(name) for name in ("interface", "channel", "bitrate")}
     bus |= {name: value for name, value in named.items() if value is not None}
     if power is None and given("power_cmd") is not None:
-        power = PowerCommand(given("power_cmd"))
+        power = DevicePowerCommand(given("power_cmd"))
     if readback is None and given("readback_cmd") is not None:
         readback = ReadbackCommand(given("readback_cmd"))
     uncertainty_s = given("uncertainty")

@@ -125,7 +125,7 @@ class DeviceFacts(Table):
         return self
 
 
-class Contents(Table):
+class ProfileKeys(Table):
     """A file without its rationales. Keys named after a case (`tx_02`) are the choices that the
     catalogue marks P.
     """
@@ -190,7 +190,7 @@ class Contents(Table):
     """Cases in which the product differs, with the reason."""
 
 
-_READER: Final = Reader(Contents, "profile")
+_READER: Final = Reader(ProfileKeys, "profile")
 
 
 def profile_keys() -> dict[str, Key]:

@@ -149,7 +149,7 @@ class RealSubject:
         return False
 
 
-class PowerCommand:
+class DevicePowerCommand:
     """Power by a command such as `relay {on|off}`: the first word of the braces switches on.
 
     Raises UsageError for a command without them.

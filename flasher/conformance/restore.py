@@ -20,7 +20,7 @@ from flasher.conformance.results import (
     TraceEntry,
 )
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import Kind, told_version
+from flasher.conformance.wire import MessageKind, told_version
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
@@ -30,7 +30,7 @@ BY_UPGRADE: Final = "upgrade"
 BY_POWER: Final = "power cycle, then upgrade"
 
 
-class Restored(NamedTuple):
+class RestoreResult(NamedTuple):
     """`how` is one of the texts above; empty, with a `reason`, when no way succeeded."""
 
     how: str
@@ -52,7 +52,7 @@ def restore(
     *,
     flash: bool,
     stopped: Callable[[], bool] = lambda: False,
-) -> Restored:
+) -> RestoreResult:
     """Make the application of the good image run; with `flash` it is flashed in any case.
 
     Raises BusError when the adapter fails, RunStopped when somebody wants to end the run.
@@ -80,13 +80,13 @@ def restore(
             reason = str(ended)
             crashed = crashed or isinstance(ended, DeviceCrashed)
         if not reason:
-            return Restored(how)
+            return RestoreResult(how)
         reasons.append(f"{how}: {reason}")
         later_s = bench.tester.began_at - began_at
         trace += [one._replace(at_s=one.at_s + later_s) for one in bench.tester.trace]
     has_wires = subject.port.timestamp_source != "simulated bus"
     diagnosis = [] if crashed else diagnose(trace, bench.encoder, has_wires=has_wires)
-    return Restored("", "; ".join(reasons), tuple(trace), tuple(diagnosis))
+    return RestoreResult("", "; ".join(reasons), tuple(trace), tuple(diagnosis))
 
 
 def is_reachable(
@@ -99,11 +99,11 @@ def is_reachable(
     within_s = profile.limit("first_version_s") + profile.limit("pause_s")
     try:
         bench.send(bench.encoder.reset())
-        if bench.wait_for(Kind.BOOT_VERSION, within_s=within_s) is not None:
+        if bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is not None:
             return True
         if subject.has_power:
             bench.power_cycle()
-            return bench.wait_for(Kind.BOOT_VERSION, within_s=within_s) is not None
+            return bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is not None
     except RunStopped:
         raise
     except CaseEnded:

@@ -30,7 +30,13 @@ from flasher.conformance.catalogue import (
     what_is_missing,
 )
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
-from flasher.conformance.restore import BY_POWER, Restored, is_reachable, may_need_power, restore
+from flasher.conformance.restore import (
+    BY_POWER,
+    RestoreResult,
+    is_reachable,
+    may_need_power,
+    restore,
+)
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
     CaseEnded,
@@ -101,7 +107,9 @@ def run(
     """
     selection.check()
     check_deviations(profile, known_cases())
-    return Run(subject, profile, options, observer or RunObserver(), stopped).go(selection.chosen())
+    return SuiteRun(subject, profile, options, observer or RunObserver(), stopped).go(
+        selection.chosen()
+    )
 
 
 class CaseEnd(NamedTuple):
@@ -136,7 +144,7 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     return CaseEnd(verdict, "the case judged nothing" if verdict is CaseVerdict.ERROR else "")
 
 
-class Run:
+class SuiteRun:
     """A run case by case (`begin`, `take`, `finish`, `report`), or whole (`go`)."""
 
     def __init__(
@@ -161,7 +169,7 @@ class Run:
         self._adapter_failed = False
         self._not_upgradable = ""
         self._killed_by = ""
-        self._no_bring_up: Restored | None = None
+        self._no_bring_up: RestoreResult | None = None
         """How the good image could not be flashed before the first case."""
         self._final_image = ""
         self._final_image_seen_by: tuple[str, ...] = ()
@@ -318,7 +326,7 @@ class Run:
             duration_s=port.now() - self._began_at,
         )
 
-    def _failed_bring_up(self, failed: Restored, repeat: int) -> CaseResult:
+    def _failed_bring_up(self, failed: RestoreResult, repeat: int) -> CaseResult:
         """The result of a bring-up that did not succeed: what was heard, and the likely cause."""
         at_s = failed.trace[-1].at_s if failed.trace else 0.0
         got = "; ".join((*failed.diagnosis, failed.reason))
@@ -362,18 +370,18 @@ class Run:
             return "not by the protocol; a power cycle brought it back"
         return ""
 
-    def _bring_back(self, *, flash: bool, at_first: bool) -> Restored:
+    def _bring_back(self, *, flash: bool, at_first: bool) -> RestoreResult:
         """Restore the known state; a device that could not be upgraded at first only has to be
         reachable. Raises BusError and RunStopped.
         """
         subject, profile, stopped = self._subject, self._profile, self._asked_to_stop
         if self._not_upgradable:
             is_there = is_reachable(subject, profile, stopped)
-            return Restored("reset" if is_there else "", "no boot version")
+            return RestoreResult("reset" if is_there else "", "no boot version")
         done = restore(subject, profile, flash=flash, stopped=stopped)
         if not done.ok and at_first:
             self._no_bring_up = done
             if is_reachable(subject, profile, stopped):
                 self._not_upgradable = done.reason
-                return Restored("reset", done.reason)
+                return RestoreResult("reset", done.reason)
         return done

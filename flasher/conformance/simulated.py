@@ -47,12 +47,12 @@ class SimulatedPort:
     def send(self, frame: RawFrame) -> None:
         made = Frame(*frame)
         self._pending.append((made, frame))
-        with CRASHES:
+        with REPORT_CRASHES:
             self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:
         if not self._arrived:
-            with CRASHES:
+            with REPORT_CRASHES:
                 while not self._arrived and self.now() < deadline:
                     self.bus.advance(deadline)
                     if not self._arrived:
@@ -106,7 +106,7 @@ class SimulatedSubject(Generic[DeviceT]):
         self.bus = self.port.bus
 
     def power(self, *, on: bool) -> None:
-        with CRASHES:
+        with REPORT_CRASHES:
             switch = self.device.power_on if on else self.device.power_cut
             switch(self.port.now())
 
@@ -117,7 +117,7 @@ class SimulatedSubject(Generic[DeviceT]):
         self.device.bus_off(self.port.now(), for_s)
 
 
-class _Crashes(AbstractContextManager[None]):
+class _CrashReporter(AbstractContextManager[None]):
     """A device model that raises has done what a real part does not allow."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
@@ -126,4 +126,4 @@ class _Crashes(AbstractContextManager[None]):
             raise DeviceCrashed(f"the device stopped: {error.what}{cause}") from error
 
 
-CRASHES: Final = _Crashes()
+REPORT_CRASHES: Final = _CrashReporter()

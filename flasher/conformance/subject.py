@@ -21,7 +21,7 @@ class Arrival(NamedTuple):
     is_echo: bool
 
 
-class Port(Protocol):
+class BusPort(Protocol):
     """The bus as the bench sees it. Methods raise BusError when the adapter fails."""
 
     bitrate_bps: int
@@ -62,7 +62,7 @@ class Subject(Protocol):
     has_timed_cuts: bool
 
     @property
-    def port(self) -> Port:
+    def port(self) -> BusPort:
         """The way to it."""
 
     def power(self, *, on: bool) -> None:

@@ -16,19 +16,27 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseLimitReached, RunStopped, TraceEntry
-from flasher.conformance.subject import Port
-from flasher.conformance.wire import UPDATE, WRITE, Decoder, Encoder, Kind, RawFrame, Received
+from flasher.conformance.subject import BusPort
+from flasher.conformance.wire import (
+    UPDATE,
+    WRITE,
+    DeviceDecoder,
+    Encoder,
+    MessageKind,
+    RawFrame,
+    Received,
+)
 
 TRACE_FRAMES: Final = 20_000
 """Frames of a case that are kept: the newest ones."""
 _LIMITS: Final = {
-    Kind.FEEDBACK: "feedback_s",
-    Kind.BOOT_VERSION: "first_version_s",
-    Kind.REQUEST: "erase_s",
-    Kind.ACK: "ack_s",
-    Kind.NAK: "ack_s",
-    Kind.COMPLETE: "complete_s",
-    Kind.VERSION_INFORMATION: "start_s",
+    MessageKind.FEEDBACK: "feedback_s",
+    MessageKind.BOOT_VERSION: "first_version_s",
+    MessageKind.REQUEST: "erase_s",
+    MessageKind.ACK: "ack_s",
+    MessageKind.NAK: "ack_s",
+    MessageKind.COMPLETE: "complete_s",
+    MessageKind.VERSION_INFORMATION: "start_s",
 }
 _RECEIVED_LIMIT: Final = 50_000
 """Messages that are kept: a babbling device must not fill the memory."""
@@ -55,7 +63,7 @@ class FaultKind(Enum):
 
 
 @dataclass(frozen=True)
-class Fault:
+class LineFault:
     """One fault on the line, of the `index`-th frame (from 0) since `BusTester.disturb`: of those
     that are sent or, with `incoming`, of those that arrive (which can be dropped and doubled only).
     """
@@ -83,11 +91,11 @@ class Sent(NamedTuple):
 
 
 class BusTester:
-    """Sends and receives on one `Port`, for one case, which may take `limit_s`."""
+    """Sends and receives on one `BusPort`, for one case, which may take `limit_s`."""
 
     def __init__(
         self,
-        port: Port,
+        port: BusPort,
         encoder: Encoder,
         profile: ConformanceProfile,
         limit_s: float,
@@ -109,7 +117,7 @@ class BusTester:
         self.left_at = self.began_at
         """When the last frame sent had left."""
         self._stopped = stopped
-        self._decoder = Decoder(encoder)
+        self._decoder = DeviceDecoder(encoder)
         self._received: deque[Received] = deque(maxlen=_RECEIVED_LIMIT)
         self._trace: deque[TraceEntry] = deque(maxlen=TRACE_FRAMES)
         self._traced = 0
@@ -117,7 +125,7 @@ class BusTester:
         self._feedback_due = 0
         """Writes that general feedback may still answer."""
         self._written_at = -inf
-        self._faults: dict[tuple[bool, int], Fault] = {}
+        self._faults: dict[tuple[bool, int], LineFault] = {}
         self._fault_origin = (0, 0)
         self._swapped: RawFrame | None = None
 
@@ -191,7 +199,7 @@ class BusTester:
             self.hears_feedback = before
 
     @contextmanager
-    def disturb(self, *faults: Fault) -> Iterator[None]:
+    def disturb(self, *faults: LineFault) -> Iterator[None]:
         """Let these faults happen inside the `with`; frames are counted from its beginning."""
         self._faults = {(fault.incoming, fault.index): fault for fault in faults}
         self._fault_origin = (self.frames_sent, self.frames_received)
@@ -213,7 +221,7 @@ class BusTester:
 
     def wait_for(
         self,
-        *kinds: Kind,
+        *kinds: MessageKind,
         within_s: float | None = None,
         unlike: Callable[[Received], bool] | None = None,
     ) -> Received | None:
@@ -226,7 +234,7 @@ class BusTester:
                 return received
         return None
 
-    def limit_s(self, kind: Kind) -> float:
+    def limit_s(self, kind: MessageKind) -> float:
         """The profile's limit for the answer of that kind. Raises KeyError for one without."""
         return self.profile.limit(_LIMITS[kind])
 
@@ -281,12 +289,12 @@ class BusTester:
             self._received.extend(filter(self._is_heard, heard))
 
     def _is_heard(self, one: Received) -> bool:
-        if one.kind is Kind.FEEDBACK and not self.hears_feedback:
+        if one.kind is MessageKind.FEEDBACK and not self.hears_feedback:
             is_late = one.first_at - self._written_at > self.profile.limit("feedback_s")
             if self._feedback_due and not is_late:
                 self._feedback_due -= 1
                 return False
-        return self.hears_application or one.kind is not Kind.APPLICATION
+        return self.hears_application or one.kind is not MessageKind.APPLICATION
 
     def _send_disturbed(self, frame: RawFrame) -> None:
         fault = self._faults.get((False, self.frames_sent - self._fault_origin[0]))

@@ -4,7 +4,7 @@ This is the one deliberate exception to "one fact, one place": a misreading that
 model of this project share must not hide here, so nothing of `flasher.protocol` is imported, and an
 import contract holds that. Do not replace these constants by those of the other modules.
 
-`Encoder` builds what the tool sends, `Decoder` names what the device sends.
+`Encoder` builds what the tool sends, `DeviceDecoder` names what the device sends.
 """
 
 from __future__ import annotations
@@ -282,7 +282,7 @@ _FIRMWARE_AT: Final = slice(48, 64)
 _BOOT_VERSION_TEXT: Final = re.compile(rb"V\d\.\d\.\d")
 
 
-class Kind(Enum):
+class MessageKind(Enum):
     """What a message from the device is; the value is how reports name it."""
 
     FEEDBACK = "general feedback"
@@ -301,13 +301,13 @@ class Kind(Enum):
 
 
 _KINDS: Final = {
-    FEEDBACK: (Kind.FEEDBACK, b"ACK"),
-    BOOT_VERSION: (Kind.BOOT_VERSION, None),
-    REQUEST: (Kind.REQUEST, b"\0\0"),
-    ACK: (Kind.ACK, None),
-    NAK: (Kind.NAK, None),
-    COMPLETE: (Kind.COMPLETE, b"\0\0"),
-    MEMORY: (Kind.MEMORY, None),
+    FEEDBACK: (MessageKind.FEEDBACK, b"ACK"),
+    BOOT_VERSION: (MessageKind.BOOT_VERSION, None),
+    REQUEST: (MessageKind.REQUEST, b"\0\0"),
+    ACK: (MessageKind.ACK, None),
+    NAK: (MessageKind.NAK, None),
+    COMPLETE: (MessageKind.COMPLETE, b"\0\0"),
+    MEMORY: (MessageKind.MEMORY, None),
 }
 """Commands from device to tool, with their data where the document fixes it."""
 
@@ -316,7 +316,7 @@ _KINDS: Final = {
 class Received:
     """A message from the device, with the times of its first and last frame in seconds."""
 
-    kind: Kind
+    kind: MessageKind
     first_at: float
     at: float
     can_id: int
@@ -350,18 +350,18 @@ class Received:
 
     def __str__(self) -> str:
         """As reports name it; device bytes in hexadecimal or escaped."""
-        if self.kind in (Kind.ACK, Kind.NAK):
+        if self.kind in (MessageKind.ACK, MessageKind.NAK):
             return f"{self.kind.value} {self.number}"
-        if self.kind is Kind.BOOT_VERSION:
+        if self.kind is MessageKind.BOOT_VERSION:
             return f"boot version {self.data.decode('latin-1')!a}"
-        if self.kind is Kind.OTHER:
+        if self.kind is MessageKind.OTHER:
             return f"{self.can_id:03X} {self.command:04X} {self.data.hex().upper()}".rstrip()
-        if self.kind is Kind.DAMAGED:
+        if self.kind is MessageKind.DAMAGED:
             return f"{self.kind.value} {self.can_id:03X} {self.raw.hex().upper()}"
         return str(self.kind.value)
 
 
-class Decoder:
+class DeviceDecoder:
     """Reassembles the messages of the device, id by id; frames of other senders are ignored. Bytes
     that are no message become `Kind.DAMAGED`.
 
@@ -381,10 +381,10 @@ class Decoder:
             return
         first_at, last_at, so_far = self._partial.pop(can_id, (at, at, b""))
         if so_far and at - last_at > self._timeout_s:
-            yield Received(Kind.DAMAGED, first_at, last_at, can_id, so_far)
+            yield Received(MessageKind.DAMAGED, first_at, last_at, can_id, so_far)
             first_at, so_far = at, b""
         if not so_far and not frame.data.startswith(b"\x55\xaa"):
-            yield Received(Kind.DAMAGED, at, at, can_id, frame.data)
+            yield Received(MessageKind.DAMAGED, at, at, can_id, frame.data)
             return
         raw = so_far + frame.data
         if len(raw) < 4 or len(raw) < _OVERHEAD_BYTES + raw[3]:
@@ -396,20 +396,24 @@ class Decoder:
 
     def _judge(self, raw: bytes, first_at: float, at: float, can_id: int) -> Received:
         if not is_intact(can_id, raw):
-            return Received(Kind.DAMAGED, first_at, at, can_id, raw)
+            return Received(MessageKind.DAMAGED, first_at, at, can_id, raw)
         mode, command, data = raw[2], int.from_bytes(raw[4:6], "big"), raw[6:-5]
         kind = self._kind(can_id, mode, command, data)
         return Received(kind, first_at, at, can_id, raw, mode, command, data)
 
-    def _kind(self, can_id: int, mode: int, command: int, data: bytes) -> Kind:
+    def _kind(self, can_id: int, mode: int, command: int, data: bytes) -> MessageKind:
         if can_id != self._ids.to_tool and command not in _KINDS:
             is_version = can_id == self._ids.to_all and command == VERSION_INFORMATION
-            return Kind.VERSION_INFORMATION if is_version and mode == REPORT else Kind.APPLICATION
+            return (
+                MessageKind.VERSION_INFORMATION
+                if is_version and mode == REPORT
+                else MessageKind.APPLICATION
+            )
         if mode != REPORT:
-            return Kind.OTHER
-        kind, fixed = _KINDS.get(command, (Kind.OTHER, None))
+            return MessageKind.OTHER
+        kind, fixed = _KINDS.get(command, (MessageKind.OTHER, None))
         if can_id != self._ids.to_tool or (fixed is not None and data != fixed):
-            return Kind.OTHER
+            return MessageKind.OTHER
         return kind
 
 

@@ -10,8 +10,8 @@ import pytest
 from flasher.conformance.bench import Bench
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, profile_of_mock
 from flasher.conformance.results import CaseLimitReached, CaseStopped
-from flasher.conformance.tester import Fault, FaultKind
-from flasher.conformance.wire import Kind, RawFrame, packet_count
+from flasher.conformance.tester import FaultKind, LineFault
+from flasher.conformance.wire import MessageKind, RawFrame, packet_count
 from tests.loops import each
 
 from .bench import PROFILE, subject
@@ -28,14 +28,14 @@ def sent(bench: Bench) -> list[int]:
 @each(
     "fault, carried",
     [
-        (Fault(FaultKind.DROP, 1), [0, 2, 3]),
-        (Fault(FaultKind.DOUBLE, 1), [0, 1, 1, 2, 3]),
-        (Fault(FaultKind.SWAP, 1), [0, 2, 1, 3]),
-        (Fault(FaultKind.SWAP, 3), [0, 1, 2, 3]),
-        (Fault(FaultKind.DELAY, 1, delay_s=0.05), [0, 1, 2, 3]),
+        (LineFault(FaultKind.DROP, 1), [0, 2, 3]),
+        (LineFault(FaultKind.DOUBLE, 1), [0, 1, 1, 2, 3]),
+        (LineFault(FaultKind.SWAP, 1), [0, 2, 1, 3]),
+        (LineFault(FaultKind.SWAP, 3), [0, 1, 2, 3]),
+        (LineFault(FaultKind.DELAY, 1, delay_s=0.05), [0, 1, 2, 3]),
     ],
 )
-def test_a_fault_befalls_one_frame(fault: Fault, carried: list[int]) -> None:
+def test_a_fault_befalls_one_frame(fault: LineFault, carried: list[int]) -> None:
     bench = made()
     with bench.disturb(fault):
         done = bench.send([RawFrame(0x7FF, bytes((number,))) for number in range(4)])
@@ -45,12 +45,12 @@ def test_a_fault_befalls_one_frame(fault: Fault, carried: list[int]) -> None:
 
 def test_a_frame_of_the_device_can_be_lost_on_its_way() -> None:
     bench = made()
-    with bench.disturb(Fault(FaultKind.DROP, 0, incoming=True)):
+    with bench.disturb(LineFault(FaultKind.DROP, 0, incoming=True)):
         bench.send(bench.encoder.reset())
         heard = bench.collect(0.04)
-    assert [one.kind for one in heard] == [Kind.DAMAGED]
+    assert [one.kind for one in heard] == [MessageKind.DAMAGED]
     with pytest.raises(ValueError, match="cannot be"):
-        Fault(FaultKind.SWAP, 0, incoming=True)
+        LineFault(FaultKind.SWAP, 0, incoming=True)
 
 
 def test_frames_can_be_sent_with_a_gap_and_at_a_time() -> None:
@@ -73,7 +73,7 @@ def test_no_wait_goes_beyond_the_limit_of_the_case() -> None:
 def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
     bench = made()
     with pytest.raises(CaseStopped):
-        bench.expect(Kind.ACK, within_s=0.1, number=3)
+        bench.expect(MessageKind.ACK, within_s=0.1, number=3)
     (check,) = bench.judge.checks
     assert (check.expected, check.got) == ("ACK 3", "nothing within 0.1 s")
 
@@ -81,7 +81,7 @@ def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
 @each("lost", [0, 5, 30, 200])
 def test_the_patient_host_gets_an_image_through_a_lost_frame(lost: int) -> None:
     bench = made()
-    with bench.disturb(Fault(FaultKind.DROP, lost)):
+    with bench.disturb(LineFault(FaultKind.DROP, lost)):
         ended = bench.upgrade(SECOND_IMAGE)
     assert ended.ok or not lost, ended
     if ended.ok:
@@ -96,9 +96,9 @@ def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
     bench.subject.cut_in_operation(0, 0.5, 0.3)
     bench.send(bench.encoder.update(len(GOOD_IMAGE)))
     # Torn while it was erased: no application, and the bootloader announces itself.
-    assert bench.wait_for(Kind.REQUEST, within_s=0.2) is None
+    assert bench.wait_for(MessageKind.REQUEST, within_s=0.2) is None
     assert bench.subject.take_cut()
-    assert bench.wait_for(Kind.BOOT_VERSION, within_s=1.0) is not None
+    assert bench.wait_for(MessageKind.BOOT_VERSION, within_s=1.0) is not None
     assert bench.application_version() is None
     bench.check_upgrade()
     bench.subject.cut_in_operation(10_000, 0.5, 0.1)

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from flasher.conformance.explore import Explored, Explorer
+from flasher.conformance.explore import Explorer, ExploreResult
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
-from flasher.conformance.explore.stimuli import REFUSED, Place, make
+from flasher.conformance.explore.stimuli import REFUSED, TransferPosition, make
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.restore import BY_NOTHING, restore
@@ -27,7 +27,7 @@ def _explorer(variant: str = "", target: str = "bms", seed: str = "1", **choices
     return Explorer(subject, profile_of_mock(device), seed=seed)
 
 
-def _found(explored: Explored) -> tuple[str, str]:
+def _found(explored: ExploreResult) -> tuple[str, str]:
     assert explored.finding is not None
     return explored.finding.rule, " ".join(explored.finding.steps)
 
@@ -155,7 +155,7 @@ def test_every_step_is_written_and_read() -> None:
 
 
 def test_no_two_messages_that_are_refused_are_the_same_and_none_is_the_right_one() -> None:
-    place = Place(Encoder("bms"), filler(640), 2, 0x20000)
+    place = TransferPosition(Encoder("bms"), filler(640), 2, 0x20000)
     made = {name: make(name, place) for name in REFUSED}
     sent = {name: tuple(refused.frames) for name, refused in made.items()}
     assert len(set(sent.values())) == len(sent)

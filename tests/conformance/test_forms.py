@@ -14,7 +14,7 @@ from flasher.conformance.explore import Explorer
 from flasher.conformance.explore.steps import next_step
 from flasher.conformance.explore.walk import Walk
 from flasher.conformance.init.answers import Trial
-from flasher.conformance.init.session import Session
+from flasher.conformance.init.session import InitSession
 from flasher.conformance.init.transfer_questions import in_forms
 from flasher.conformance.profile import words
 from flasher.conformance.results import CaseVerdict
@@ -42,7 +42,7 @@ def test_a_form_that_is_added_is_sent_by_its_case(own_junk: bytes) -> None:
 
 
 def test_a_form_that_is_added_is_asked_for_a_profile(own_junk: bytes) -> None:
-    session = Session(subject(), PROFILE, lambda: False)
+    session = InitSession(subject(), PROFILE, lambda: False)
     stimulus = f"a packet behind {own_junk.hex(' ')} in its first frame"
     found = list(in_forms(session, "fr_02"))
     assert Trial("found", "taken", stimulus, "") in found

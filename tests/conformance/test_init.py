@@ -12,7 +12,7 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.subject import open_subject
-from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, Asked, ask
+from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, InitResult, ask
 from flasher.conformance.init.answers import Trial, decided, limit
 from flasher.conformance.mock import (
     GOOD_IMAGE,
@@ -159,7 +159,7 @@ def mock(kind: type[MockDevice] = MockDevice, target: str = "bms", **choices: An
     return MockSubject(target, profile=device, make_device=device_maker(kind))
 
 
-def values(asked: Asked) -> dict[str, Any]:
+def values(asked: InitResult) -> dict[str, Any]:
     assert asked.stopped == ""
     return {one.key: one.value for one in asked.answers}
 

@@ -13,7 +13,7 @@ from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, profile_of_mock
-from flasher.conformance.real import PowerCommand, ReadbackCommand, RealPort, RealSubject
+from flasher.conformance.real import DevicePowerCommand, ReadbackCommand, RealPort, RealSubject
 from flasher.conformance.results import CaseVerdict, CheckOutcome, Unsupported
 from flasher.conformance.runner import run
 from flasher.conformance.wire import RawFrame
@@ -143,7 +143,7 @@ def test_what_a_link_cannot_send_is_unsupported() -> None:
 @pytest.mark.parametrize(("on", "said"), [(True, "on"), (False, "off")])
 def test_the_power_command_says_on_or_off(tmp_path: Path, on: bool, said: str) -> None:
     path = tmp_path / "said"
-    PowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
+    DevicePowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
     assert path.read_text() == said
 
 
@@ -156,11 +156,13 @@ def test_the_power_command_says_on_or_off(tmp_path: Path, on: bool, said: str) -
 )
 def test_a_power_command_that_fails_is_an_error_of_the_bench(command: str, said: str) -> None:
     with pytest.raises(BusError, match=said):
-        PowerCommand(command)(True)
+        DevicePowerCommand(command)(True)
 
 
 def test_a_power_command_that_hangs_is_cut() -> None:
-    command = PowerCommand(f'{sys.executable} -c "import time; time.sleep(60)" {{on|off}}', 0.1)
+    command = DevicePowerCommand(
+        f'{sys.executable} -c "import time; time.sleep(60)" {{on|off}}', 0.1
+    )
     with pytest.raises(BusError, match="longer than"):
         command(True)
 
@@ -168,7 +170,7 @@ def test_a_power_command_that_hangs_is_cut() -> None:
 @each("template", ["relay on", "relay {on}", "relay '{on|off}"])
 def test_a_power_command_that_makes_no_sense_is_refused(template: str) -> None:
     with pytest.raises(UsageError):
-        PowerCommand(template)
+        DevicePowerCommand(template)
 
 
 def test_the_readback_command_yields_the_file_that_it_wrote() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut import CanFrame, Facts
-from flasher.conformance.dut.pipes import FACTS, HEADER, Kind
+from flasher.conformance.dut.pipes import FACTS, HEADER, PipeMessage
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import run
@@ -330,7 +330,7 @@ def test_a_library_in_the_working_directory_says_what_it_lacks(
 
 def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -> None:
     program = tmp_path / "boot"
-    facts = HEADER.pack(Kind.FACTS.value, FACTS.size) + FACTS.pack(2, *8 * [0])
+    facts = HEADER.pack(PipeMessage.FACTS.value, FACTS.size) + FACTS.pack(2, *8 * [0])
     program.write_text(f"#!{sys.executable}\nimport os\nos.write(1, {facts!r})\nos.read(0, 1)\n")
     program.chmod(0o755)
     with pytest.raises(UsageError, match="built with version 2"):

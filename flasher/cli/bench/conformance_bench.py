@@ -47,7 +47,7 @@ class BenchChoices:
     def described(self, bus: Bus) -> BenchOptions:
         """The bench. Raises UsageError for one that makes no sense."""
         from flasher.conformance.bench_options import BenchOptions, check_bench  # noqa: PLC0415
-        from flasher.conformance.real import PowerCommand, ReadbackCommand  # noqa: PLC0415
+        from flasher.conformance.real import DevicePowerCommand, ReadbackCommand  # noqa: PLC0415
 
         if self.target is None:
             raise UsageError(
@@ -73,7 +73,7 @@ class BenchChoices:
             allow_implausible=self.allow_implausible,
             bus=bus.config,
             fallback=None if without else bus.fallback,
-            power=None if self.power_cmd is None else PowerCommand(self.power_cmd),
+            power=None if self.power_cmd is None else DevicePowerCommand(self.power_cmd),
             readback=None if self.readback_cmd is None else ReadbackCommand(self.readback_cmd),
             uncertainty_s=self.uncertainty,
         )

@@ -30,7 +30,7 @@ from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
-    from flasher.conformance.explore import Explored
+    from flasher.conformance.explore import ExploreResult
 
 _EXAMPLES: Final = """\
 examples:
@@ -152,7 +152,7 @@ def explore(
     return _tell(explored, output, trace_file, code)
 
 
-def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> int:
+def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code: ExitCode) -> int:
     ctx, finding = click.get_current_context(), explored.finding
     words = ["flasher", *rebuild_command_line(ctx, "conformance", without=_REPLACED.__contains__)]
     words.insert(words.index("conformance") + 1, "explore")

@@ -12,12 +12,12 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
-from flasher.conformance.tester import Fault, FaultKind, Sent
+from flasher.conformance.tester import FaultKind, LineFault, Sent
 from flasher.conformance.wire import (
     ACK,
     FEEDBACK,
     REQUEST,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -50,13 +50,13 @@ class _Disturbance(NamedTuple):
     """True when the message itself arrives, so that the device goes on."""
 
 
-_Left = dict[str, deque[_Disturbance]]
+_PendingFaults = dict[str, deque[_Disturbance]]
 """The faults that each message of the tool has still to meet, in turn."""
 
 
 @contextmanager
 def _faulty(
-    bench: Bench, frames: Sequence[RawFrame], faults: Sequence[Fault] = ()
+    bench: Bench, frames: Sequence[RawFrame], faults: Sequence[LineFault] = ()
 ) -> Iterator[Sent]:
     """Send a message while these faults are set for it and its answer."""
     with bench.disturb(*faults):
@@ -102,16 +102,16 @@ def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sen
 def disturbed_frames(bench: Bench) -> None:
     delay_s = 1.5 * bench.limit("inter_frame_s")
 
-    def faults(frames: int) -> Iterator[Fault]:
+    def faults(frames: int) -> Iterator[LineFault]:
         for index in range(frames):
-            yield Fault(FaultKind.DROP, index)
-            yield Fault(FaultKind.DOUBLE, index)
+            yield LineFault(FaultKind.DROP, index)
+            yield LineFault(FaultKind.DOUBLE, index)
             if index:
-                yield Fault(FaultKind.DELAY, index, delay_s=delay_s)
-                yield Fault(FaultKind.SWAP, index - 1)
+                yield LineFault(FaultKind.DELAY, index, delay_s=delay_s)
+                yield LineFault(FaultKind.SWAP, index - 1)
         for index in range(_ANSWER_FRAMES):
             for kind in (FaultKind.DROP, FaultKind.DOUBLE):
-                yield Fault(kind, index, incoming=True)
+                yield LineFault(kind, index, incoming=True)
 
     def disturbances(frames: int) -> Iterator[_Disturbance]:
         for fault in faults(frames):
@@ -154,7 +154,7 @@ def bus_off(bench: Bench) -> None:
         bench.wait(off_s / 2)
         bench.forget()
         heard = bench.collect(off_s / 2 + bench.host.burst_s)
-        versions = [one for one in heard if one.kind is Kind.BOOT_VERSION]
+        versions = [one for one in heard if one.kind is MessageKind.BOOT_VERSION]
         bench.check(not versions, "the application runs by then", describe(versions))
         bench.check_application()
 
@@ -192,7 +192,7 @@ def same_id(bench: Bench) -> None:
 def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance]]) -> None:
     """Repeat the upgrade until every fault has happened, one in each message at most."""
     image, encoder = bench.good_image, bench.encoder
-    left: _Left = {
+    left: _PendingFaults = {
         "reset": deque(make(len(encoder.reset()))),
         "update command": deque(make(len(encoder.update(len(image))))),
         "packet": deque(make(len(encoder.packet_of(image, 1)))),
@@ -208,12 +208,12 @@ def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance
     bench.check(done, "the upgrades come to their end", "the device restarts in each one")
 
 
-def _next(left: _Left, message: str) -> _Disturbance:
+def _next(left: _PendingFaults, message: str) -> _Disturbance:
     """The next fault for that message; an undisturbed sending when none is left."""
     return left[message].popleft() if left[message] else _UNDISTURBED
 
 
-def _enter(bench: Bench, image: bytes, left: _Left) -> None:
+def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
     """Send reset and update command until request transfer. A device that received only a part of
     them may announce, run, erase or wait for packet 1; it has to request the transfer in the end.
     """
@@ -228,7 +228,9 @@ def _enter(bench: Bench, image: bytes, left: _Left) -> None:
         if message == "reset":
             within_s = limit("feedback_s") if disturbance.name else limit("first_version_s")
             with disturbance.send(bench, bench.encoder.reset()):
-                heard = bench.wait_for(Kind.BOOT_VERSION, Kind.REQUEST, within_s=within_s)
+                heard = bench.wait_for(
+                    MessageKind.BOOT_VERSION, MessageKind.REQUEST, within_s=within_s
+                )
         else:
             within_s = bench.host.burst_s if disturbance.name else limit("erase_s")
             with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
@@ -239,17 +241,17 @@ def _enter(bench: Bench, image: bytes, left: _Left) -> None:
             ):
                 sent = bench.send(bench.encoder.update(len(image)))
                 heard = bench.host.request_or_version(sent.left_at, limit("silence_s"))
-        if heard is not None and heard.kind is Kind.REQUEST:
+        if heard is not None and heard.kind is MessageKind.REQUEST:
             break
         # One that answers no reset may wait for packet 1: its request transfer was lost (R26).
         is_deaf = message == "reset" and not disturbance.name
         message = "update command" if heard is not None or is_deaf else "reset"
     with bench.step("; ".join(names) or "undisturbed"):
-        is_there = heard is not None and heard.kind is Kind.REQUEST
-        bench.require(is_there, Kind.REQUEST.value, heard or "nothing in many tries")
+        is_there = heard is not None and heard.kind is MessageKind.REQUEST
+        bench.require(is_there, MessageKind.REQUEST.value, heard or "nothing in many tries")
 
 
-def _send_packets(bench: Bench, image: bytes, left: _Left) -> bool:
+def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     """Send all packets, each one with its fault and then undisturbed until it is acknowledged.
     False when the device announced a restart: the upgrade begins again (R11).
     """
@@ -258,11 +260,11 @@ def _send_packets(bench: Bench, image: bytes, left: _Left) -> bool:
         disturbance = _next(left, "packet")
         with bench.step(f"packet {number}, {disturbance.name}" if disturbance.name else "packets"):
             with disturbance.send(bench, bench.encoder.packet_of(image, number)):
-                heard = bench.wait_for(Kind.ACK, Kind.NAK)
+                heard = bench.wait_for(MessageKind.ACK, MessageKind.NAK)
             last = ""
-            if heard is None or heard.kind is not Kind.ACK or heard.number != number:
+            if heard is None or heard.kind is not MessageKind.ACK or heard.number != number:
                 last = bench.host.insist_on_packet(image, number, began_at)
-            if last.startswith(Kind.BOOT_VERSION.value):
+            if last.startswith(MessageKind.BOOT_VERSION.value):
                 bench.info(f"the device restarts: {disturbance.name}")
                 return False
             if disturbance.name or last:
@@ -270,7 +272,7 @@ def _send_packets(bench: Bench, image: bytes, left: _Left) -> bool:
     return True
 
 
-def _end(bench: Bench, image: bytes, left: _Left) -> bool:
+def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     """End of transfer, with one fault after the other until it is answered; false when the device
     refused the image explicitly, with two NAKs (R6).
     """
@@ -282,10 +284,12 @@ def _end(bench: Bench, image: bytes, left: _Left) -> bool:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=bench.limit("silence_s"))
+            heard = bench.wait_for(
+                MessageKind.COMPLETE, MessageKind.NAK, within_s=bench.limit("silence_s")
+            )
         if disturbance.hits_answer:
             break
-    if heard is not None and heard.kind is Kind.COMPLETE:
+    if heard is not None and heard.kind is MessageKind.COMPLETE:
         return True
     with bench.step("; ".join(names) or "end of transfer"):
         done = bench.host.insist_on_end(image)

@@ -19,7 +19,7 @@ from flasher.conformance.wire import (
     REPORT,
     REQUEST,
     Encoder,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     build,
@@ -109,28 +109,28 @@ def load(bench: Bench) -> None:
             bench.send(_FOREIGN)
             bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
         bench.send(_under_load(bench.encoder.reset()))
-        _expect_under_load(bench, Kind.BOOT_VERSION)
+        _expect_under_load(bench, MessageKind.BOOT_VERSION)
         bench.wait_to_be_heard()
     with bench.step("update command under load"):
         bench.send(_under_load(bench.encoder.update(len(image))))
-        _expect_under_load(bench, Kind.REQUEST)
+        _expect_under_load(bench, MessageKind.REQUEST)
     with bench.step("packets under load"):
         for number in range(1, loaded):
             bench.send(_under_load(bench.encoder.packet_of(image, number)))
-            heard = _expect_under_load(bench, Kind.ACK)
+            heard = _expect_under_load(bench, MessageKind.ACK)
             bench.require(heard.number == number, f"ACK {number}", heard)
     with bench.step("a babbling node in the transfer"):
         began_at = bench.now
         bench.send_packet(image, loaded)
         _babble(bench)
         heard_all = bench.collect(bench.limit("ack_s"))
-        if not any(one.kind is Kind.ACK and one.number == loaded for one in heard_all):
+        if not any(one.kind is MessageKind.ACK and one.number == loaded for one in heard_all):
             trouble = bench.host.insist_on_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
     with bench.step("end of transfer, the bus taken behind it"):
         bench.packets(image, loaded + 1)
         bench.send([*bench.encoder.end(), *_BABBLE_SHORTLY])
-        bench.expect(Kind.COMPLETE)
+        bench.expect(MessageKind.COMPLETE)
         bench.check_image(image)
 
 
@@ -152,14 +152,14 @@ def two_upgrades(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.wait_to_be_heard()
             _between(bench, bench.encoder.update(len(image)), other.update(len(image)))
-            bench.expect(Kind.REQUEST, ignoring=(Kind.BOOT_VERSION,))
+            bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
                 # The other's packet has other data; its next one comes alone.
                 inverse = inverted(packet_payload(image, number))
                 own = bench.encoder.packet_of(image, number)
                 _between(bench, own, other.packet(number, total, inverse))
-                bench.expect(Kind.ACK, number=number)
+                bench.expect(MessageKind.ACK, number=number)
                 bench.send(other.answer(ACK, number.to_bytes(2, "little")))
                 if number < total:
                     bench.send(other.packet(number + 1, total, inverse))
@@ -191,13 +191,13 @@ def application_traffic(bench: Bench) -> None:
         bench.reset_to_bootloader()
         bench.send(traffic)
         heard = bench.collect(bench.limit("version_spacing_s"))
-        bench.check_only(heard, Kind.BOOT_VERSION, why="no answer")
+        bench.check_only(heard, MessageKind.BOOT_VERSION, why="no answer")
         bench.update(len(image))
     middle = max(1, total // 2)
     for before, first, last in (("packet 1", 1, middle), ("a packet", middle + 1, total)):
         with bench.step(f"before {before}"):
             bench.send(traffic)
-            bench.expect_silence(ignoring=(Kind.BOOT_VERSION,) if first == 1 else ())
+            bench.expect_silence(ignoring=(MessageKind.BOOT_VERSION,) if first == 1 else ())
             bench.packets(image, first, last)
     with bench.step("before the end"):
         bench.send(traffic)
@@ -214,7 +214,7 @@ def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
     return [one for frame in frames for one in (*_FOREIGN, frame)]
 
 
-def _expect_under_load(bench: Bench, kind: Kind) -> Received:
+def _expect_under_load(bench: Bench, kind: MessageKind) -> Received:
     """The next message of that kind, while the load goes on."""
     within_s = bench.tester.limit_s(kind)
     until = bench.now + within_s

@@ -10,7 +10,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.patient_host import UPDATE_SPACING_S, UPDATES_MAX
-from flasher.conformance.tester import Fault, FaultKind
+from flasher.conformance.tester import FaultKind, LineFault
 from flasher.conformance.wire import (
     BOOT_VERSION,
     PACKET_BYTES,
@@ -18,7 +18,7 @@ from flasher.conformance.wire import (
     REPORT,
     RESET,
     RESET_TEXT,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     build,
@@ -96,13 +96,13 @@ def bursts(bench: Bench) -> None:
         # Those after which no intact packet is left: the first or the last frame doubled leaves
         # one, and behind the last frame there is none to swap it with.
         last = PACKET_FRAMES - 1
-        faults: list[Fault] = []
+        faults: list[LineFault] = []
         for index in range(PACKET_FRAMES):
-            faults.append(Fault(FaultKind.DROP, index))
+            faults.append(LineFault(FaultKind.DROP, index))
             if 0 < index < last:
-                faults.append(Fault(FaultKind.DOUBLE, index))
+                faults.append(LineFault(FaultKind.DOUBLE, index))
             if index < last:
-                faults.append(Fault(FaultKind.SWAP, index))
+                faults.append(LineFault(FaultKind.SWAP, index))
         for fault in faults:
             probe.keep_alive()
             frames = probe.frames()
@@ -149,7 +149,7 @@ def other_checksums(bench: Bench) -> None:
     choices=("tx_01",),
 )
 def vectors(bench: Bench) -> None:
-    exact, encoder = _Exact(bench), bench.encoder
+    exact, encoder = _WrittenMessages(bench), bench.encoder
     limit, image = bench.limit, bench.good_image
     with bench.step("upgrade"):
         exact.enter(encoder.update(len(image)))
@@ -233,7 +233,7 @@ VECTORS: Final[dict[str, dict[str, str]]] = {
 """
 
 
-class _Exact:
+class _WrittenMessages:
     """Sends and expects messages that are written out in `VECTORS`."""
 
     def __init__(self, bench: Bench) -> None:
@@ -254,8 +254,8 @@ class _Exact:
         heard = self._bench.next_message(within_s)
         if (
             heard is None
-            or heard.kind is Kind.ACK
-            or (heard.kind is Kind.NAK and heard.number != 1)
+            or heard.kind is MessageKind.ACK
+            or (heard.kind is MessageKind.NAK and heard.number != 1)
         ):
             why = f"the damaged packet 1 got {heard or 'no answer'}"
             self._bench.unsupported("NAK 1, byte for byte", why)
@@ -270,7 +270,9 @@ class _Exact:
         with bench.tester.hearing_feedback():
             bench.send(encoder.reset() if is_own else self.frames("reset"))
             heard = bench.next_message(limit("first_version_s"))
-        if heard is None or heard.kind is not Kind.BOOT_VERSION:  # one without feedback: RS-01
+        if (
+            heard is None or heard.kind is not MessageKind.BOOT_VERSION
+        ):  # one without feedback: RS-01
             self._judge("feedback", self._written["feedback"], heard)
             heard = bench.next_message(limit("first_version_s"))
         # The text in it is the product's own.
@@ -282,10 +284,10 @@ class _Exact:
             for _ in range(UPDATES_MAX):
                 heard = bench.next_message(limit("erase_s"))
                 # Boot versions sent before it was heard do not count (R2).
-                is_version = heard is not None and heard.kind is Kind.BOOT_VERSION
+                is_version = heard is not None and heard.kind is MessageKind.BOOT_VERSION
                 if heard is None or not is_version or heard.at > sent.left_at + UPDATE_SPACING_S:
                     break
-            if heard is None or heard.kind is not Kind.BOOT_VERSION:
+            if heard is None or heard.kind is not MessageKind.BOOT_VERSION:
                 break
         self._judge("request", self._written["request"], heard)
 
@@ -397,5 +399,5 @@ def _check_none_taken(
 
 def _require_none_taken(bench: Bench, what: str, heard: Sequence[Received]) -> None:
     """NAK or silence; which of them, with which number, is TX-01."""
-    if any(one.kind is not Kind.NAK for one in heard):
+    if any(one.kind is not MessageKind.NAK for one in heard):
         bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003

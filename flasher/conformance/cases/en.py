@@ -7,7 +7,15 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import check_out_of_turn, transfer_image
 from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
-from flasher.conformance.wire import END, WRITE, Kind, Received, describe, packet_count, version_in
+from flasher.conformance.wire import (
+    END,
+    WRITE,
+    MessageKind,
+    Received,
+    describe,
+    packet_count,
+    version_in,
+)
 
 _RESET_PERIOD_S: Final = 0.2
 """A tool repeats a command at this interval (4.3)."""
@@ -15,7 +23,13 @@ _WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
 """Bytes of an end of transfer in place of 04."""
 _NO_APPLICATION_S: Final = 1.0
 """How long an application that must not run is asked."""
-_UPGRADE_KINDS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.FEEDBACK)
+_UPGRADE_KINDS: Final = (
+    MessageKind.REQUEST,
+    MessageKind.ACK,
+    MessageKind.NAK,
+    MessageKind.COMPLETE,
+    MessageKind.FEEDBACK,
+)
 """What an end of transfer can be answered by; an application that starts may report besides."""
 
 
@@ -37,7 +51,7 @@ def end(bench: Bench) -> None:
     bench.packets(image)
     bench.end_transfer()
     with bench.step("after complete"):
-        heard = bench.wait_for(Kind.BOOT_VERSION)
+        heard = bench.wait_for(MessageKind.BOOT_VERSION)
         if bench.choice("en_03") != "either":
             restarts = bench.choice("en_03") == "restarts"
             expected = "the bootloader announces itself" if restarts else "no boot version"
@@ -74,10 +88,10 @@ def end_early_and_twice(bench: Bench) -> None:
             done = stored
             bench.send(bench.encoder.end())
             # A NAK of any number (R6), and nothing else.
-            bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
-            bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
+            bench.expect(MessageKind.NAK, within_s=bench.limit("complete_s"))
+            bench.expect_silence(bench.limit("ack_s"), ignoring=(MessageKind.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
-            heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION)
+            heard = bench.wait_for(MessageKind.ACK, MessageKind.NAK, MessageKind.BOOT_VERSION)
             if str(heard) == f"ACK {stored + 1}":
                 bench.succeed(f"ACK {stored + 1}", heard)
                 done += 1
@@ -89,17 +103,19 @@ def end_early_and_twice(bench: Bench) -> None:
         with bench.step(f"end of transfer with {mark:02X}"):
             bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
             answers = bench.collect(bench.limit("ack_s"))
-            ok = not any(one.kind in (Kind.COMPLETE, Kind.ACK) for one in answers)
+            ok = not any(one.kind in (MessageKind.COMPLETE, MessageKind.ACK) for one in answers)
             bench.require(ok, "rejected", describe(answers))
-        if any(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in answers):
+        if any(one.kind in (MessageKind.NAK, MessageKind.BOOT_VERSION) for one in answers):
             bench.send_packet(image, total)
-            known = bench.wait_for(Kind.ACK, Kind.NAK, unlike=lambda one: one.number < total)
+            known = bench.wait_for(
+                MessageKind.ACK, MessageKind.NAK, unlike=lambda one: one.number < total
+            )
             if known is None:
                 _begin_anew(bench, image, total)
             break
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
-        _check_second_end(bench, Kind.COMPLETE)
+        _check_second_end(bench, MessageKind.COMPLETE)
         bench.check_image(image)
 
 
@@ -107,21 +123,21 @@ def _begin_anew(bench: Bench, image: bytes, stored: int, heard: Received | None 
     """Send the packets up to that one in a new transfer; `heard` was the last message."""
     bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
-    found = heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
-    found = found or bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+    found = heard if heard is not None and heard.kind is MessageKind.BOOT_VERSION else None
+    found = found or bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
     if bench.choice("rs_03") == "announces":
         bench.require_received(found, "the transfer goes on, or boot version", within_s)
     bench.update(len(image))
     bench.packets(image, 1, stored)
 
 
-def _check_second_end(bench: Bench, first_answer: Kind) -> None:
+def _check_second_end(bench: Bench, first_answer: MessageKind) -> None:
     """End of transfer once more, right after its answer."""
     bench.send(bench.encoder.end())
     heard = bench.collect(bench.limit("ack_s"))
     answers = [one for one in heard if one.kind in _UPGRADE_KINDS]
     # An application that runs already may confirm what it does not know (R17).
-    silence: list[list[Kind]] = [[], [Kind.FEEDBACK]]
+    silence: list[list[MessageKind]] = [[], [MessageKind.FEEDBACK]]
     allowed = {
         "same_answer": [[first_answer]],
         "silence": silence,
@@ -147,14 +163,14 @@ def wrong_checksum(bench: Bench) -> None:
     bench.start_transfer(len(image))
     bench.packets(image)
     bench.send(bench.encoder.end())
-    bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
+    bench.expect(MessageKind.NAK, within_s=bench.limit("complete_s"))
     with bench.step("end of transfer again"):
-        _check_second_end(bench, Kind.NAK)
+        _check_second_end(bench, MessageKind.NAK)
     with bench.step("afterwards"):
         within_s = bench.limit("refused_s")
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
         if bench.choice("rs_03") == "announces":  # else it may listen silently
-            bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+            bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
         bench.wait(bench.host.burst_s)
         runs = bench.application_runs(_NO_APPLICATION_S)
         bench.check(not runs, "no application runs", "it answers" if runs else "no answer")
@@ -189,11 +205,11 @@ def in_a_row(bench: Bench) -> None:
                 while heard is None and bench.now < deadline:
                     with bench.tester.hearing_feedback():
                         bench.send(bench.encoder.reset())
-                        kinds = (Kind.FEEDBACK, Kind.BOOT_VERSION)
+                        kinds = (MessageKind.FEEDBACK, MessageKind.BOOT_VERSION)
                         heard = bench.wait_for(*kinds, within_s=_RESET_PERIOD_S)
-                if heard is not None and heard.kind is Kind.FEEDBACK:
-                    heard = bench.wait_for(Kind.BOOT_VERSION)
-                bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+                if heard is not None and heard.kind is MessageKind.FEEDBACK:
+                    heard = bench.wait_for(MessageKind.BOOT_VERSION)
+                bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
             bench.update(len(image))
             bench.packets(image)
             bench.end_transfer()

@@ -24,7 +24,7 @@ from flasher.conformance.wire import (
     UPDATE,
     WRITE,
     Encoder,
-    Kind,
+    MessageKind,
     RawFrame,
     build,
     filled_up,
@@ -257,7 +257,7 @@ def padded(bench: Bench) -> None:
         within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
             within_s = min(within_s, bench.limit("pause_s") / 2)
-        heard = bench.wait_for(Kind.COMPLETE, within_s=within_s)
+        heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
         ok = is_as(choice, heard is not None)
         bench.check(ok, f"end of transfer {choice}", heard or "nothing")
         if heard is None:
@@ -285,7 +285,7 @@ def back_to_back(bench: Bench) -> None:
         with bench.step(f"{count} times a query, then a packet"):
             # Whether a bootloader answers a query is CO-04.
             frames = count * query + probe.frames()
-            probe.offer(frames, ACCEPTED, ignoring=(Kind.FEEDBACK, Kind.OTHER))
+            probe.offer(frames, ACCEPTED, ignoring=(MessageKind.FEEDBACK, MessageKind.OTHER))
     with bench.step("the last packet again, then the next one"):
         bench.forget()
         frames, number = probe.frames(), probe.number
@@ -293,7 +293,7 @@ def back_to_back(bench: Bench) -> None:
         first = bench.next_message(bench.limit("ack_s"))
         allowed = bench.right_to_repetition(number - 1)
         bench.require(str(first) in allowed, " or ".join(allowed), first or "nothing")
-        bench.expect(Kind.ACK, number=number)
+        bench.expect(MessageKind.ACK, number=number)
 
 
 @case(
@@ -386,7 +386,7 @@ def _of_command(bench: Bench, command: int) -> list[RawFrame]:
 # -- stimuli --------------------------------------------------------------------------------------
 
 
-class Form(NamedTuple):
+class PacketForm(NamedTuple):
     """A form of an intact packet: `step` names it in a case, `asked` in a profile of `init`; the
     bytes `before` it stand in its first frame.
     """
@@ -397,7 +397,7 @@ class Form(NamedTuple):
     frame_bytes: int = FRAME_BYTES
 
 
-def forms(encoder: Encoder) -> dict[str, list[Form]]:
+def forms(encoder: Encoder) -> dict[str, list[PacketForm]]:
     """Forms of a packet by the key of the profile that decides about them: its first word is for a
     packet that is taken, the second one for the other. Cases, `init` and walks send all of them.
     """
@@ -405,10 +405,10 @@ def forms(encoder: Encoder) -> dict[str, list[Form]]:
     junk = {f"{own.hex(' ').upper()} in its first frame": own for own in JUNK_IN_FRAME}
     query = joined(encoder.query_version())[:-1]
     return {
-        "fr_01": [Form(step, f"a {step}", frame_bytes=size) for size, step in splits.items()],
-        "fr_02": [Form(step, f"a packet behind {step}", own) for step, own in junk.items()],
+        "fr_01": [PacketForm(step, f"a {step}", frame_bytes=size) for size, step in splits.items()],
+        "fr_02": [PacketForm(step, f"a packet behind {step}", own) for step, own in junk.items()],
         "fr_04": [
-            Form(
+            PacketForm(
                 f"query that ends with {tail:02X}, packet in the same frame",
                 f"a packet behind a tail {tail:02X} in its first frame",
                 query + bytes((tail,)),

@@ -10,7 +10,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -33,7 +33,7 @@ def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
 
-class Transfer:
+class PacketTransfer:
     """A transfer of `image` that goes on packet by packet; so many of them are `stored`."""
 
     def __init__(self, bench: Bench, image: bytes) -> None:
@@ -65,7 +65,7 @@ class Transfer:
 
     def is_taken(self, heard: Received) -> bool:
         """True for the ACK of the next packet."""
-        return heard.kind is Kind.ACK and heard.number == self.number
+        return heard.kind is MessageKind.ACK and heard.number == self.number
 
     def answers(
         self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
@@ -86,7 +86,7 @@ class Transfer:
         return heard
 
 
-class Probe(Transfer):
+class Probe(PacketTransfer):
     """A transfer (of some packets of chance by default) for stimuli that are judged.
 
     With "accepted" the stimulus has to be acknowledged as the next packet. With "rejected" it must
@@ -116,7 +116,7 @@ class Probe(Transfer):
             bench.wait_to_be_heard()
         sent = bench.send(frames)
         heard = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
-        taken = heard is not None and heard.kind is Kind.REQUEST
+        taken = heard is not None and heard.kind is MessageKind.REQUEST
         bench.check(is_as(wanted, taken), f"update command {wanted}", heard or "no answer")
         if not taken:
             if reset and heard is None:  # by now the application was started
@@ -138,10 +138,10 @@ class Probe(Transfer):
         heard: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
             heard.append(one)
-            if one.kind is not Kind.NAK:
+            if one.kind is not MessageKind.NAK:
                 break
-        ok = all(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in heard)
-        goes_on = not is_burst or (bool(heard) and heard[-1].kind is Kind.BOOT_VERSION)
+        ok = all(one.kind in (MessageKind.NAK, MessageKind.BOOT_VERSION) for one in heard)
+        goes_on = not is_burst or (bool(heard) and heard[-1].kind is MessageKind.BOOT_VERSION)
         bench.require(ok and goes_on, "boot version, NAK at the most before it", describe(heard))
         bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
@@ -177,7 +177,7 @@ class Probe(Transfer):
         *,
         gap_s: float = 0.0,
         gaps: int | None = None,
-        ignoring: Sequence[Kind] = (),
+        ignoring: Sequence[MessageKind] = (),
     ) -> bool:
         """Send `frames`, as `answers` does, and judge whether the next packet is taken as `wanted`;
         sends it as it should be when it was not. Messages of the kinds `ignoring` do not count.
@@ -185,7 +185,7 @@ class Probe(Transfer):
         """
         heard = self.answers(frames, gap_s=gap_s, gaps=gaps)
         taken = any(map(self.is_taken, heard))
-        allowed = (Kind.NAK, *ignoring)
+        allowed = (MessageKind.NAK, *ignoring)
         others = [one for one in heard if one.kind not in allowed and not self.is_taken(one)]
         expected = {
             ACCEPTED: f"ACK {self.number}",
@@ -208,7 +208,7 @@ class Probe(Transfer):
         bench.forget()
         bench.send(frames)
         heard = bench.collect(self.settle_s())
-        ok = all(one.kind is Kind.NAK for one in heard)
+        ok = all(one.kind is MessageKind.NAK for one in heard)
         bench.require(ok, "NAK or no answer", describe(heard))
         self.plain()
 

@@ -13,7 +13,7 @@ from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
 from flasher.conformance.wire import (
     PACKET_BYTES,
     PACKET_FRAMES,
-    Kind,
+    MessageKind,
     Received,
     packet_count,
     version_in,
@@ -44,7 +44,7 @@ class _Cut(NamedTuple):
 
 
 @dataclass
-class _Upgrade:
+class _InterruptedUpgrade:
     """The images of a case, and how far the interrupted upgrade went."""
 
     old: bytes
@@ -118,7 +118,7 @@ def second_cut(bench: Bench) -> None:
         with bench.step("first cut"):
             _go_to(bench, upgrade, _Cut(1, 9))
             bench.power_cycle(_OFF_S)
-            bench.await_message(Kind.BOOT_VERSION)
+            bench.await_message(MessageKind.BOOT_VERSION)
         with bench.step(f"second cut {_name_of(cut, total)}"):
             upgrade.runs = False
             _go_to(bench, upgrade, cut)
@@ -161,11 +161,11 @@ def _name_of(cut: _Cut, total: int) -> str:
 # -- the images -----------------------------------------------------------------------------------
 
 
-def _upgrade(bench: Bench) -> _Upgrade:
+def _upgrade(bench: Bench) -> _InterruptedUpgrade:
     """From the good image to another one where there is one, so that they can be told apart; it is
     said where they cannot.
     """
-    upgrade = _Upgrade(bench.good_image, bench.subject.second_image or bench.good_image)
+    upgrade = _InterruptedUpgrade(bench.good_image, bench.subject.second_image or bench.good_image)
     same = version_in(upgrade.old) == version_in(upgrade.new) or version_in(upgrade.old) is None
     if not bench.subject.has_readback and (same or not bench.encoder.has_version_query):
         bench.unsupported(
@@ -178,7 +178,7 @@ def _upgrade(bench: Bench) -> _Upgrade:
 # -- an upgrade up to the cut ---------------------------------------------------------------------
 
 
-def _enter(bench: Bench, upgrade: _Upgrade) -> None:
+def _enter(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """Request transfer, from the application or from a bootloader that waits for it."""
     upgrade.end_was_sent = False
     if upgrade.runs:
@@ -187,7 +187,7 @@ def _enter(bench: Bench, upgrade: _Upgrade) -> None:
     upgrade.runs = False
 
 
-def _go_to(bench: Bench, upgrade: _Upgrade, cut: _Cut) -> None:
+def _go_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> None:
     """Carry out the upgrade up to the cut."""
     total, encoder = packet_count(len(upgrade.new)), bench.encoder
     if not cut.packet:
@@ -204,7 +204,7 @@ def _go_to(bench: Bench, upgrade: _Upgrade, cut: _Cut) -> None:
         bench.send(encoder.packet_of(upgrade.new, cut.packet)[: cut.frames])
 
 
-def _check_upgrade(bench: Bench, upgrade: _Upgrade) -> None:
+def _check_upgrade(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """From a power-up where no application runs, as a bootloader that only listens ignores the
     reset of a host (rs_03).
     """
@@ -214,25 +214,29 @@ def _check_upgrade(bench: Bench, upgrade: _Upgrade) -> None:
         bench.check_upgrade()
 
 
-def _check_after_cut(bench: Bench, upgrade: _Upgrade, first: Received | None = None) -> None:
+def _check_after_cut(
+    bench: Bench, upgrade: _InterruptedUpgrade, first: Received | None = None
+) -> None:
     """The device announces itself (`first` was heard), or starts an application, but only a whole
     one.
     """
-    if first is None and bench.wait_for(Kind.BOOT_VERSION) is None:
+    if first is None and bench.wait_for(MessageKind.BOOT_VERSION) is None:
         # That it should have announced itself is another case (RS-05).
         upgrade.runs = _check_whole(bench, upgrade)
-        bench.require(upgrade.runs, Kind.BOOT_VERSION.value, "neither that nor an application")
+        bench.require(
+            upgrade.runs, MessageKind.BOOT_VERSION.value, "neither that nor an application"
+        )
         return
     spacing_s = bench.limit("version_spacing_s") + bench.limit("version_spacing_tolerance_s")
     heard = bench.collect(bench.host.burst_s + 2 * spacing_s)
-    announced = 1 + sum(one.kind is Kind.BOOT_VERSION for one in heard)
+    announced = 1 + sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
     # More than a burst: it has nothing to start.
     upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
     if not upgrade.runs:
         bench.succeed("no application is started", "none")
 
 
-def _check_whole(bench: Bench, upgrade: _Upgrade) -> bool:
+def _check_whole(bench: Bench, upgrade: _InterruptedUpgrade) -> bool:
     """What runs is the old image, or the new one that was sent to its end; false when nothing
     runs.
     """
@@ -257,7 +261,7 @@ def _check_whole(bench: Bench, upgrade: _Upgrade) -> bool:
     return True
 
 
-def _run_old(bench: Bench, upgrade: _Upgrade) -> None:
+def _run_old(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """Let the old image run, so that what is erased is an application. From a power-up, as a
     bootloader that only listens ignores the reset of a host (rs_03).
     """
@@ -272,7 +276,7 @@ def _run_old(bench: Bench, upgrade: _Upgrade) -> None:
 # -- in the flash ---------------------------------------------------------------------------------
 
 
-def _cut_erase(bench: Bench, upgrade: _Upgrade) -> None:
+def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """A cut while the application is erased, at shares of the time that it took once."""
     _run_old(bench, upgrade)
     upgrade.end_was_sent = upgrade.runs = False
@@ -291,7 +295,7 @@ def _cut_erase(bench: Bench, upgrade: _Upgrade) -> None:
             _check_after_cut(bench, upgrade)
 
 
-def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
+def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """A cut before, in and after each operation, until an upgrade has no more of them."""
     if not bench.subject.has_timed_cuts:
         bench.unsupported(
@@ -318,28 +322,32 @@ def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
     bench.info(f"only the first {_OPERATIONS_MAX} flash operations of the upgrade were cut")
 
 
-def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:
+def _upgrade_until_cut(bench: Bench, upgrade: _InterruptedUpgrade) -> Received | None:
     """Upgrade until the device announces itself again; None when the upgrade was completed."""
     limit = bench.limit
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
     sent = bench.send(bench.encoder.update(len(upgrade.new)))
     heard = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
-    upgrade.was_requested = heard is not None and heard.kind is Kind.REQUEST
+    upgrade.was_requested = heard is not None and heard.kind is MessageKind.REQUEST
     for number in range(1, packet_count(len(upgrade.new)) + 1):
-        if heard is None or heard.kind is Kind.BOOT_VERSION:
+        if heard is None or heard.kind is MessageKind.BOOT_VERSION:
             return heard
         bench.send_packet(upgrade.new, number)
-        heard = bench.wait_for(Kind.ACK, Kind.BOOT_VERSION, within_s=limit("ack_s") + back_s)
-    if heard is None or heard.kind is Kind.BOOT_VERSION:
+        heard = bench.wait_for(
+            MessageKind.ACK, MessageKind.BOOT_VERSION, within_s=limit("ack_s") + back_s
+        )
+    if heard is None or heard.kind is MessageKind.BOOT_VERSION:
         return heard
     upgrade.end_was_sent = True
     bench.send(bench.encoder.end())
-    heard = bench.wait_for(Kind.COMPLETE, Kind.BOOT_VERSION, within_s=limit("complete_s") + back_s)
-    return heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
+    heard = bench.wait_for(
+        MessageKind.COMPLETE, MessageKind.BOOT_VERSION, within_s=limit("complete_s") + back_s
+    )
+    return heard if heard is not None and heard.kind is MessageKind.BOOT_VERSION else None
 
 
-def _cut_after_ack(bench: Bench, upgrade: _Upgrade) -> None:
+def _cut_after_ack(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """Packets that the device acknowledged are still stored after a power cut (R10)."""
     written = 2 * PACKET_BYTES
     last = packet_count(written + bench.number("buffer_bytes"))
@@ -360,7 +368,7 @@ def _cut_after_ack(bench: Bench, upgrade: _Upgrade) -> None:
         _check_after_cut(bench, upgrade)
 
 
-def _cut_after_complete(bench: Bench, upgrade: _Upgrade) -> None:
+def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """What was said to be complete runs after a power cut."""
     _run_old(bench, upgrade)
     with bench.step("just after complete"):
@@ -368,7 +376,7 @@ def _cut_after_complete(bench: Bench, upgrade: _Upgrade) -> None:
         bench.packets(upgrade.new)
         bench.end_transfer()
         bench.power_cycle(_OFF_S)
-        bench.wait_for(Kind.BOOT_VERSION)  # without one: RS-05
+        bench.wait_for(MessageKind.BOOT_VERSION)  # without one: RS-05
         bench.collect(bench.host.burst_s)
         bench.check_image(upgrade.new)
         upgrade.runs = True

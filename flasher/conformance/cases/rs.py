@@ -13,7 +13,7 @@ from flasher.conformance.wire import (
     RESET,
     RESET_TEXT,
     WRITE,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     build,
@@ -50,9 +50,9 @@ _LISTENS_S: Final = 16.0
 def reset(bench: Bench) -> None:
     with bench.tester.hearing_feedback():
         sent = bench.send(bench.encoder.reset())
-        feedback = bench.expect(Kind.FEEDBACK)
+        feedback = bench.expect(MessageKind.FEEDBACK)
     bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
-    first = bench.expect(Kind.BOOT_VERSION)
+    first = bench.expect(MessageKind.BOOT_VERSION)
     bench.measure(Times.FIRST, first.at - sent.left_at)
     _check_burst(bench, first)
 
@@ -69,7 +69,7 @@ def reset_again(bench: Bench) -> None:
     count = bench.number("versions")
     with bench.step("two resets in a row"):
         bench.send(bench.encoder.reset() + bench.encoder.reset())
-        first = bench.wait_for(Kind.BOOT_VERSION)
+        first = bench.wait_for(MessageKind.BOOT_VERSION)
         bench.require(first is not None, "boot version", first or "nothing")
         # The second one may reach a bootloader that announces itself by then.
         restarts = bench.choice("rs_02") != "ignored"
@@ -86,7 +86,7 @@ def reset_again(bench: Bench) -> None:
         elif bench.choice("rs_02") == "ignored":
             _check_count(bench, count - 2, "the burst goes on as if nothing had happened")
         else:
-            bench.expect(Kind.BOOT_VERSION)
+            bench.expect(MessageKind.BOOT_VERSION)
             _check_count(bench, count - 1, "a whole burst anew")
         bench.check_application()
 
@@ -116,7 +116,7 @@ def no_update(bench: Bench) -> None:
         elif bench.choice("rs_03") == "announces":
             # The document gives no period (R14); each one may take as long as the first one.
             more, wanted = 0, 2 * count + 1
-            while more < wanted and bench.wait_for(Kind.BOOT_VERSION) is not None:
+            while more < wanted and bench.wait_for(MessageKind.BOOT_VERSION) is not None:
                 more += 1
             expected = f"it announces on, {wanted} boot versions more"
             bench.check(more == wanted, expected, f"{more} boot versions")
@@ -164,7 +164,7 @@ def no_reset(bench: Bench) -> None:
 def power_up(bench: Bench) -> None:
     bench.power_cycle()
     on_at = bench.now
-    first = bench.expect(Kind.BOOT_VERSION)
+    first = bench.expect(MessageKind.BOOT_VERSION)
     bench.measure(Times.POWERED, first.at - on_at)
     _check_burst(bench, first)
 
@@ -196,11 +196,13 @@ def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
     heard = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
     wanted = " or ".join(map(str, (count, *others)))
     bench.check(_versions(heard) in (count, *others), f"{expected}: {wanted}", describe(heard))
-    bench.check_only(heard, Kind.BOOT_VERSION, Kind.FEEDBACK, why="nothing but boot versions")
+    bench.check_only(
+        heard, MessageKind.BOOT_VERSION, MessageKind.FEEDBACK, why="nothing but boot versions"
+    )
 
 
 def _versions(heard: list[Received]) -> int:
-    return sum(one.kind is Kind.BOOT_VERSION for one in heard)
+    return sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
 
 
 def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
@@ -208,5 +210,6 @@ def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
     with bench.step(step):
         bench.send(frames)
         bench.expect_silence(
-            ignoring=(Kind.FEEDBACK, Kind.OTHER, Kind.VERSION_INFORMATION), why="no restart"
+            ignoring=(MessageKind.FEEDBACK, MessageKind.OTHER, MessageKind.VERSION_INFORMATION),
+            why="no restart",
         )

@@ -20,7 +20,7 @@ from flasher.conformance.wire import (
     REPORT,
     UPDATE,
     WRITE,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -80,15 +80,15 @@ def endless(bench: Bench) -> None:
     with bench.step("in a pause of the transfer"):
         if bench.choice("tx_12") == "announces":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            heard = _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
+            heard = _drip_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
             bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
         elif bench.choice("tx_12") == "either":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
+            _drip_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
             bench.collect(2 * bench.limit("inter_frame_s"))
             bench.send_packet(image, len(floods) + 1)
-            heard = bench.wait_for(Kind.ACK, Kind.BOOT_VERSION)
-            if heard is not None and heard.kind is Kind.ACK:
+            heard = bench.wait_for(MessageKind.ACK, MessageKind.BOOT_VERSION)
+            if heard is not None and heard.kind is MessageKind.ACK:
                 bench.finish(image, len(floods) + 2)
             else:  # it gave the transfer up, and may announce itself or listen silently
                 bench.update(len(image))
@@ -106,7 +106,9 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
             bench.send(frames)
     if bench.encoder.has_version_query:
         limit_s = bench.limit("start_s")
-        heard = _drip_until(bench, Kind.VERSION_INFORMATION, limit_s, bench.encoder.query_version())
+        heard = _drip_until(
+            bench, MessageKind.VERSION_INFORMATION, limit_s, bench.encoder.query_version()
+        )
         expected = f"an application that answers within {limit_s:g} s"
         bench.check(heard is not None, expected, heard or "none")
         # Many were asked for: a late answer is none to what follows.
@@ -118,7 +120,7 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
 
 
 def _drip_until(
-    bench: Bench, kind: Kind, within_s: float, query: list[RawFrame]
+    bench: Bench, kind: MessageKind, within_s: float, query: list[RawFrame]
 ) -> Received | None:
     """Send useless messages and bytes, `query` between them, until `kind` is received."""
     deadline = bench.now + within_s
@@ -162,7 +164,7 @@ def noise(bench: Bench) -> None:
         bench.reset_to_bootloader()
         bench.send(bench.encoder.update(len(image)))
         _make_noise(bench)
-        bench.wait_for(Kind.REQUEST)
+        bench.wait_for(MessageKind.REQUEST)
         done = _carry_on(bench, image, 0)
     for stored in (1, 3, packet_count(len(image))):
         with bench.step(f"after packet {stored}"):
@@ -183,11 +185,11 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
     bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     if stored < packet_count(len(image)):
         bench.send_packet(image, stored + 1)
-        if bench.wait_for(Kind.ACK, unlike=lambda one: one.number != stored + 1) is not None:
+        if bench.wait_for(MessageKind.ACK, unlike=lambda one: one.number != stored + 1) is not None:
             return stored + 1
     else:
         bench.send(bench.encoder.end())
-        if bench.wait_for(Kind.COMPLETE) is not None:
+        if bench.wait_for(MessageKind.COMPLETE) is not None:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
     done = bench.upgrade(image, blind=bench.choice("up_08") != "rejected")
@@ -263,7 +265,7 @@ def outside(bench: Bench) -> None:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, marker))
                 heard = bench.answers()
-                ok = all(one.kind is Kind.NAK for one in heard)
+                ok = all(one.kind is MessageKind.NAK for one in heard)
                 bench.check(ok, "NAK or silence", describe(heard))
     expected = "none of the rejected data in the flash"
     if not bench.subject.has_readback:

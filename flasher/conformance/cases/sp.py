@@ -16,7 +16,7 @@ from flasher.conformance.cases.tm import (
 )
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
 from flasher.conformance.judge import Times
-from flasher.conformance.wire import Kind, told_version
+from flasher.conformance.wire import MessageKind, told_version
 
 _START_AGAIN: Final = "window's end to an application that answers"
 _TAKEN: Final = "last boot version to an update command that is taken"
@@ -104,7 +104,7 @@ def window(bench: Bench) -> None:
                 heard = bench.next_version()
             sent = bench.send(frames, at=heard.at + max(offset_s - wire_s, 0.0))
             at_s = sent.left_at - heard.at
-            request = bench.wait_for(Kind.REQUEST)
+            request = bench.wait_for(MessageKind.REQUEST)
             (not_taken if request is None else taken).append(at_s)
             bench.measure(_NOT_TAKEN if request is None else _TAKEN, at_s)
             got = "not taken" if request is None else "taken"

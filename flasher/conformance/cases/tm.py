@@ -11,7 +11,7 @@ from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.judge import Times
 from flasher.conformance.wire import (
     PACKET_FRAMES,
-    Kind,
+    MessageKind,
     Received,
     packet_count,
 )
@@ -110,7 +110,7 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
     last = bench.reset_measured(_PATIENCE * bench.limit("first_version_s"))
     for _ in range(bench.number("versions") - 1):
         within_s = _PATIENCE * bench.limit("version_spacing_s")
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
         if heard is None:
             break
         bench.measure(Times.SPACING, heard.at - last.at)
@@ -125,7 +125,7 @@ def measure_packets(bench: Bench, image: bytes) -> None:
     limit_s = _PATIENCE * bench.limit("ack_s")
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
-        heard = bench.expect(Kind.ACK, within_s=limit_s, number=number)
+        heard = bench.expect(MessageKind.ACK, within_s=limit_s, number=number)
         bench.measure(Times.ANSWER, heard.at - sent.left_at)
 
 
@@ -133,6 +133,6 @@ def end_measured(bench: Bench) -> Received:
     """End of transfer; returns complete."""
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")
-    heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
+    heard = bench.await_message(MessageKind.COMPLETE, within_s=within_s)
     bench.measure(Times.COMPLETE, heard.at - sent.left_at)
     return heard

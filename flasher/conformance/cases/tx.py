@@ -16,7 +16,7 @@ from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -73,7 +73,7 @@ def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
         with bench.step(f"packet {number} as it should be"):
             bench.send_packet(image, number)
             # Where a frame was lost a NAK may come as late as the next message (FR-05).
-            bench.expect(Kind.ACK, number=number, ignoring=(Kind.NAK,))
+            bench.expect(MessageKind.ACK, number=number, ignoring=(MessageKind.NAK,))
         done = number
     bench.finish(image, done + 1)
 
@@ -86,7 +86,11 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     bench.wait_to_be_heard()
     bench.send(frames)
     heard = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
-    positive = [one for one in heard if one.kind in (Kind.ACK, Kind.COMPLETE, Kind.REQUEST)]
+    positive = [
+        one
+        for one in heard
+        if one.kind in (MessageKind.ACK, MessageKind.COMPLETE, MessageKind.REQUEST)
+    ]
     bench.check(not positive, "neither ACK nor complete", describe(positive or heard))
 
 
@@ -305,12 +309,12 @@ def many_packets(bench: Bench) -> None:
             return
         bench.send(bench.encoder.end())
         within_s = bench.limit("complete_s")
-        heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=within_s)
-        if heard is not None and heard.kind is Kind.NAK:
+        heard = bench.wait_for(MessageKind.COMPLETE, MessageKind.NAK, within_s=within_s)
+        if heard is not None and heard.kind is MessageKind.NAK:
             why = "the device refuses the good image with FF behind it, by a check of its own"
             bench.unsupported("the largest image runs", why)
             return
-        bench.require_received(heard, Kind.COMPLETE.value, within_s)
+        bench.require_received(heard, MessageKind.COMPLETE.value, within_s)
         bench.check_image(whole)
 
 
@@ -320,7 +324,7 @@ def _send_all(bench: Bench, image: bytes) -> bool:
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
         heard = bench.next_message(bench.limit("ack_s"))
-        if heard is None or (heard.kind, heard.number) != (Kind.ACK, number):
+        if heard is None or (heard.kind, heard.number) != (MessageKind.ACK, number):
             bench.fail(f"ACK {number}", heard or "nothing")
             return False
         bench.measure(Times.ANSWER, heard.at - sent.left_at)
@@ -362,12 +366,12 @@ def other_filler(bench: Bench) -> None:
     bench.send(bench.encoder.packet(total, total, rest.ljust(PACKET_BYTES, b"\x00")))
     if bench.choice("tx_08") == "either":
         heard = bench.next_message(bench.limit("ack_s"))
-        is_there = heard is None or heard.kind is Kind.NAK or str(heard) == f"ACK {total}"
+        is_there = heard is None or heard.kind is MessageKind.NAK or str(heard) == f"ACK {total}"
         bench.check(is_there, f"ACK {total}, NAK or silence", heard or "nothing")
-        taken = heard is not None and heard.kind is Kind.ACK
+        taken = heard is not None and heard.kind is MessageKind.ACK
         bench.finish(image, total + 1 if taken else total)
     elif bench.choice("tx_08") == "ignored":
-        bench.expect(Kind.ACK, number=total)
+        bench.expect(MessageKind.ACK, number=total)
         bench.finish(image, total + 1)
     else:
         bench.check_packet_rejected(total, total)
@@ -432,7 +436,7 @@ def _announces(bench: Bench) -> None:
             bench.packets(image, 2 if stored == 1 else 1, stored)
             began_at = bench.now
             within_s = pause_s + bench.limit("first_version_s")
-            heard = bench.expect(Kind.BOOT_VERSION, within_s=within_s)
+            heard = bench.expect(MessageKind.BOOT_VERSION, within_s=within_s)
             bench.measure("pause to boot version", heard.at - began_at)
     with bench.step("upgrade after the pauses"):
         bench.update(len(bench.good_image))
@@ -452,7 +456,7 @@ def _announces_or_waits(bench: Bench) -> None:
     for stored in (1, packet_count(len(image))):
         with bench.step(_place("a pause", stored)):
             bench.packets(image, 2, stored)
-            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=pause_s)
+            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=pause_s)
             bench.info(f"after {pause_s:g} s: {heard or 'nothing'}")
             if heard is not None:
                 bench.update(len(image))
@@ -463,7 +467,7 @@ def _announces_or_waits(bench: Bench) -> None:
         bench.packet(image, 1)
         bench.send(bench.encoder.update(len(image)))
         within_s = bench.limit("pause_s") / 2
-        if bench.wait_for(Kind.REQUEST, within_s=within_s) is None:
+        if bench.wait_for(MessageKind.REQUEST, within_s=within_s) is None:
             bench.unsupported("a new upgrade after a pause", "an update command starts none")
             return
         bench.packet(image, 1)
@@ -520,9 +524,9 @@ def reset(bench: Bench) -> None:
             if choice == "ignored":
                 bench.expect_silence(why="silence, no restart")
                 continue
-            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
             if choice == "restarts":
-                bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+                bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
             if heard is not None:
                 bench.update(len(image))
                 bench.packets(image, 1, stored)
@@ -543,17 +547,17 @@ def _reset_while_it_erases(bench: Bench) -> None:
     # Boot versions that were on their way when the update command came do not count (R11).
     bench.wait(UPDATE_SPACING_S)
     within_s = bench.limit("erase_s") + bench.limit("first_version_s")
-    heard = bench.wait_for(Kind.REQUEST, Kind.BOOT_VERSION, within_s=within_s)
+    heard = bench.wait_for(MessageKind.REQUEST, MessageKind.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(heard, "request transfer, or boot version", within_s)
     restarts: Received | None = found
-    if found.kind is Kind.REQUEST and bench.choice("tx_13") != "ignored":
+    if found.kind is MessageKind.REQUEST and bench.choice("tx_13") != "ignored":
         # It may hear the reset when it has erased; what it announced before does not count.
         restarts = bench.wait_for(
-            Kind.BOOT_VERSION,
+            MessageKind.BOOT_VERSION,
             within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),
             unlike=lambda one: one.at < found.at + LEFTOVER_S,
         )
-    if restarts is not None and restarts.kind is Kind.BOOT_VERSION:
+    if restarts is not None and restarts.kind is MessageKind.BOOT_VERSION:
         bench.update(len(image))
     bench.finish(image)
 

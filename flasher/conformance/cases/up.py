@@ -12,7 +12,7 @@ from flasher.conformance.wire import (
     READ,
     UPDATE,
     WRITE,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -89,7 +89,9 @@ def without_reset(bench: Bench) -> None:
     for step, frames in bench.encoder.upgrade_messages(len(image)).items():
         with bench.step(step), bench.tester.hearing_feedback():
             bench.send(frames)
-            _check_answer(bench, bench.collect(bench.limit("silence_s")), Kind.FEEDBACK, choice)
+            _check_answer(
+                bench, bench.collect(bench.limit("silence_s")), MessageKind.FEEDBACK, choice
+            )
     bench.check_application()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
@@ -219,10 +221,10 @@ def in_transfer(bench: Bench) -> None:
             bench.packets(begun, 1, _FIRST_PACKETS)
             bench.send(bench.encoder.update(len(image) if starts_over else size))
             if starts_over:
-                bench.expect(Kind.REQUEST)
+                bench.expect(MessageKind.REQUEST)
                 bench.finish(image)
             else:
-                bench.expect_silence(ignoring=(Kind.NAK,), why="no request transfer")
+                bench.expect_silence(ignoring=(MessageKind.NAK,), why="no request transfer")
                 bench.finish(image, _FIRST_PACKETS + 1)
     if starts_over:
         with bench.step("many in a row"):
@@ -230,7 +232,7 @@ def in_transfer(bench: Bench) -> None:
             for _ in range(_MANY):
                 bench.packet(image, 1)
                 bench.send(bench.encoder.update(len(image)))
-                bench.expect(Kind.REQUEST)
+                bench.expect(MessageKind.REQUEST)
             bench.finish(image)
 
 
@@ -242,12 +244,14 @@ def _starts_over(bench: Bench) -> bool:
     bench.start_transfer(len(image))
     bench.packets(image, 1, _FIRST_PACKETS)
     bench.send(bench.encoder.update(len(image)))
-    heard = bench.wait_for(Kind.REQUEST, within_s=bench.limit("pause_s") / 2)
+    heard = bench.wait_for(MessageKind.REQUEST, within_s=bench.limit("pause_s") / 2)
     if heard is None:
         bench.send_packet(image, number)
-        heard = bench.wait_for(Kind.ACK, Kind.REQUEST, within_s=bench.limit("erase_s"))
+        heard = bench.wait_for(
+            MessageKind.ACK, MessageKind.REQUEST, within_s=bench.limit("erase_s")
+        )
     found = bench.require_received(heard, "request transfer, or the transfer goes on", 0.0)
-    starts_over = found.kind is Kind.REQUEST
+    starts_over = found.kind is MessageKind.REQUEST
     bench.info("the device starts over" if starts_over else "the device goes on")
     bench.finish(image, 1 if starts_over else number + 1)
     return starts_over
@@ -259,16 +263,20 @@ def _finish_requested(bench: Bench, choice: str) -> None:
     """
     image = bench.good_image
     heard = bench.collect(_SOON_S)
-    bench.check_only(heard, Kind.BOOT_VERSION, Kind.REQUEST, why="request transfer, or nothing")
-    more = sum(one.kind is Kind.REQUEST for one in heard)
+    bench.check_only(
+        heard, MessageKind.BOOT_VERSION, MessageKind.REQUEST, why="request transfer, or nothing"
+    )
+    more = sum(one.kind is MessageKind.REQUEST for one in heard)
     copies = 0
     acknowledged: Received | None = None
     while acknowledged is None:
         copies += 1
         sent = bench.send_packet(image, 1)
-        found = bench.wait_for(Kind.ACK, Kind.REQUEST, within_s=bench.limit("erase_s"))
+        found = bench.wait_for(
+            MessageKind.ACK, MessageKind.REQUEST, within_s=bench.limit("erase_s")
+        )
         found = bench.require_received(found, "ACK 1, or request transfer", bench.limit("erase_s"))
-        if found.kind is Kind.ACK:
+        if found.kind is MessageKind.ACK:
             acknowledged = found
         else:
             more += 1
@@ -278,7 +286,7 @@ def _finish_requested(bench: Bench, choice: str) -> None:
         bench.measure(Times.ANSWER, acknowledged.at - sent.left_at)
     else:  # each of them may be answered (R10)
         late = bench.collect(_SOON_S)
-        bench.check_only(late, Kind.ACK, Kind.NAK, why="answers to packet 1")
+        bench.check_only(late, MessageKind.ACK, MessageKind.NAK, why="answers to packet 1")
     wanted = {"once": (0,), "each": (1,)}.get(choice, (0, 1))
     bench.check(more in wanted, f"request transfer more than once: {choice}", f"{more} times more")
     bench.finish(image, 2)
@@ -296,7 +304,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
         return
     # One that took it against the profile shows no application when this time is over.
     within_s = limit("erase_s") if choice == "either" else limit("silence_s")
-    request = bench.wait_for(Kind.REQUEST, within_s=within_s)
+    request = bench.wait_for(MessageKind.REQUEST, within_s=within_s)
     ok = request is None or choice == "either"
     bench.check(ok, f"update command {choice}", request or "no request transfer")
     if request is None:
@@ -307,7 +315,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
 
 def _expect_request(bench: Bench) -> None:
     """Request transfer follows; boot versions that are still on their way do not count."""
-    bench.expect(Kind.REQUEST, ignoring=(Kind.BOOT_VERSION,))
+    bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
 
 
 def _enter_at(bench: Bench, version: int) -> float:
@@ -326,13 +334,13 @@ def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> No
         bench.reset_to_bootloader()
         bench.send(frames)
         heard = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
-        answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-        _check_answer(bench, answers, Kind.NAK, bench.choice("up_02"), "rejected by ")
+        answers = [one for one in heard if one.kind is not MessageKind.BOOT_VERSION]
+        _check_answer(bench, answers, MessageKind.NAK, bench.choice("up_02"), "rejected by ")
         bench.check_image(bench.good_image)
 
 
 def _check_answer(
-    bench: Bench, answers: list[Received], kind: Kind, choice: str, prefix: str = ""
+    bench: Bench, answers: list[Received], kind: MessageKind, choice: str, prefix: str = ""
 ) -> None:
     """One message of `kind`, or none, as `choice` says ("silence", "either", or another word for
     the message).

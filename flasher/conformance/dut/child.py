@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Final, Never, cast
 
 from flasher.conformance.dut import Bootloader, CanFrame, Facts, SubjectError, pipes
-from flasher.conformance.dut.pipes import Kind, Pipe
+from flasher.conformance.dut.pipes import Pipe, PipeMessage
 
 _FUNCTIONS: Final = tuple(
     f"flasher_dut_{name}" for name in ("about", "start", "receive", "tick", "next_frame")
@@ -33,30 +33,30 @@ class _ProcessHost:
         return self.now - 1
 
     def flash_read(self, offset: int, size_bytes: int) -> bytes:
-        self._pipe.write(Kind.FLASH_READ, pipes.RANGE.pack(offset, size_bytes))
+        self._pipe.write(PipeMessage.FLASH_READ, pipes.RANGE.pack(offset, size_bytes))
         return _next(self._pipe)[1]
 
     def flash_erase(self, offset: int) -> None:
-        self._pipe.write(Kind.FLASH_ERASE, pipes.PLACE.pack(self.now, offset))
+        self._pipe.write(PipeMessage.FLASH_ERASE, pipes.PLACE.pack(self.now, offset))
         (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
 
     def flash_write(self, offset: int, data: bytes) -> None:
-        self._pipe.write(Kind.FLASH_WRITE, pipes.PLACE.pack(self.now, offset), data)
+        self._pipe.write(PipeMessage.FLASH_WRITE, pipes.PLACE.pack(self.now, offset), data)
         (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
 
     def transmit_pending(self) -> int:
         return self.pending
 
     def start_application(self) -> None:
-        self._pipe.write(Kind.APPLICATION, pipes.TIME.pack(self.now))
+        self._pipe.write(PipeMessage.APPLICATION, pipes.TIME.pack(self.now))
         os._exit(0)
 
     def reset(self) -> None:
-        self._pipe.write(Kind.RESET, pipes.TIME.pack(self.now))
+        self._pipe.write(PipeMessage.RESET, pipes.TIME.pack(self.now))
         os._exit(0)
 
     def log(self, text: str) -> None:
-        self._pipe.write(Kind.LOG, text.encode(errors="replace"))
+        self._pipe.write(PipeMessage.LOG, text.encode(errors="replace"))
 
 
 # -- a shared library ------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ def _make(subject: str) -> Bootloader:
     return made
 
 
-def _next(pipe: Pipe) -> tuple[Kind, bytes]:
+def _next(pipe: Pipe) -> tuple[PipeMessage, bytes]:
     """The next message of the suite; ends the process when the suite has ended."""
     while (found := pipe.take()) is None:
         if not pipe.fill():
@@ -179,15 +179,15 @@ def serve(subject: str, pipe: Pipe) -> Never:
     function MODULE:FACTORY makes.
     """
     bootloader, host = _make(subject), _ProcessHost(pipe)
-    pipe.write(Kind.FACTS, pipes.pack_facts(bootloader.facts))
+    pipe.write(PipeMessage.FACTS, pipes.pack_facts(bootloader.facts))
     while True:
         kind, data = _next(pipe)
         host.now, number = pipes.TURN.unpack_from(data)
-        if kind is Kind.START:
+        if kind is PipeMessage.START:
             bootloader.start(host, number)
         else:
             host.pending = number
-            if kind is Kind.RECEIVE:
+            if kind is PipeMessage.RECEIVE:
                 bootloader.receive(pipes.unpack_frame(data[pipes.TURN.size :]))
         wanted = bootloader.tick(host.now)
         frames: list[bytes] = []
@@ -197,4 +197,4 @@ def serve(subject: str, pipe: Pipe) -> Never:
                 break
             frames.append(pipes.pack_frame(frame))
         done = pipes.DONE.pack(host.now, pipes.NEVER if wanted is None else wanted)
-        pipe.write(Kind.DONE, done, *frames)
+        pipe.write(PipeMessage.DONE, done, *frames)

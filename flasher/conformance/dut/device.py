@@ -10,7 +10,7 @@ from struct import Struct
 from typing import Final
 
 from flasher.conformance.dut import CanFrame, pipes
-from flasher.conformance.dut.pipes import Kind
+from flasher.conformance.dut.pipes import PipeMessage
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.errors import FlasherError
 from flasher.mock.application import Application
@@ -205,7 +205,7 @@ class CompiledDevice(Machine):
             self._due_at = inf
         self._has_power = True
         self._process.start()
-        self._call(Kind.START, self._cause, now)
+        self._call(PipeMessage.START, self._cause, now)
 
     # -- the running application -------------------------------------------------------------------
 
@@ -239,14 +239,14 @@ class CompiledDevice(Machine):
         """Hand over what was received, and give it its turn, unless it is busy."""
         while self._process.is_running and self._received and now >= self._busy_until:
             frame = pipes.pack_frame(self._received.popleft())
-            self._call(Kind.RECEIVE, self._pending(now), now, frame)
+            self._call(PipeMessage.RECEIVE, self._pending(now), now, frame)
         if self._process.is_running and now >= self._next_turn_at:
-            self._call(Kind.TICK, self._pending(now), now)
+            self._call(PipeMessage.TICK, self._pending(now), now)
 
     def _pending(self, now: float) -> int:
         return len(self._to_send) + (now < self._left_at)
 
-    def _call(self, kind: Kind, number: int, now: float, frame: bytes = b"") -> None:
+    def _call(self, kind: PipeMessage, number: int, now: float, frame: bytes = b"") -> None:
         self._handled_bytes = 0
         try:
             answer = self._process.call(
@@ -263,9 +263,9 @@ class CompiledDevice(Machine):
         if answer is None:
             return
         how, data = answer
-        if how is Kind.APPLICATION:
+        if how is PipeMessage.APPLICATION:
             self._start_application(now)
-        elif how is Kind.RESET:
+        elif how is PipeMessage.RESET:
             self._begin_anew(RESET, now + _RESTART_S)
         else:
             left_us, wanted_us = pipes.DONE.unpack_from(data)
@@ -280,29 +280,29 @@ class CompiledDevice(Machine):
                 self._to_send.append(Frame(*made[:4]))
             self._is_full = self._pending(now) >= pipes.TRANSMIT_FRAMES
 
-    def _hardware(self, asked: Kind, data: bytes) -> bytes | None:
+    def _hardware(self, asked: PipeMessage, data: bytes) -> bytes | None:
         """What a function of the hardware gives; None for no answer."""
-        if asked is Kind.LOG:
+        if asked is PipeMessage.LOG:
             self._count(pipes.HEADER.size + len(data))
             self._log.append(data.decode(errors="replace"))
             return None
         try:
             return self._in_flash(asked, data)
         except FlashError as error:
-            row = pipes.RANGE if asked is Kind.FLASH_READ else pipes.PLACE
-            offset = row.unpack_from(data)[asked is not Kind.FLASH_READ]
+            row = pipes.RANGE if asked is PipeMessage.FLASH_READ else pipes.PLACE
+            offset = row.unpack_from(data)[asked is not PipeMessage.FLASH_READ]
             raise FlashError(
                 f"{asked.name.lower()} at offset 0x{offset:X}: {error.what}", where=error.where
             ) from error
 
-    def _in_flash(self, asked: Kind, data: bytes) -> bytes | None:
+    def _in_flash(self, asked: PipeMessage, data: bytes) -> bytes | None:
         """Read, erase or write; None when the power was cut."""
-        if asked is Kind.FLASH_READ:
+        if asked is PipeMessage.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
             self._count(size_bytes)
             return self.flash.read(self.flash.start + offset, size_bytes)
         now_us, offset = pipes.PLACE.unpack_from(data)
-        content = None if asked is Kind.FLASH_ERASE else data[pipes.PLACE.size :]
+        content = None if asked is PipeMessage.FLASH_ERASE else data[pipes.PLACE.size :]
         operation = Operation(self.flash.start + offset, content)
         takes_us, size_bytes = self.facts.erase_us, self.facts.sector_bytes
         if content is not None:

@@ -28,7 +28,7 @@ NEVER: Final = 0xFFFF_FFFF_FFFF_FFFF
 _READ_SIZE: Final = 1 << 16
 
 
-class Kind(Enum):
+class PipeMessage(Enum):
     """The first byte of a message."""
 
     FACTS = ord("f")
@@ -54,14 +54,14 @@ class Pipe:
         self._write_fd = write_fd
         self._buffer = bytearray()
 
-    def write(self, kind: Kind, *parts: bytes) -> None:
+    def write(self, kind: PipeMessage, *parts: bytes) -> None:
         """Send a message. Raises BrokenPipeError when the other side has ended."""
         data = b"".join(parts)
         view = memoryview(HEADER.pack(kind.value, len(data)) + data)
         while view:
             view = view[os.write(self._write_fd, view) :]
 
-    def take(self) -> tuple[Kind, bytes] | None:
+    def take(self) -> tuple[PipeMessage, bytes] | None:
         """A message that has arrived whole; None without one. Raises ValueError for bytes that are
         no message.
         """
@@ -69,7 +69,7 @@ class Pipe:
             return None
         kind, size = HEADER.unpack_from(self._buffer)
         try:
-            found = Kind(kind)
+            found = PipeMessage(kind)
         except ValueError:
             wrote = bytes(self._buffer[:16])
             raise ValueError(f"it wrote {wrote!r}, which is no message") from None

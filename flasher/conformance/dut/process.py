@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final, Never
 
 from flasher.conformance.dut import Facts, SubjectError, pipes
-from flasher.conformance.dut.pipes import Kind, Pipe
+from flasher.conformance.dut.pipes import Pipe, PipeMessage
 from flasher.errors import FlasherError, UsageError, printable
 
 WATCHDOG_S: Final = 5.0
@@ -88,7 +88,7 @@ class BootloaderProcess:
         self._poll.register(read_fd, select.POLLIN)
         try:
             kind, data = self._next("flasher_dut_about")
-            if kind is not Kind.FACTS:
+            if kind is not PipeMessage.FACTS:
                 raise ValueError("its first message holds no facts")  # noqa: TRY301
             return pipes.unpack_facts(data)
         except ValueError as error:
@@ -96,8 +96,8 @@ class BootloaderProcess:
             raise self.refused(f"is no bootloader for the suite: {error}", self.said()) from error
 
     def call(
-        self, kind: Kind, *parts: bytes, during: Callable[[Kind, bytes], bytes | None]
-    ) -> tuple[Kind, bytes] | None:
+        self, kind: PipeMessage, *parts: bytes, during: Callable[[PipeMessage, bytes], bytes | None]
+    ) -> tuple[PipeMessage, bytes] | None:
         """Call the bootloader, and answer with `during` what it asks of its hardware meanwhile.
 
         Returns how the call ended (DONE, APPLICATION, RESET) and what was said with it; None when
@@ -108,17 +108,19 @@ class BootloaderProcess:
             self._pipe.write(kind, *parts)
             while True:
                 asked, data = self._next(doing)
-                if asked is Kind.DONE:
+                if asked is PipeMessage.DONE:
                     return asked, data
-                if asked in {Kind.APPLICATION, Kind.RESET}:
+                if asked in {PipeMessage.APPLICATION, PipeMessage.RESET}:
                     self.kill()
                     return asked, data
                 reply = during(asked, data)
                 if not self.is_running:
                     return None
                 if reply is not None:
-                    is_read = asked is Kind.FLASH_READ
-                    self._pipe.write(Kind.FLASH_DATA if is_read else Kind.FLASH_DONE, reply)
+                    is_read = asked is PipeMessage.FLASH_READ
+                    self._pipe.write(
+                        PipeMessage.FLASH_DATA if is_read else PipeMessage.FLASH_DONE, reply
+                    )
         except (BrokenPipeError, ValueError):
             raise self._died(doing) from None
 
@@ -182,7 +184,7 @@ class BootloaderProcess:
         finally:
             os._exit(1)
 
-    def _next(self, doing: str) -> tuple[Kind, bytes]:
+    def _next(self, doing: str) -> tuple[PipeMessage, bytes]:
         while (found := self._pipe.take()) is None:
             if not self._poll.poll(WATCHDOG_S * 1000):
                 self.kill()

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.explore.steps import Step, next_step, parse_step, reachable_pairs
-from flasher.conformance.explore.walk import Phase, Violation, Walk
+from flasher.conformance.explore.steps import WalkStep, next_step, parse_step, reachable_pairs
+from flasher.conformance.explore.walk import DevicePhase, Violation, Walk
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.restore import BY_POWER, may_need_power, restore
 from flasher.conformance.results import (
@@ -34,7 +34,7 @@ _NO_CHANCE: Final = random.Random(0)  # noqa: S311  all steps are given
 
 
 @dataclass(frozen=True)
-class Finding:
+class WalkFinding:
     """What a walk found, and the shortest one that finds it."""
 
     rule: str
@@ -46,7 +46,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Explored:
+class ExploreResult:
     """Walks from the first to the last. `coverage` has every pair of phase and step that a walk may
     meet, with how often it was met.
     """
@@ -56,7 +56,7 @@ class Explored:
     walks: int
     steps: int
     coverage: tuple[tuple[str, str, int], ...]
-    finding: Finding | None = None
+    finding: WalkFinding | None = None
     stopped: str = ""
 
     @property
@@ -82,11 +82,11 @@ class Explorer:
         self._seed = seed
         self._stopped = stopped
         self._progress = progress
-        self._met: Counter[tuple[Phase, str]] = Counter()
+        self._met: Counter[tuple[DevicePhase, str]] = Counter()
         self._steps = 0
         self._walks = 0
 
-    def explore(self, steps: int) -> Explored:
+    def explore(self, steps: int) -> ExploreResult:
         """Walk until so many steps were taken, or something is found. Raises BusError."""
         try:
             trouble = self._restored()
@@ -95,7 +95,7 @@ class Explorer:
             while self._steps < steps and not self._stopped():
                 chance = random.Random(f"{self._seed}/{self._walks}")  # noqa: S311  by the seed
                 length = min(chance.randint(3, WALK_STEPS), steps - self._steps)
-                taken: list[Step] = []
+                taken: list[WalkStep] = []
                 found = self._walk([None] * length, taken, chance)
                 self._progress(self._steps)
                 if found is not None:
@@ -105,10 +105,10 @@ class Explorer:
             return self._explored(stopped=self._stop())
         return self._explored(stopped="it was stopped" if self._steps < steps else "")
 
-    def replay(self, texts: Sequence[str]) -> Explored:
+    def replay(self, texts: Sequence[str]) -> ExploreResult:
         """Take these steps, as a finding tells them. Raises UsageError, BusError."""
         steps = [parse_step(text) for text in texts]
-        taken: list[Step] = []
+        taken: list[WalkStep] = []
         try:
             trouble = self._restored()
             if trouble:
@@ -124,8 +124,8 @@ class Explorer:
 
     def _walk(
         self,
-        steps: Sequence[Step | None],
-        taken: list[Step],
+        steps: Sequence[WalkStep | None],
+        taken: list[WalkStep],
         chance: random.Random = _NO_CHANCE,
     ) -> tuple[Violation, Bench] | None:
         """Take these steps, `chance` choosing those that are None, then upgrade the device to the
@@ -181,7 +181,7 @@ class Explorer:
 
     # -- shrinking ---------------------------------------------------------------------------------
 
-    def _shrunk(self, found: tuple[Violation, Bench], taken: list[Step]) -> Finding:
+    def _shrunk(self, found: tuple[Violation, Bench], taken: list[WalkStep]) -> WalkFinding:
         """The shortest walk, by leaving steps out, that ends with the same rule; the shortest until
         then when somebody stops it, or the adapter fails.
         """
@@ -192,7 +192,7 @@ class Explorer:
                 start, was_shorter = 0, False
                 while start < len(best) and tries < SHRINK_TRIES:
                     shorter = best[:start] + best[start + size :]
-                    again_taken: list[Step] = []
+                    again_taken: list[WalkStep] = []
                     tries += 1
                     again = self._walk(shorter, again_taken) if shorter or rule else None
                     if again is not None and again[0].rule == rule:
@@ -213,10 +213,10 @@ class Explorer:
             return True
 
     def _finding(
-        self, found: tuple[Violation, Bench], steps: Sequence[Step], first: Sequence[Step]
-    ) -> Finding:
+        self, found: tuple[Violation, Bench], steps: Sequence[WalkStep], first: Sequence[WalkStep]
+    ) -> WalkFinding:
         violation, bench = found
-        return Finding(
+        return WalkFinding(
             violation.rule,
             str(violation),
             tuple(map(str, steps)),
@@ -224,14 +224,14 @@ class Explorer:
             bench.tester.trace,
         )
 
-    def _explored(self, finding: Finding | None = None, stopped: str = "") -> Explored:
+    def _explored(self, finding: WalkFinding | None = None, stopped: str = "") -> ExploreResult:
         coverage = tuple(
             (phase.value, name, self._met[phase, name]) for phase, name in reachable_pairs()
         )
-        return Explored(
+        return ExploreResult(
             self._subject.name, self._seed, self._walks, self._steps, coverage, finding, stopped
         )
 
 
-def _first_trouble(trouble: str) -> Finding:
-    return Finding("upgrade", f"the good image could not be flashed: {trouble}", (), ())
+def _first_trouble(trouble: str) -> WalkFinding:
+    return WalkFinding("upgrade", f"the good image could not be flashed: {trouble}", (), ())

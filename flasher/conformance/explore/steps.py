@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.cases.fr import forms
 from flasher.conformance.explore.stimuli import ENDS, NO_CONCERN, PACKETS, UPDATES
-from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
+from flasher.conformance.explore.walk import ALL_STEPS, DevicePhase, Walk
 from flasher.conformance.wire import Encoder
 from flasher.errors import UsageError, did_you_mean
 
@@ -16,8 +16,8 @@ _NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
 _OPEN: Final = "packet-open"
 """Any of the forms that the profile decides about."""
-_WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
-    Phase.APPLICATION: {
+_WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
+    DevicePhase.APPLICATION: {
         "reset": 14,
         **dict.fromkeys(("burst", "burst=twice", "query", "update=384", "packet", "end"), 1),
         **dict.fromkeys(("wait=0.3", "power", "bus-off"), 1),
@@ -25,7 +25,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         **dict.fromkeys([name for name in NO_CONCERN if name != "unknown"], 0.7),
         **dict.fromkeys(("packet-crc", "update-others"), 0.4),
     },
-    Phase.ANNOUNCING: {
+    DevicePhase.ANNOUNCING: {
         "update=good": 8,
         "update=second": 6,
         "update=384": 6,
@@ -44,7 +44,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         **dict.fromkeys(UPDATES, 1),
         **dict.fromkeys((*NO_CONCERN, "bus-off"), 0.5),
     },
-    Phase.BEGUN: {
+    DevicePhase.BEGUN: {
         "packet": 10,
         "packets=4": 6,
         "packets=all": 4,
@@ -57,7 +57,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
     },
-    Phase.TRANSFER: {
+    DevicePhase.TRANSFER: {
         "packet": 5,
         "packets=2": 5,
         "packets=all": 14,
@@ -78,7 +78,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
     },
-    Phase.STORED: {
+    DevicePhase.STORED: {
         "end": 15,
         "end=twice": 5,
         "end=padded": 3,
@@ -93,7 +93,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         **dict.fromkeys((*ENDS, "cut=0", "cut=1"), 1),
         **dict.fromkeys((*PACKETS, *NO_CONCERN), 0.2),
     },
-    Phase.UNCLEAR: {
+    DevicePhase.UNCLEAR: {
         "packet": 3,
         "end": 3,
         "update=good": 3,
@@ -105,7 +105,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
 """How often each step is taken, by what the device does."""
 
 
-class Step(NamedTuple):
+class WalkStep(NamedTuple):
     """One step, as it is written: `packet`, `update=384`."""
 
     name: str
@@ -123,7 +123,7 @@ _ARGUMENTS: Final = {
 """What may stand behind each step; where a number does, another one may too."""
 
 
-def parse_step(text: str) -> Step:
+def parse_step(text: str) -> WalkStep:
     """A step as it is written. Raises UsageError for one that does not exist."""
     name, _, argument = text.partition("=")
     known = set(_forms()) if name == _OPEN else _ARGUMENTS.get(name, set())
@@ -131,10 +131,10 @@ def parse_step(text: str) -> Step:
     if argument not in known and not is_number:
         hint = did_you_mean(text, ALL_STEPS).rstrip()
         raise UsageError(f"There is no step {text!a}.", remedy=hint)
-    return Step(name, argument)
+    return WalkStep(name, argument)
 
 
-def next_step(walk: Walk, chance: random.Random) -> Step:
+def next_step(walk: Walk, chance: random.Random) -> WalkStep:
     """A step for what the device does, by chance; only what the bench can do."""
     weights, subject = _WEIGHTS[walk.phase], walk.bench.subject
     lacks = {
@@ -144,7 +144,7 @@ def next_step(walk: Walk, chance: random.Random) -> Step:
     }
     texts = [text for text in weights if not lacks.get(text.partition("=")[0])]
     (text,) = chance.choices(texts, [weights[text] for text in texts])
-    return Step(_OPEN, chance.choice(_forms())) if text == _OPEN else parse_step(text)
+    return WalkStep(_OPEN, chance.choice(_forms())) if text == _OPEN else parse_step(text)
 
 
 def _forms() -> list[str]:
@@ -153,7 +153,7 @@ def _forms() -> list[str]:
     return [f"{key}-{index}" for key, each in found for index in range(len(each))]
 
 
-def reachable_pairs() -> list[tuple[Phase, str]]:
+def reachable_pairs() -> list[tuple[DevicePhase, str]]:
     """Every phase with every step that a walk may take in it, without the steps' arguments."""
     return [
         (phase, name)

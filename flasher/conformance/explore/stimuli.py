@@ -38,7 +38,7 @@ _SMALL_BYTES: Final = 3 * PACKET_BYTES
 
 
 @dataclass(frozen=True)
-class Place:
+class TransferPosition:
     """Where in a transfer: the image, and the packet that is next."""
 
     encoder: Encoder
@@ -65,14 +65,14 @@ class Place:
         return self.packet(self.wanted)
 
 
-class Refused(NamedTuple):
+class Stimulus(NamedTuple):
     """What is sent; an intact write may have general feedback (R15)."""
 
     frames: list[RawFrame]
     is_intact_write: bool
 
 
-Maker = Callable[[Place], bytes | list[RawFrame]]
+Maker = Callable[[TransferPosition], bytes | list[RawFrame]]
 """Bytes go to the device, in frames of 8."""
 
 
@@ -138,14 +138,14 @@ PACKETS: Final[dict[str, Maker]] = {
 
 
 def _small_update(
-    place: Place, *, mode: int = WRITE, text: bytes = b"", more: bytes = b""
+    place: TransferPosition, *, mode: int = WRITE, text: bytes = b"", more: bytes = b""
 ) -> bytes:
     """An update command; with `more` data, length byte and data are longer than it says."""
     data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little") + more
     return build(place.encoder.to_device, mode, UPDATE, data)
 
 
-def _for_others(place: Place) -> list[RawFrame]:
+def _for_others(place: TransferPosition) -> list[RawFrame]:
     """Update command and packet 1 to the other targets."""
     packet = (1, packet_count(_SMALL_BYTES), bytes(PACKET_BYTES))
     return [
@@ -187,7 +187,7 @@ def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Maker:
     )
 
 
-def _resets_of_nodes(place: Place) -> list[RawFrame]:
+def _resets_of_nodes(place: TransferPosition) -> list[RawFrame]:
     """Resets to this target, but not by the tool: from every other node."""
     encoder, digit = place.encoder, place.encoder.to_device & 0xF
     ids = [0x700 | sender << 4 | digit for sender in (1, 2, 3, 4) if sender != digit]
@@ -195,7 +195,7 @@ def _resets_of_nodes(place: Place) -> list[RawFrame]:
     return [frame for can_id in ids for frame in split(can_id, build(can_id, *reset))]
 
 
-def _junk(place: Place) -> list[RawFrame]:
+def _junk(place: TransferPosition) -> list[RawFrame]:
     chance = random.Random(7)  # noqa: S311  the same at every replay
     data = [bytes((chance.randrange(0x60, 0xF0),)) + chance.randbytes(7) for _ in range(16)]
     return [RawFrame(place.encoder.to_device, each) for each in data]
@@ -225,10 +225,10 @@ NO_CONCERN: Final[dict[str, Maker]] = {
 REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
 
 
-def make(name: str, place: Place) -> Refused:
+def make(name: str, place: TransferPosition) -> Stimulus:
     """What is sent in the step of that name."""
     made = REFUSED[name](place)
     frames = place.encoder.frames(made) if isinstance(made, bytes) else made
     raw, can_id = joined(frames), place.encoder.to_device
     is_own = all(frame.can_id == can_id for frame in frames)
-    return Refused(frames, is_own and is_intact(can_id, raw) and raw[2] == WRITE)
+    return Stimulus(frames, is_own and is_intact(can_id, raw) and raw[2] == WRITE)

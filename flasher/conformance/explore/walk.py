@@ -18,12 +18,12 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.fr import forms
-from flasher.conformance.explore.stimuli import PACKETS, REFUSED, UPDATES, Place, make
+from flasher.conformance.explore.stimuli import PACKETS, REFUSED, UPDATES, TransferPosition, make
 from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.profile import words
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -40,7 +40,7 @@ _BUS_OFF_S: Final = 0.02
 _UPDATES_MAX: Final = 8
 
 
-class Phase(Enum):
+class DevicePhase(Enum):
     """What the device does, as far as it is certain."""
 
     APPLICATION = "application"
@@ -51,10 +51,10 @@ class Phase(Enum):
     UNCLEAR = "unclear"
 
 
-_IN_TRANSFER: Final = frozenset((Phase.BEGUN, Phase.TRANSFER, Phase.STORED))
+_IN_TRANSFER: Final = frozenset((DevicePhase.BEGUN, DevicePhase.TRANSFER, DevicePhase.STORED))
 
 
-class Outcome(Enum):
+class EndOutcome(Enum):
     """What the end of a transfer has to lead to, by the image."""
 
     RUNS = "complete"
@@ -87,7 +87,7 @@ class Walk:
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
-        self.phase = Phase.APPLICATION
+        self.phase = DevicePhase.APPLICATION
         self.is_whole: bool | None = True
         """There is an application to start; None where that is not certain."""
         self.was_requested = False
@@ -95,7 +95,7 @@ class Walk:
         self.running = bench.good_image
         """The image of that application."""
         self._image = filler(3 * PACKET_BYTES)
-        self._end_is = Outcome.NEVER_ENDED
+        self._end_is = EndOutcome.NEVER_ENDED
         self._offered = (self._image, self._end_is)
         """What the last update command was about."""
         self._stored = 0
@@ -128,7 +128,7 @@ class Walk:
     def check_application(self) -> None:
         """The application that should be there runs. Raises Violation."""
         bench = self.bench
-        if self.phase is not Phase.APPLICATION and bench.encoder.has_version_query:
+        if self.phase is not DevicePhase.APPLICATION and bench.encoder.has_version_query:
             bench.wait(bench.host.burst_s)
         wanted = version_in(self.running)
         if wanted is None or not bench.encoder.has_version_query:
@@ -137,7 +137,7 @@ class Walk:
             found = bench.application_version(bench.limit("start_s")) or "no answer"
         if found != wanted:
             raise Violation("application", f"the application does not run: {found}, not {wanted}")
-        self.phase = Phase.APPLICATION
+        self.phase = DevicePhase.APPLICATION
         bench.forget()
 
     def check_stored(self, image: bytes) -> None:
@@ -153,15 +153,15 @@ class Walk:
         """What time alone has changed since the last step."""
         bench = self.bench
         silent_s = bench.now - self._version_at
-        if self.phase is Phase.ANNOUNCING and silent_s > bench.host.burst_s:
+        if self.phase is DevicePhase.ANNOUNCING and silent_s > bench.host.burst_s:
             if self.is_whole:
                 self._await_start()
             elif self.is_whole is None:
-                self.phase, self._may_restart = Phase.UNCLEAR, True
+                self.phase, self._may_restart = DevicePhase.UNCLEAR, True
         pause_s = bench.now - self._useful_at
         may_end = bench.choice("tx_12") != "waits" and pause_s > 0.8 * bench.limit("pause_s")
         if self.phase in _IN_TRANSFER and may_end:
-            self.phase, self._may_restart = Phase.UNCLEAR, True
+            self.phase, self._may_restart = DevicePhase.UNCLEAR, True
 
     def _await_start(self) -> None:
         """The burst is over: wait for the application, however long the window is."""
@@ -172,8 +172,8 @@ class Walk:
             bench.forget()
         else:
             self._listen(self._version_at + start_s - bench.now)
-        if self.phase is Phase.ANNOUNCING:
-            self.phase = Phase.APPLICATION
+        if self.phase is DevicePhase.ANNOUNCING:
+            self.phase = DevicePhase.APPLICATION
 
     def _listen(
         self, within_s: float, until: Callable[[Received], bool] | None = None
@@ -186,7 +186,9 @@ class Walk:
                 return heard
         return None
 
-    def _await(self, kind: Kind, within_s: float, after: str, number: int | None = None) -> None:
+    def _await(
+        self, kind: MessageKind, within_s: float, after: str, number: int | None = None
+    ) -> None:
         """The message has to come. Raises Violation when it does not."""
         heard = self._listen(
             within_s, lambda one: one.kind is kind and number in (None, one.number)
@@ -200,7 +202,7 @@ class Walk:
         """Listen for as long as an answer may take, and a broken message is kept."""
         bench = self.bench
         broken_s = 2 * bench.limit("inter_frame_s")
-        if self.phase is Phase.ANNOUNCING:
+        if self.phase is DevicePhase.ANNOUNCING:
             self._listen(broken_s)  # and no longer: its window is short
             return
         self._listen(max(bench.limit("ack_s"), broken_s))
@@ -208,31 +210,31 @@ class Walk:
 
     def _judge(self, heard: Received) -> None:
         match heard.kind:
-            case Kind.FEEDBACK:
+            case MessageKind.FEEDBACK:
                 if not self._feedback_due:
                     raise Violation("feedback", "general feedback without a write")
                 self._feedback_due -= 1
-            case Kind.BOOT_VERSION:
+            case MessageKind.BOOT_VERSION:
                 self._judge_version(heard)
-            case Kind.REQUEST:
+            case MessageKind.REQUEST:
                 if not self._updates_unanswered:
                     raise Violation("request", "request transfer without a valid update command")
                 self._updates_unanswered -= 1
                 self._begin_transfer(heard.at)
-            case Kind.ACK | Kind.NAK:
+            case MessageKind.ACK | MessageKind.NAK:
                 self._judge_number(heard)
-            case Kind.COMPLETE:
+            case MessageKind.COMPLETE:
                 if not self._may_complete:
                     raise Violation("complete", "complete without all packets and a valid end")
-            case Kind.OTHER if heard.can_id in self._nodes_asked:
+            case MessageKind.OTHER if heard.can_id in self._nodes_asked:
                 pass
-            case Kind.DAMAGED if self._may_break_off:
+            case MessageKind.DAMAGED if self._may_break_off:
                 self._may_break_off = False
-            case Kind.OTHER | Kind.DAMAGED:
+            case MessageKind.OTHER | MessageKind.DAMAGED:
                 raise Violation("form", f"{heard}: no message that a device sends")
 
     def _judge_number(self, heard: Received) -> None:
-        if heard.kind is Kind.ACK:
+        if heard.kind is MessageKind.ACK:
             if not self._acks_due[heard.number]:
                 raise Violation("ack", f"{heard} without such a packet that is valid")
             self._acks_due[heard.number] -= 1
@@ -248,19 +250,19 @@ class Walk:
         is_leftover = heard.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
-        is_expected = self._may_restart or self.phase is Phase.UNCLEAR
-        if self.phase is not Phase.ANNOUNCING and not is_expected:
+        is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
+        if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
             raise Violation("restart", f"{heard} without a reset, a pause or power, in the phase: "
                             f"{self.phase.value}")  # fmt: skip
         if heard.boot_name != self.bench.encoder.boot_name or not heard.has_good_version_text:
             raise Violation("form", f"{heard} is not of the form Vx.x.x of this device")
-        self.phase = Phase.ANNOUNCING
+        self.phase = DevicePhase.ANNOUNCING
         self._version_at = heard.at
         self._may_complete = False
         self._acks_due.clear()
 
     def _begin_transfer(self, at: float) -> None:
-        self.phase = Phase.BEGUN
+        self.phase = DevicePhase.BEGUN
         self._image, self._end_is = self._offered
         self.is_whole, self.was_requested = False, True
         self._stored = 0
@@ -270,20 +272,20 @@ class Walk:
 
     def _store(self) -> None:
         self._stored += 1
-        if self.phase is not Phase.UNCLEAR:
+        if self.phase is not DevicePhase.UNCLEAR:
             is_last = self._stored == packet_count(len(self._image))
-            self.phase = Phase.STORED if is_last else Phase.TRANSFER
+            self.phase = DevicePhase.STORED if is_last else DevicePhase.TRANSFER
 
     # -- reset, power, time ------------------------------------------------------------------------
 
     def _reset(self, _: str) -> None:
         bench, before = self.bench, self.phase
         self._feedback_due += 1
-        if before is Phase.APPLICATION:
+        if before is DevicePhase.APPLICATION:
             feedback_due = self._feedback_due
             self._may_restart = True
             bench.send(bench.encoder.reset())
-            self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+            self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
             self._may_restart = False
             if self._feedback_due == feedback_due:
                 raise Violation("no feedback", "no general feedback to a reset of the application")
@@ -292,17 +294,17 @@ class Walk:
         self._may_restart = self._may_break_off = choice != "ignored"
         bench.send(bench.encoder.reset())
         if choice == "restarts":
-            self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+            self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
         else:
             self._quiet()
             if choice not in ("", "ignored") and self.phase is before:
-                self.phase = Phase.UNCLEAR
+                self.phase = DevicePhase.UNCLEAR
 
     def _burst(self, argument: str) -> None:
         """Reset, no update command: the burst is whole, then the application starts. With `twice`,
         a second reset follows the first one.
         """
-        if self.phase is not Phase.APPLICATION:
+        if self.phase is not DevicePhase.APPLICATION:
             self._reset("")
             return
         bench = self.bench
@@ -313,15 +315,17 @@ class Walk:
             bench.send(bench.encoder.reset())
         heard = bench.collect(bench.limit("first_version_s"))
         if argument == "twice":
-            versions = sum(one.kind is Kind.BOOT_VERSION for one in heard)
+            versions = sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
             bursts = 1 if bench.choice("rs_02") == "ignored" else 2
             if versions > bursts * bench.number("versions"):
                 raise Violation("burst", f"{versions} boot versions after two resets")
             self._feedback_due = 0
             self.check_application()
             return
-        times = [one.at for one in heard if one.kind is Kind.BOOT_VERSION]
-        if [one.kind for one in heard[:1]] != [Kind.FEEDBACK] or len(times) != len(heard) - 1:
+        times = [one.at for one in heard if one.kind is MessageKind.BOOT_VERSION]
+        if [one.kind for one in heard[:1]] != [MessageKind.FEEDBACK] or len(times) != len(
+            heard
+        ) - 1:
             raise Violation("burst", f"after a reset: {describe(heard)}")
         if len(times) != bench.number("versions"):
             raise Violation("burst", f"{len(times)} boot versions after a reset")
@@ -340,7 +344,7 @@ class Walk:
         self._acks_due.clear()
         self._updates_unanswered = self._naks_due = self._feedback_due = 0
         self._may_restart = self._may_break_off = True
-        self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
+        self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
         self._may_restart = False
 
     def _wait(self, argument: str) -> None:
@@ -352,14 +356,14 @@ class Walk:
         choice = bench.choice("tx_12")
         within_s = bench.limit("pause_s") + bench.limit("first_version_s")
         if self.phase not in _IN_TRANSFER or choice == "waits":
-            self._may_restart = self._may_restart or self.phase is Phase.UNCLEAR
+            self._may_restart = self._may_restart or self.phase is DevicePhase.UNCLEAR
             self._listen(1.2 * bench.limit("pause_s"))
             return
         self._may_restart = True
         if choice == "announces":
-            self._await(Kind.BOOT_VERSION, within_s, "the last packet")
+            self._await(MessageKind.BOOT_VERSION, within_s, "the last packet")
         else:
-            self.phase = Phase.UNCLEAR
+            self.phase = DevicePhase.UNCLEAR
             self._listen(within_s)
 
     def _bus_off(self, _: str) -> None:
@@ -369,7 +373,7 @@ class Walk:
         self._listen(4 * _BUS_OFF_S + bench.limit("inter_frame_s"))
 
     def _query(self, _: str) -> None:
-        if self.phase is Phase.APPLICATION:
+        if self.phase is DevicePhase.APPLICATION:
             self.check_application()
         else:
             self.bench.send(self.bench.encoder.query_version())
@@ -379,17 +383,17 @@ class Walk:
 
     def _at_version(self) -> None:
         """Where it announces itself, wait for the moment at which it takes an update command."""
-        if self.phase is not Phase.ANNOUNCING:
+        if self.phase is not DevicePhase.ANNOUNCING:
             return
         bench = self.bench
         within_s = 4 * bench.limit("version_spacing_s")
         if self.is_whole is False:  # it may restart just now
             within_s = bench.limit("first_version_s")
-        heard = self._listen(within_s, lambda one: one.kind is Kind.BOOT_VERSION)
+        heard = self._listen(within_s, lambda one: one.kind is MessageKind.BOOT_VERSION)
         if heard is None and self.is_whole:  # its window is over, or nearly
             self._await_start()
         elif heard is None and self.is_whole is None:
-            self.phase = Phase.UNCLEAR
+            self.phase = DevicePhase.UNCLEAR
 
     def _update(self, argument: str) -> None:
         bench = self.bench
@@ -397,20 +401,20 @@ class Walk:
         frames = bench.encoder.update(len(image))
         self._at_version()
         self._feedback_due += 1
-        if self.phase is Phase.APPLICATION:
+        if self.phase is DevicePhase.APPLICATION:
             bench.send(frames)
             self._quiet()
             return
-        is_same = self.phase is Phase.BEGUN and len(image) == len(self._image)
+        is_same = self.phase is DevicePhase.BEGUN and len(image) == len(self._image)
         if self.phase in _IN_TRANSFER and not is_same:
             self._update_in_transfer(frames, image, outcome)
             return
         self._offered = image, outcome
-        if is_same or self.phase is Phase.UNCLEAR:
+        if is_same or self.phase is DevicePhase.UNCLEAR:
             self._updates_unanswered += 1
             self._naks_due, self._nak_numbers = 1, None
             bench.send(frames)
-            self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST)
+            self._listen(bench.limit("erase_s"), lambda one: one.kind is MessageKind.REQUEST)
             return
         for _ in range(_UPDATES_MAX):
             self._updates_unanswered += 1
@@ -419,21 +423,23 @@ class Walk:
                 bench.limit("erase_s"),
                 partial(_answers_update, not_before=sent.left_at + UPDATE_SPACING_S),
             )
-            if heard is None or heard.kind is Kind.REQUEST:
+            if heard is None or heard.kind is MessageKind.REQUEST:
                 break
             is_late = heard.at > sent.left_at + LEFTOVER_S
             if is_late and bench.choice("up_04_burst") == "accepted":
                 break
             self._feedback_due += 1
-        if self.phase is not Phase.BEGUN:
+        if self.phase is not DevicePhase.BEGUN:
             raise Violation("no request", "no request transfer after a valid update command")
         # An erase for each of them is right too (R25), and so is one answer.
         while self._updates_unanswered and self._listen(
-            LEFTOVER_S, lambda one: one.kind is Kind.REQUEST
+            LEFTOVER_S, lambda one: one.kind is MessageKind.REQUEST
         ):
             pass
 
-    def _update_in_transfer(self, frames: list[RawFrame], image: bytes, outcome: Outcome) -> None:
+    def _update_in_transfer(
+        self, frames: list[RawFrame], image: bytes, outcome: EndOutcome
+    ) -> None:
         bench, choice = self.bench, self.bench.choice("up_08")
         self._naks_due, self._nak_numbers = 1, None
         if choice == "rejected":
@@ -444,17 +450,19 @@ class Walk:
         self._updates_unanswered += 1
         bench.send(frames)
         if choice == "starts_over":
-            self._await(Kind.REQUEST, bench.limit("erase_s"), "an update command in a transfer")
+            self._await(
+                MessageKind.REQUEST, bench.limit("erase_s"), "an update command in a transfer"
+            )
             return
         self._may_restart = True  # one that ignores it has a long pause now
-        if not self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST):
-            self.phase = Phase.UNCLEAR
+        if not self._listen(bench.limit("erase_s"), lambda one: one.kind is MessageKind.REQUEST):
+            self.phase = DevicePhase.UNCLEAR
 
     def _update_reset(self, _: str) -> None:
         """An update command, and a reset right behind it: while it erases."""
         bench = self.bench
         self._at_version()
-        if self.phase is not Phase.ANNOUNCING:
+        if self.phase is not DevicePhase.ANNOUNCING:
             self._reset("")
             return
         self._offered = self._named_image("good")
@@ -464,11 +472,11 @@ class Walk:
         bench.send([*bench.encoder.update(len(bench.good_image)), *bench.encoder.reset()])
         heard = self._listen(
             bench.limit("erase_s"),
-            lambda one: one.kind in (Kind.REQUEST, Kind.BOOT_VERSION),
+            lambda one: one.kind in (MessageKind.REQUEST, MessageKind.BOOT_VERSION),
         )
         if heard is None:
             raise Violation("no request", "nothing after an update command and a reset behind it")
-        self.phase, self.is_whole, self.was_requested = Phase.UNCLEAR, None, True
+        self.phase, self.is_whole, self.was_requested = DevicePhase.UNCLEAR, None, True
         self._may_restart = True
         self._quiet()
 
@@ -476,28 +484,28 @@ class Walk:
         """Cut the power half-way through a flash operation: of the erasing that an update command
         begins, or, when all packets are stored, of what the end of transfer writes.
         """
-        bench, is_end = self.bench, self.phase is Phase.STORED
-        if is_end and self._end_is is not Outcome.RUNS:
+        bench, is_end = self.bench, self.phase is DevicePhase.STORED
+        if is_end and self._end_is is not EndOutcome.RUNS:
             return
         if not is_end:
             self._at_version()
-            if self.phase is not Phase.ANNOUNCING:
+            if self.phase is not DevicePhase.ANNOUNCING:
                 return
         before = self.running if self.is_whole else None
         after = self._image if is_end else None
         self._may_restart = self._may_break_off = self._may_complete = True
         self._updates_unanswered += 1
         self._feedback_due += 1
-        self.was_requested, self.phase = True, Phase.UNCLEAR
+        self.was_requested, self.phase = True, DevicePhase.UNCLEAR
         bench.subject.cut_in_operation(int(argument), 0.5, _GAP_S)
         bench.send(bench.encoder.end() if is_end else bench.encoder.update(len(bench.good_image)))
         if not is_end:
             self._offered = self._named_image("good")
         within_s = bench.limit("erase_s") + bench.limit("first_version_s")
-        ends = (Kind.BOOT_VERSION, Kind.REQUEST, Kind.COMPLETE)
+        ends = (MessageKind.BOOT_VERSION, MessageKind.REQUEST, MessageKind.COMPLETE)
         heard = self._listen(within_s, lambda one: one.kind in ends)
         if not bench.subject.take_cut():  # it does less operations than that
-            if heard is not None and heard.kind is Kind.COMPLETE:
+            if heard is not None and heard.kind is MessageKind.COMPLETE:
                 self._completed()
             return
         self._updates_unanswered = 0
@@ -508,7 +516,7 @@ class Walk:
     def _check_not_mixed(self, images: Sequence[bytes]) -> None:
         """What runs after a power cut is one of the images, whole, or nothing."""
         bench = self.bench
-        self.phase = Phase.UNCLEAR
+        self.phase = DevicePhase.UNCLEAR
         self.is_whole = None
         if not bench.encoder.has_version_query:
             return
@@ -520,21 +528,21 @@ class Walk:
         if whole is None:
             raise Violation("mixed", f"application {found!a} runs after a power cut")
         self.check_stored(whole)
-        self.running, self.is_whole, self.phase = whole, True, Phase.APPLICATION
+        self.running, self.is_whole, self.phase = whole, True, DevicePhase.APPLICATION
 
-    def _named_image(self, argument: str) -> tuple[bytes, Outcome]:
+    def _named_image(self, argument: str) -> tuple[bytes, EndOutcome]:
         """The image of a step, and what comes of it."""
         bench = self.bench
         if argument in ("", "good"):
-            return bench.good_image, Outcome.RUNS
+            return bench.good_image, EndOutcome.RUNS
         if argument == "second":
-            return bench.subject.second_image or bench.good_image, Outcome.RUNS
+            return bench.subject.second_image or bench.good_image, EndOutcome.RUNS
         if argument == "wrong":
             image = bytes((bench.good_image[0] ^ 1,)) + bench.good_image[1:]
             has_checksum = bench.choice("en_04") != "none"
-            return image, Outcome.REFUSED if has_checksum else Outcome.NEVER_ENDED
+            return image, EndOutcome.REFUSED if has_checksum else EndOutcome.NEVER_ENDED
         size_bytes = min(int(argument), bench.number("largest_image_bytes"))
-        return filler(size_bytes), Outcome.NEVER_ENDED
+        return filler(size_bytes), EndOutcome.NEVER_ENDED
 
     # -- packets -----------------------------------------------------------------------------------
 
@@ -549,24 +557,24 @@ class Walk:
         return min(self._stored + 1, self.total)
 
     @property
-    def _place(self) -> Place:
+    def _place(self) -> TransferPosition:
         bench = self.bench
         largest_bytes = bench.number("largest_image_bytes")
-        return Place(bench.encoder, self._image, self.wanted, largest_bytes)
+        return TransferPosition(bench.encoder, self._image, self.wanted, largest_bytes)
 
     def _packet(self, _: str, frames: Sequence[RawFrame] = (), gap_s: float = 0.0) -> None:
         """The next packet, in these frames; elsewhere than in a transfer it is out of turn."""
         bench, number = self.bench, self.wanted
         self._feedback_due += 1
-        is_next = self.phase in (Phase.BEGUN, Phase.TRANSFER)
-        if is_next or self.phase is Phase.UNCLEAR:
+        is_next = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER)
+        if is_next or self.phase is DevicePhase.UNCLEAR:
             self._acks_due[number] += 1
         self._naks_due, self._nak_numbers = int(not is_next), None
         bench.send(frames or self.bench.encoder.frames(self._place.packet(number)), gap_s=gap_s)
         if is_next:
-            self._await(Kind.ACK, bench.limit("ack_s"), f"packet {number}", number)
+            self._await(MessageKind.ACK, bench.limit("ack_s"), f"packet {number}", number)
         else:
-            if self.phase is Phase.STORED:  # the last packet again
+            if self.phase is DevicePhase.STORED:  # the last packet again
                 self._acks_due[number] += 1
             self._quiet()
 
@@ -574,7 +582,7 @@ class Walk:
         left = self.total - self._stored
         count = {"all": left, "most": left - 1}.get(argument)
         for _ in range(int(argument) if count is None else count):
-            if self.phase not in (Phase.BEGUN, Phase.TRANSFER):
+            if self.phase not in (DevicePhase.BEGUN, DevicePhase.TRANSFER):
                 break
             self._packet("")
         self._read("")
@@ -588,13 +596,13 @@ class Walk:
         """The packet that was stored last, or an older one, perhaps with other data."""
         is_older = argument.startswith("older")
         number = self._stored - 1 if is_older else self._stored
-        if self.phase not in (Phase.TRANSFER, Phase.STORED) or number < 1:
+        if self.phase not in (DevicePhase.TRANSFER, DevicePhase.STORED) or number < 1:
             self._packet("")
             return
         payload, has_other_data = packet_payload(self._image, number), argument.endswith("other")
         payload = inverted(payload) if has_other_data else payload
         choice = self.bench.choice("tx_03" if is_older else "tx_02")
-        is_open = choice != "ack" and (is_older or self.phase is Phase.STORED)
+        is_open = choice != "ack" and (is_older or self.phase is DevicePhase.STORED)
         right = [f"ACK {number}"] if is_older else self.bench.right_to_repetition(number)
         self._feedback_due += 1
         self._acks_due[number] += is_open or f"ACK {number}" in right
@@ -634,7 +642,7 @@ class Walk:
         if not bench.profile.allows(key, not_taken):
             self._packet("", frames)
             return
-        is_next = self.phase in (Phase.BEGUN, Phase.TRANSFER, Phase.UNCLEAR)
+        is_next = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER, DevicePhase.UNCLEAR)
         if is_next and bench.profile.allows(key, taken):
             self._acks_due[self.wanted] += 1
         self._naks_due, self._nak_numbers = 4, None
@@ -658,19 +666,19 @@ class Walk:
         """End of transfer; with `twice`, again at once."""
         bench = self.bench
         self._feedback_due += 1
-        if self.phase is not Phase.STORED:
+        if self.phase is not DevicePhase.STORED:
             self._naks_due, self._nak_numbers = 1, None
             was_in_transfer = self.phase in _IN_TRANSFER
-            if self.phase is Phase.UNCLEAR and self._stored == self.total:
+            if self.phase is DevicePhase.UNCLEAR and self._stored == self.total:
                 return  # perhaps it is complete
             bench.send(bench.encoder.end())
             self._quiet()
             if was_in_transfer and self.phase in _IN_TRANSFER:
-                self.phase = Phase.UNCLEAR
+                self.phase = DevicePhase.UNCLEAR
             return
-        if self._end_is is Outcome.NEVER_ENDED:
+        if self._end_is is EndOutcome.NEVER_ENDED:
             return
-        refused = self._end_is is Outcome.REFUSED
+        refused = self._end_is is EndOutcome.REFUSED
         self._naks_due, self._nak_numbers = int(refused), None
         self._may_complete = not refused
         frames = bench.encoder.end()
@@ -679,11 +687,13 @@ class Walk:
         bench.send(frames)
         if refused:
             self._may_restart = True
-            self._await(Kind.NAK, bench.limit("complete_s"), "an image whose checksum is wrong")
-            self.phase = Phase.UNCLEAR
+            self._await(
+                MessageKind.NAK, bench.limit("complete_s"), "an image whose checksum is wrong"
+            )
+            self.phase = DevicePhase.UNCLEAR
             return
-        self._await(Kind.COMPLETE, bench.limit("complete_s"), "the end of the transfer")
-        self.phase, self._may_restart = Phase.UNCLEAR, True
+        self._await(MessageKind.COMPLETE, bench.limit("complete_s"), "the end of the transfer")
+        self.phase, self._may_restart = DevicePhase.UNCLEAR, True
         if argument == "twice":
             self._feedback_due += 1
             bench.send(bench.encoder.end())
@@ -719,8 +729,8 @@ class Walk:
 
 def _answers_update(heard: Received, not_before: float) -> bool:
     """True for request transfer, and for a boot version that follows the update command."""
-    is_later = heard.kind is Kind.BOOT_VERSION and heard.at >= not_before
-    return is_later or heard.kind is Kind.REQUEST
+    is_later = heard.kind is MessageKind.BOOT_VERSION and heard.at >= not_before
+    return is_later or heard.kind is MessageKind.REQUEST
 
 
 STEPS: Final = (

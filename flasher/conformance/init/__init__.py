@@ -12,8 +12,8 @@ from functools import partial
 from typing import Final
 
 from flasher.conformance.init import entry_questions, transfer_questions
-from flasher.conformance.init.answers import Answer, Findings, Trial, decided, limit
-from flasher.conformance.init.session import Session
+from flasher.conformance.init.answers import Findings, KeyAnswer, Trial, decided, limit
+from flasher.conformance.init.session import InitSession
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
 from flasher.conformance.restore import restore
@@ -22,7 +22,7 @@ from flasher.conformance.subject import Subject
 
 UPGRADES: Final = 100
 """About how often the device is erased: some forty upgrades, sizes, and what goes wrong."""
-Question = Callable[[Session], Findings]
+Question = Callable[[InitSession], Findings]
 QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (
         entry_questions.burst,
@@ -97,12 +97,12 @@ _PATIENCE: Final[dict[str, Value]] = {
 
 
 @dataclass(frozen=True)
-class Asked:
+class InitResult:
     """What came of the questions. `answers` has every key of the profile, in its order."""
 
     subject: str
     target: str
-    answers: tuple[Answer, ...]
+    answers: tuple[KeyAnswer, ...]
     stopped: str = ""
     """Why it ended early; the answers are then not to be kept."""
     was_brought_up: bool = True
@@ -129,24 +129,24 @@ def ask(
     *,
     stopped: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Asked:
+) -> InitResult:
     """Ask a device everything. Raises BusError. The good image runs before and after it; of
     `start` is believed what no question answers.
     """
-    return _Asking(subject, start, stopped).go(progress)
+    return _Interview(subject, start, stopped).go(progress)
 
 
-class _Asking:
+class _Interview:
     def __init__(
         self, subject: Subject, start: ConformanceProfile, stopped: Callable[[], bool]
     ) -> None:
         self._subject = subject
         self._start = start
         self._stopped = stopped
-        self._answers: dict[str, Answer] = {}
+        self._answers: dict[str, KeyAnswer] = {}
         self._measured: dict[str, list[float]] = {}
 
-    def go(self, progress: Callable[[int, int], None]) -> Asked:
+    def go(self, progress: Callable[[int, int], None]) -> InitResult:
         was_brought_up = True
         try:
             trouble = self._restored("before the first question", flash=True)
@@ -171,21 +171,21 @@ class _Asking:
         if why and not self._restored("before it was asked again", flash=False):
             why = self._tried(question, keys) or "nothing was seen"
         for key in keys:
-            self._answers.setdefault(key, Answer(key, None, why))
+            self._answers.setdefault(key, KeyAnswer(key, None, why))
 
     def _tried(self, question: Question, keys: tuple[str, ...]) -> str:
         """Ask; returns what the device did else, or ""."""
-        it = Session(self._subject, self._profile(), self._stopped)
+        it = InitSession(self._subject, self._profile(), self._stopped)
         why, trials = "", list[Trial]()
         try:
             it.settle()
             for found in question(it):
                 if isinstance(found, Trial):
                     trials.append(found)
-                elif isinstance(found, Answer):
+                elif isinstance(found, KeyAnswer):
                     self._answers[found.key] = found
                 else:
-                    self._answers |= {key: Answer(key, None, found) for key in keys}
+                    self._answers |= {key: KeyAnswer(key, None, found) for key in keys}
             if trials:
                 choice = next(key for key in keys if "." not in key)
                 self._answers[choice] = decided(choice, trials)
@@ -200,7 +200,7 @@ class _Asking:
             self._measured.setdefault(one.name, []).append(one.value_s)
         return why
 
-    def _limits(self) -> Iterator[Answer]:
+    def _limits(self) -> Iterator[KeyAnswer]:
         for key, (least_s, names) in LIMITS.items():
             values_s = [value_s for name in names for value_s in self._measured.get(name, ())]
             yield limit(key, values_s, least_s, self._subject.port.uncertainty_s)
@@ -219,11 +219,11 @@ class _Asking:
         said = "; ".join((done.reason, *done.diagnosis))
         return f"{when}, the device could not be brought back: {said}"
 
-    def _asked(self, stopped: str, *, was_brought_up: bool = True) -> Asked:
+    def _asked(self, stopped: str, *, was_brought_up: bool = True) -> InitResult:
         self._answers |= {one.key: one for one in self._limits()}
         found = [
-            self._answers.get(key) or Answer(key, None, NOT_ASKED.get(key, "it was not asked"))
+            self._answers.get(key) or KeyAnswer(key, None, NOT_ASKED.get(key, "it was not asked"))
             for key in profile_keys()
         ]
         name, target = self._subject.name, self._subject.target
-        return Asked(name, target, tuple(found), stopped, was_brought_up)
+        return InitResult(name, target, tuple(found), stopped, was_brought_up)

@@ -17,7 +17,7 @@ _EITHER: Final = "either"
 
 
 @dataclass(frozen=True)
-class Answer:
+class KeyAnswer:
     """What is written for a key of the profile; `value` is None where it stays open. `seen` says
     what was seen, or why it stays open.
     """
@@ -44,21 +44,21 @@ class Trial(NamedTuple):
         return f"{self.answer} {self.link} {self.stimulus}"
 
 
-Findings = Iterator[Answer | Trial | str]
+Findings = Iterator[KeyAnswer | Trial | str]
 """What a question finds: answers, trials for its choice, or why all of its keys stay open."""
 
 
-def decided(key: str, trials: Sequence[Trial]) -> Answer:
+def decided(key: str, trials: Sequence[Trial]) -> KeyAnswer:
     """The value that all trials agree in; where they differ, `either` if the key has it."""
     seen, values = _told(trials), {trial.value for trial in trials}
     allowed = profile_keys()[key].choices
     if not values <= set(allowed):
-        return Answer(key, None, f"no value describes this: {seen}")
+        return KeyAnswer(key, None, f"no value describes this: {seen}")
     if len(values) == 1:
-        return Answer(key, values.pop(), seen)
+        return KeyAnswer(key, values.pop(), seen)
     if _EITHER in allowed:
-        return Answer(key, _EITHER, seen)
-    return Answer(key, None, f"it differs: {seen}")
+        return KeyAnswer(key, _EITHER, seen)
+    return KeyAnswer(key, None, f"it differs: {seen}")
 
 
 def _told(trials: Sequence[Trial]) -> str:
@@ -76,14 +76,14 @@ def _told(trials: Sequence[Trial]) -> str:
     return f"{summed}: {'; '.join(found[:_SHOWN])}; and {more} more"
 
 
-def limit(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> Answer:
+def limit(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> KeyAnswer:
     """A limit from what was measured: with a margin, so never shorter than what it took."""
     if not values_s:
-        return Answer(key, None, "it was never measured")
+        return KeyAnswer(key, None, "it was never measured")
     longest_s = max(values_s)
     value = rounded_up(max(MARGIN * longest_s + 2 * unsure_s, least_s))
     times = "once" if len(values_s) == 1 else f"{len(values_s)} times"
-    return Answer(
+    return KeyAnswer(
         key,
         value,
         f"measured {times}, at most {longest_s * 1000:.1f} ms; the limit is {MARGIN} times that, "

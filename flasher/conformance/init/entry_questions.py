@@ -7,15 +7,15 @@ from math import ceil
 from statistics import median
 from typing import Final
 
-from flasher.conformance.init.answers import Answer, Findings, Trial
-from flasher.conformance.init.session import REPEATS, Session, told
+from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
+from flasher.conformance.init.session import REPEATS, InitSession, told
 from flasher.conformance.judge import Times
 from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import (
     IMAGE_BYTES_MAX,
     WRITE,
-    Kind,
+    MessageKind,
     RawFrame,
     Received,
     packet_count,
@@ -35,7 +35,7 @@ _UNKNOWN: Final = 0x7704
 """A command that nobody has."""
 
 
-def burst(it: Session) -> Findings:
+def burst(it: InitSession) -> Findings:
     """The announcements after a reset, and after power-up."""
     bench = it.bench
     counts: list[int] = []
@@ -45,7 +45,7 @@ def burst(it: Session) -> Findings:
         if turn == "power":
             bench.power_cycle()
             on_at = bench.now
-            first = bench.await_message(Kind.BOOT_VERSION)
+            first = bench.await_message(MessageKind.BOOT_VERSION)
             bench.measure(Times.POWERED, first.at - on_at)
         else:
             first = it.enter()
@@ -54,37 +54,37 @@ def burst(it: Session) -> Findings:
         gaps_s += [after.at - before.at for before, after in pairwise(versions)]
         it.await_application()
     command = f"{bench.encoder.reset_command:04X}"
-    yield Answer(
+    yield KeyAnswer(
         "device.reset_command",
         bench.encoder.reset_command,
         f"{command} was followed by boot versions, {REPEATS} of {REPEATS} times",
     )
     text = bench.encoder.reset_data.decode()
-    yield Answer("device.reset_data", text, f"{command} was sent with {text}")
+    yield KeyAnswer("device.reset_data", text, f"{command} was sent with {text}")
     shown = ", ".join(map(str, counts))
     alike = len(set(counts)) == 1
     said = f"{shown} boot versions after {REPEATS} resets"
     if len(turns) > REPEATS:
         said += f" and {REPEATS} power cycles"
-    yield Answer("device.versions", counts[0] if alike else None, said)
+    yield KeyAnswer("device.versions", counts[0] if alike else None, said)
     if not gaps_s:
         why = "a single boot version has no spacing"
-        yield Answer("limits.version_spacing_s", None, why)
-        yield Answer("limits.version_spacing_tolerance_s", None, why)
+        yield KeyAnswer("limits.version_spacing_s", None, why)
+        yield KeyAnswer("limits.version_spacing_tolerance_s", None, why)
         return
     spacing_s = round(median(gaps_s), 3)
     seen = f"{len(gaps_s)} times, from {min(gaps_s) * 1000:.1f} to {max(gaps_s) * 1000:.1f} ms"
     off_s = max(abs(gap_s - spacing_s) for gap_s in gaps_s)
     tolerance_s = max(_TOLERANCE_S, _up(2 * off_s + 2 * bench.port.uncertainty_s))
-    yield Answer("limits.version_spacing_s", spacing_s, f"measured {seen}; the median")
-    yield Answer(
+    yield KeyAnswer("limits.version_spacing_s", spacing_s, f"measured {seen}; the median")
+    yield KeyAnswer(
         "limits.version_spacing_tolerance_s",
         tolerance_s,
         f"measured {seen}; twice the widest difference, {_TOLERANCE_S * 1000:g} ms at the least",
     )
 
 
-def upgrade(it: Session) -> Findings:
+def upgrade(it: InitSession) -> Findings:
     """Plain upgrades, for their times and for what follows complete."""
     bench = it.bench
     for _ in range(REPEATS):
@@ -93,7 +93,7 @@ def upgrade(it: Session) -> Findings:
         bench.end_transfer()
         complete_at = bench.now
         heard = _first_sign(it)
-        if heard is not None and heard.kind is Kind.BOOT_VERSION:
+        if heard is not None and heard.kind is MessageKind.BOOT_VERSION:
             bench.measure(Times.RESTARTED, heard.at - complete_at)
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
@@ -103,24 +103,26 @@ def upgrade(it: Session) -> Findings:
         it.await_application(Times.START_AGAIN, last.at)
 
 
-def _first_sign(it: Session) -> Received | None:
+def _first_sign(it: InitSession) -> Received | None:
     """The first boot version after complete, or the first answer of the application."""
     bench = it.bench
     if not bench.encoder.has_version_query:
         within_s = max(bench.limit("first_version_s"), _RESTART_S)
-        return bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+        return bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
     deadline = bench.now + bench.limit("start_s")
     heard: Received | None = None
     while heard is None and bench.now < deadline:
         bench.send(bench.encoder.query_version())
-        heard = bench.wait_for(Kind.BOOT_VERSION, Kind.VERSION_INFORMATION, within_s=0.05)
+        heard = bench.wait_for(
+            MessageKind.BOOT_VERSION, MessageKind.VERSION_INFORMATION, within_s=0.05
+        )
     return heard
 
 
 # -- the window -----------------------------------------------------------------------------------
 
 
-def in_burst(it: Session) -> Findings:
+def in_burst(it: InitSession) -> Findings:
     """Update command between the announcements."""
     bench = it.bench
     count = bench.number("versions")
@@ -136,7 +138,7 @@ def in_burst(it: Session) -> Findings:
             it.finish() if taken else it.await_application()
 
 
-def window(it: Session) -> Findings:
+def window(it: InitSession) -> Findings:
     """The window's end behind the last announcement, by bisection."""
     bench = it.bench
     at_s, taken = _offer_at(it, 0.0)
@@ -172,9 +174,11 @@ def window(it: Session) -> Findings:
         f"update command taken up to {low_s * 1000:.1f} ms behind the last boot version, not from "
         f"{high_s * 1000:.1f} ms on, by bisection"
     )
-    yield Answer("limits.window_s", window_s, f"{seen}; the middle")
+    yield KeyAnswer("limits.window_s", window_s, f"{seen}; the middle")
     half_s = _up((high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2)
-    yield Answer("limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure")
+    yield KeyAnswer(
+        "limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure"
+    )
     stimulus = (
         f"update command {(high_s + resolution_s) * 1000:.0f} ms behind the last boot version"
     )
@@ -183,7 +187,7 @@ def window(it: Session) -> Findings:
         yield Trial("accepted" if taken else "rejected", answer, stimulus)
 
 
-def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
+def _offer_at(it: InitSession, offset_s: float) -> tuple[float, bool]:
     """Update command so long behind the last boot version; when it was there, and if it is taken.
     The good image runs again afterwards.
     """
@@ -192,7 +196,7 @@ def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
     wire_s = bench.tester.wire_s(frames)
     last = it.enter(bench.number("versions"))
     sent = bench.send(frames, at=last.at + max(offset_s - wire_s, 0.0))
-    heard = bench.wait_for(Kind.REQUEST)
+    heard = bench.wait_for(MessageKind.REQUEST)
     if heard is None:
         it.await_application()
     else:
@@ -205,7 +209,7 @@ def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
 # -- what is not taken ----------------------------------------------------------------------------
 
 
-def reset_in_bootloader(it: Session) -> Findings:
+def reset_in_bootloader(it: InitSession) -> Findings:
     """Reset between the announcements."""
     bench = it.bench
     count = bench.number("versions")
@@ -220,7 +224,7 @@ def reset_in_bootloader(it: Session) -> Findings:
         it.await_application()
 
 
-def rejected_update(it: Session) -> Findings:
+def rejected_update(it: InitSession) -> Findings:
     """Update commands that no bootloader takes."""
     bench = it.bench
     other = next(iter(bench.encoder.others()))
@@ -236,12 +240,12 @@ def rejected_update(it: Session) -> Findings:
             it.enter()
             bench.send(frames)
             heard = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
-            answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+            answers = [one for one in heard if one.kind is not MessageKind.BOOT_VERSION]
             yield Trial(_word(answers), told(answers), stimulus)
             it.await_application()
 
 
-def feedback(it: Session) -> Findings:
+def feedback(it: InitSession) -> Findings:
     """General feedback of the bootloader, to an unknown write and to those of an upgrade."""
     bench = it.bench
     unknown = bench.encoder.message(WRITE, _UNKNOWN, bytes(_UNKNOWN & 0xFF))
@@ -260,7 +264,7 @@ def feedback(it: Session) -> Findings:
         it.finish()
 
 
-def update_twice(it: Session) -> Findings:
+def update_twice(it: InitSession) -> Findings:
     """Two update commands in a row."""
     bench = it.bench
     update = bench.encoder.update(len(it.image))
@@ -268,9 +272,9 @@ def update_twice(it: Session) -> Findings:
         it.enter()
         bench.wait_for_window()
         bench.send(update + update)
-        first = bench.wait_for(Kind.REQUEST)
+        first = bench.wait_for(MessageKind.REQUEST)
         more = [] if first is None else bench.collect(bench.limit("erase_s"))
-        count = (first is not None) + sum(one.kind is Kind.REQUEST for one in more)
+        count = (first is not None) + sum(one.kind is MessageKind.REQUEST for one in more)
         value = {1: "once", 2: "each"}.get(count, "")
         answer = f"request transfer {count} times"
         yield Trial(value, answer, "two update commands in a row")
@@ -278,7 +282,7 @@ def update_twice(it: Session) -> Findings:
         it.finish() if count else it.await_application()
 
 
-def application(it: Session) -> Findings:
+def application(it: InitSession) -> Findings:
     """Messages of the upgrade to the running application."""
     bench = it.bench
     for stimulus, frames in bench.encoder.upgrade_messages(len(it.image)).items():
@@ -295,14 +299,14 @@ def _word(heard: list[Received]) -> str:
     """The value for one answer, or none."""
     if not heard:
         return "silence"
-    names = {Kind.NAK: "nak", Kind.FEEDBACK: "feedback"}
+    names = {MessageKind.NAK: "nak", MessageKind.FEEDBACK: "feedback"}
     return names.get(heard[0].kind, "") if len(heard) == 1 else ""
 
 
 # -- without an application -----------------------------------------------------------------------
 
 
-def _way_out(it: Session) -> str:
+def _way_out(it: InitSession) -> str:
     """Why nothing ends a transfer of this device; empty when something does."""
     if needs_power(it.bench.profile) and not it.bench.subject.has_power:
         return "only power would end a transfer, and none is controlled"
@@ -312,7 +316,7 @@ def _way_out(it: Session) -> str:
     return ""
 
 
-def without_application(it: Session) -> Findings:
+def without_application(it: InitSession) -> Findings:
     """A bootloader that has nothing to start."""
     bench = it.bench
     why = _way_out(it)
@@ -325,7 +329,7 @@ def without_application(it: Session) -> Findings:
         bench.leave_transfer()
         more, last_at = 0, bench.now
         while more < 2 * count:
-            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=_SILENT_S)
+            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=_SILENT_S)
             if heard is None:
                 break
             bench.measure(Times.GAP, heard.at - last_at)
@@ -338,7 +342,7 @@ def without_application(it: Session) -> Findings:
         it.finish()
 
 
-def largest_image(it: Session) -> Findings:
+def largest_image(it: InitSession) -> Findings:
     """The largest size that an update command is taken with."""
     bench = it.bench
     restarts_at_once = bench.choice("up_08") == "starts_over"
@@ -374,21 +378,21 @@ def largest_image(it: Session) -> Findings:
     said = f"update command for {low} bytes is taken"
     if high:
         said += f", and for {high} bytes not, by bisection"
-    yield Answer("device.largest_image_bytes", low, said)
+    yield KeyAnswer("device.largest_image_bytes", low, said)
 
 
-def _is_size_taken(it: Session, frames: list[RawFrame], within_s: float) -> bool:
+def _is_size_taken(it: InitSession, frames: list[RawFrame], within_s: float) -> bool:
     """True for request transfer. A NAK, or a bootloader that announces itself on, says no."""
     bench = it.bench
     bench.forget()
     sent = bench.send(frames)
     deadline, versions = sent.left_at + within_s, 0
-    kinds = (Kind.REQUEST, Kind.NAK, Kind.BOOT_VERSION)
+    kinds = (MessageKind.REQUEST, MessageKind.NAK, MessageKind.BOOT_VERSION)
     while versions < 3:
         heard = bench.wait_for(*kinds, within_s=deadline - bench.now)
-        if heard is None or heard.kind is Kind.NAK:
+        if heard is None or heard.kind is MessageKind.NAK:
             break
-        if heard.kind is Kind.REQUEST:
+        if heard.kind is MessageKind.REQUEST:
             bench.measure(Times.REQUEST, heard.at - sent.left_at)
             return True
         versions += heard.at > sent.left_at + UPDATE_SPACING_S

@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probe import Transfer
+from flasher.conformance.cases.probe import PacketTransfer
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.wire import (
-    Decoder,
-    Kind,
+    DeviceDecoder,
+    MessageKind,
     RawFrame,
     Received,
     describe,
@@ -33,7 +33,7 @@ _QUIET_START_S: Final = 2.0
 """No window is longer, as far as a device is waited for that tells no version."""
 
 
-class Session(Transfer):
+class InitSession(PacketTransfer):
     """A device whose good image runs, when the question begins and when it ends."""
 
     def __init__(
@@ -49,7 +49,7 @@ class Session(Transfer):
         bench = self.bench
         if not bench.encoder.has_version_query:
             quiet_s = max(bench.limit("first_version_s"), _QUIET_START_S)
-            while bench.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) is not None:
+            while bench.wait_for(MessageKind.BOOT_VERSION, within_s=quiet_s) is not None:
                 pass
 
     # -- the application --------------------------------------------------------------------------
@@ -80,14 +80,14 @@ class Session(Transfer):
         bench = self.bench
         found = bench.reset_measured(bench.limit("first_version_s"))
         for _ in range(version - 1):
-            found = bench.await_message(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
+            found = bench.await_message(MessageKind.BOOT_VERSION, within_s=_BURST_GAP_S)
         return found
 
     def more_versions(self) -> list[Received]:
         """The boot versions that follow, until none comes any more."""
         found: list[Received] = []
         while len(found) < _VERSIONS_MAX:
-            heard = self.bench.wait_for(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
+            heard = self.bench.wait_for(MessageKind.BOOT_VERSION, within_s=_BURST_GAP_S)
             if heard is None:
                 break
             found.append(heard)
@@ -97,7 +97,7 @@ class Session(Transfer):
         """Send what may be an update command for the good image; True when it is taken."""
         bench = self.bench
         sent = bench.send(frames)
-        heard = bench.wait_for(Kind.REQUEST)
+        heard = bench.wait_for(MessageKind.REQUEST)
         if heard is not None:
             bench.measure(Times.REQUEST, heard.at - sent.left_at)
             self.stored = 0
@@ -164,9 +164,9 @@ class Session(Transfer):
     def feedback_since(self, moment: float) -> int:
         """How many messages of general feedback came after that time, heard or not."""
         bench = self.bench
-        decoder, since_s = Decoder(bench.encoder), moment - bench.tester.began_at
+        decoder, since_s = DeviceDecoder(bench.encoder), moment - bench.tester.began_at
         return sum(
-            heard.kind is Kind.FEEDBACK
+            heard.kind is MessageKind.FEEDBACK
             for entry in bench.tester.trace
             if not entry.sent and entry.at_s > since_s
             for heard in decoder.feed(entry.frame, entry.at_s)

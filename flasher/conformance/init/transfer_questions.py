@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import floor
 from typing import Final
 
-from flasher.conformance.cases.fr import PADDINGS, Form, forms
-from flasher.conformance.init.answers import Answer, Findings, Trial
-from flasher.conformance.init.session import REPEATS, Session, told
+from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
+from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
+from flasher.conformance.init.session import REPEATS, InitSession, told
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import words
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    Kind,
+    MessageKind,
     RawFrame,
     filled_up,
     joined,
@@ -26,7 +26,13 @@ _SHARES: Final = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LATER_S: Final = 0.5
 _PAUSE_WATCHED_S: Final = 30.0
 _BEFORE_PAUSE: Final = 0.9
-_END_ANSWERS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.FEEDBACK)
+_END_ANSWERS: Final = (
+    MessageKind.REQUEST,
+    MessageKind.ACK,
+    MessageKind.NAK,
+    MessageKind.COMPLETE,
+    MessageKind.FEEDBACK,
+)
 _PACKETS_READ_BACK: Final = 33
 
 
@@ -34,19 +40,19 @@ _PACKETS_READ_BACK: Final = 33
 
 
 def _asked(
-    it: Session, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
+    it: InitSession, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
 ) -> Iterator[Trial]:
     """Send that some times. `words` are those for the answers, "NAK" for any other NAK."""
     for _ in range(REPEATS):
         it.bench.forget()
         it.bench.send(frames)
         heard = it.bench.answers()
-        is_nak = [one.kind for one in heard] == [Kind.NAK]
-        value = words.get(told(heard)) or words.get(Kind.NAK.value if is_nak else "", "")
+        is_nak = [one.kind for one in heard] == [MessageKind.NAK]
+        value = words.get(told(heard)) or words.get(MessageKind.NAK.value if is_nak else "", "")
         yield Trial(value, told(heard), stimulus)
 
 
-def repeated_packet(it: Session) -> Findings:
+def repeated_packet(it: InitSession) -> Findings:
     """The packet stored last, again."""
     it.begin()
     for stored in (1, 2):
@@ -56,7 +62,7 @@ def repeated_packet(it: Session) -> Findings:
     it.finish()
 
 
-def older_packet(it: Session) -> Findings:
+def older_packet(it: InitSession) -> Findings:
     """A packet before the one stored last."""
     it.begin()
     it.reach(3, 1)
@@ -67,7 +73,7 @@ def older_packet(it: Session) -> Findings:
     it.finish()
 
 
-def bad_packet(it: Session) -> Findings:
+def bad_packet(it: InitSession) -> Findings:
     """Packets that are damaged, or make no sense."""
     trials = list[Trial]()
     it.begin()
@@ -107,7 +113,7 @@ def bad_packet(it: Session) -> Findings:
     yield from (trial._replace(value=word) for trial in trials)
 
 
-def lost_frame(it: Session) -> Findings:
+def lost_frame(it: InitSession) -> Findings:
     """Packets of which a frame is lost."""
     bench = it.bench
     it.begin()
@@ -121,7 +127,7 @@ def lost_frame(it: Session) -> Findings:
             late = bench.collect(_LATER_S)
             kinds = [one.kind for one in (*heard, *late)]
             value = {0: "silence", 1: "nak"}.get(len(kinds), "")
-            if kinds not in ([], [Kind.NAK]):
+            if kinds not in ([], [MessageKind.NAK]):
                 value = ""
             elif late:
                 value = "either"
@@ -132,7 +138,7 @@ def lost_frame(it: Session) -> Findings:
     it.finish()
 
 
-def filler(it: Session) -> Findings:
+def filler(it: InitSession) -> Findings:
     """Other bytes than FF behind the end of the image, in the last packet."""
     bench = it.bench
     rest = it.image[(it.total - 1) * PACKET_BYTES :]
@@ -156,7 +162,7 @@ def filler(it: Session) -> Findings:
 # -- framing --------------------------------------------------------------------------------------
 
 
-def splits(it: Session) -> Findings:
+def splits(it: InitSession) -> Findings:
     """Messages in frames of other sizes."""
     bench = it.bench
     for _ in range(REPEATS):
@@ -177,7 +183,7 @@ def splits(it: Session) -> Findings:
         it.finish()
 
 
-def in_forms(it: Session, key: str) -> Findings:
+def in_forms(it: InitSession, key: str) -> Findings:
     """Packets in the forms that one key of the profile decides about."""
     it.begin()
     for form in forms(it.bench.encoder)[key]:
@@ -186,13 +192,13 @@ def in_forms(it: Session, key: str) -> Findings:
     it.finish()
 
 
-def _offered(it: Session, form: Form, key: str) -> Trial:
+def _offered(it: InitSession, form: PacketForm, key: str) -> Trial:
     it.reach(0, 1)
     taken = it.offer(it.bench.encoder.frames(form.before + it.raw(), form.frame_bytes))
     return _taken(taken, form.asked, *words(key))
 
 
-def padded(it: Session) -> Findings:
+def padded(it: InitSession) -> Findings:
     """Update command and end of transfer, their last frames filled up."""
     bench = it.bench
     within_s = bench.limit("complete_s")
@@ -210,7 +216,7 @@ def padded(it: Session) -> Findings:
         it.packets()
         bench.forget()
         sent = bench.send(filled_up(bench.encoder.end(), byte))
-        heard = bench.wait_for(Kind.COMPLETE, within_s=within_s)
+        heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
         yield _taken(heard is not None, f"end {said}", "ignored", "rejected")
         if heard is None:
             bench.forget()
@@ -220,7 +226,7 @@ def padded(it: Session) -> Findings:
         it.await_application()
 
 
-def gaps(it: Session) -> Findings:
+def gaps(it: InitSession) -> Findings:
     """Packets with gaps between their frames."""
     it.begin()
     for gap_s, count in it.bench.gaps(it.frames(), _SHARES):
@@ -239,7 +245,7 @@ def _taken(taken: bool, stimulus: str, yes: str = "accepted", no: str = "rejecte
 # -- update command, pause and reset in a transfer ------------------------------------------------
 
 
-def update_again(it: Session) -> Findings:
+def update_again(it: InitSession) -> Findings:
     """Update command after packet 3, for the same size and for another one."""
     bench = it.bench
     for _ in range(REPEATS):
@@ -259,7 +265,7 @@ def update_again(it: Session) -> Findings:
         it.finish()
 
 
-def pause(it: Session) -> Findings:
+def pause(it: InitSession) -> Findings:
     """Pauses in the transfer."""
     bench = it.bench
     places, found_s = (1, 0, it.total), list[float]()
@@ -267,7 +273,7 @@ def pause(it: Session) -> Findings:
         it.begin()
         it.packets(stored)
         began_at = bench.now
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=_PAUSE_WATCHED_S)
+        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=_PAUSE_WATCHED_S)
         stimulus = f"a pause after packet {stored}" if stored else "a pause before packet 1"
         if heard is None:
             answer = f"no boot version in {_PAUSE_WATCHED_S:g} s"
@@ -279,17 +285,17 @@ def pause(it: Session) -> Findings:
         it.finish()
     if len(found_s) < len(places):
         why = f"no boot version in a pause of {_PAUSE_WATCHED_S:g} s; the default stands"
-        yield Answer("limits.pause_s", None, why)
+        yield KeyAnswer("limits.pause_s", None, why)
         return
     digit = 10 if min(found_s) >= 1 else 100
     shortest_s = floor(min(found_s) * digit + 1e-6) / digit
     for one_s in found_s:
         bench.measure(Times.LATE, one_s - shortest_s)
     seen = f"a boot version after pauses of {min(found_s):.3f} to {max(found_s):.3f} s"
-    yield Answer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
+    yield KeyAnswer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
 
 
-def reset_again(it: Session) -> Findings:
+def reset_again(it: InitSession) -> Findings:
     """Reset before packet 1, amid the packets and before the end."""
     bench = it.bench
     within_s = bench.limit("first_version_s")
@@ -301,7 +307,7 @@ def reset_again(it: Session) -> Findings:
         it.packets(stored)
         bench.forget()
         bench.send(bench.encoder.reset())
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
         stimulus = f"reset after packet {stored}" if stored else "reset before packet 1"
         value, answer = ("restarts", "boot version") if heard else ("ignored", "no boot version")
         yield Trial(value, answer, stimulus, "after")
@@ -313,7 +319,7 @@ def reset_again(it: Session) -> Findings:
 # -- the end, and what is stored ------------------------------------------------------------------
 
 
-def end_again(it: Session) -> Findings:
+def end_again(it: InitSession) -> Findings:
     """End of transfer once more, right after complete."""
     bench = it.bench
     for _ in range(REPEATS):
@@ -326,12 +332,16 @@ def end_again(it: Session) -> Findings:
         heard = [one for one in heard if one.kind in _END_ANSWERS]
         kinds = [one.kind for one in heard]
         # An application that runs already may confirm what it does not know (R17).
-        words = {(): "silence", (Kind.FEEDBACK,): "silence", (Kind.COMPLETE,): "same_answer"}
+        words = {
+            (): "silence",
+            (MessageKind.FEEDBACK,): "silence",
+            (MessageKind.COMPLETE,): "same_answer",
+        }
         yield Trial(words.get(tuple(kinds), ""), told(heard), "end of transfer again")
         it.await_application()
 
 
-def buffer(it: Session) -> Findings:
+def buffer(it: InitSession) -> Findings:
     """What is acknowledged and not yet in the flash."""
     bench = it.bench
     if not bench.subject.has_readback:
@@ -348,4 +358,4 @@ def buffer(it: Session) -> Findings:
     # The last packet may be on its way into the flash when its ACK comes (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
     seen = f"after ACK 1 to {count} at most {lacking} bytes were not in the flash"
-    yield Answer("device.buffer_bytes", held, f"{seen}; one packet may be on its way")
+    yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may be on its way")
