@@ -68,6 +68,12 @@ from flasher.protocol import contents
 
 __version__ = "0.1.0"
 __all__ = [
+    "flash",
+    "connect",
+    "aconnect",
+    "connect_mock",
+    "load",
+    "make_plan",
     "AsyncDevice",
     "Connection",
     "Device",
@@ -86,12 +92,6 @@ __all__ = [
     "UpgradeOptions",
     "Verification",
     "Written",
-    "aconnect",
-    "connect",
-    "connect_mock",
     "contents",
     "events",
-    "flash",
-    "load",
-    "make_plan",
 ]

@@ -54,6 +54,19 @@ if TYPE_CHECKING:
     from flasher.mock.profile import DeviceProfile
 
 __all__ = [
+    "flash",
+    "aconnect",
+    "connect",
+    "connect_mock",
+    "load",
+    "make_plan",
+    "prepare",
+    "find_release",
+    "as_dialect",
+    "as_level",
+    "as_target",
+    "check_level",
+    "default_level",
     "AsyncDevice",
     "Check",
     "Connection",
@@ -75,19 +88,6 @@ __all__ = [
     "Verification",
     "Watch",
     "Written",
-    "aconnect",
-    "as_dialect",
-    "as_level",
-    "as_target",
-    "check_level",
-    "connect",
-    "connect_mock",
-    "default_level",
-    "find_release",
-    "flash",
-    "load",
-    "make_plan",
-    "prepare",
 ]
 
 T = TypeVar("T")
