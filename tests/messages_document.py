@@ -14,15 +14,15 @@ from typing import Final
 
 from flasher.protocol.catalogue import ITEMS, Item, answer_of
 from flasher.protocol.fields import (
-    Address,
+    AddressField,
     Codec,
-    Constant,
+    ConstantField,
     Content,
     DateField,
-    Flags,
-    Number,
-    Numbers,
-    Reserved,
+    FlagsField,
+    NumberField,
+    NumberListField,
+    ReservedField,
     TextField,
     flag_names,
     label,
@@ -84,14 +84,14 @@ def _upgrade() -> Iterator[str]:
 
 
 def _part(name: str, codec: Codec) -> str:
-    if isinstance(codec, Constant):
+    if isinstance(codec, ConstantField):
         text = codec.expected.decode()
         return f"`{text}`" if text.isprintable() else codec.expected.hex(" ").upper()
     return f"{name.removesuffix('_bytes')} ({codec.size_bytes} B{_little(codec)})"
 
 
 def _little(codec: Codec) -> str:
-    return ", low byte first" if isinstance(codec, Number) else ""
+    return ", low byte first" if isinstance(codec, NumberField) else ""
 
 
 def _dialects() -> Iterator[str]:
@@ -161,19 +161,19 @@ def _content(content: type[Content]) -> Iterator[str]:
         at += codec.size_bytes
     yield ""
     for name, codec in content.LAYOUT:
-        if isinstance(codec, Flags):
+        if isinstance(codec, FlagsField):
             yield from _bits(label(name, codec), codec)
 
 
 def _type(codec: Codec) -> str:
     match codec:
-        case Number(size_bytes=size_bytes, signed=signed):
+        case NumberField(size_bytes=size_bytes, signed=signed):
             return f"{'int' if signed else 'uint'}{8 * size_bytes}"
-        case Numbers(count=count, each=each):
+        case NumberListField(count=count, each=each):
             return f"{count} {_type(each)}"
-        case Flags(size_bytes=size_bytes):
+        case FlagsField(size_bytes=size_bytes):
             return f"{8 * size_bytes} bits"
-        case TextField() | Constant():
+        case TextField() | ConstantField():
             return "text"
         case DateField():
             return "date"
@@ -183,25 +183,25 @@ def _type(codec: Codec) -> str:
 
 def _on_the_wire(codec: Codec) -> str:
     match codec:
-        case Address():
+        case AddressField():
             return "an address"
-        case Number(offset=offset) if offset:
+        case NumberField(offset=offset) if offset:
             return f"value + {offset}"
-        case Flags(none=none):
+        case FlagsField(none=none):
             return f"no bit: {none}"
-        case Constant(expected=expected):
+        case ConstantField(expected=expected):
             return f"`{expected.decode()}`, no terminator"
         case TextField(size_bytes=size_bytes):
             return f"up to {size_bytes - 1} characters"
         case DateField():
             return "YYYYMMDD"
-        case Reserved():
+        case ReservedField():
             return "00"
         case _:
             return ""
 
 
-def _bits(name: str, codec: Flags) -> Iterator[str]:
+def _bits(name: str, codec: FlagsField) -> Iterator[str]:
     others = "are reserved" if "reserved" in codec.names.unnamed(0) else "are not in the document"
     yield from (f"Bits of {name}; the others {others}:", "")
     yield from _table("bit", "mask", "meaning")

@@ -19,7 +19,7 @@ import can
 from flasher.export.names import key
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
-from flasher.protocol.fields import Codec, Flags, Number, Numbers, flag_names
+from flasher.protocol.fields import Codec, FlagsField, NumberField, NumberListField, flag_names
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import COMMAND_SIZE, PREFIX_SIZE, TARGETS, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -125,18 +125,18 @@ def _signals(command: int, prefix: str, layout: Iterable[tuple[str, Codec]]) -> 
         if at > FD_SIZE:
             return
         match codec:
-            case Number():
+            case NumberField():
                 yield _Signal(
                     whole, command, bit, 8 * size, -codec.offset, codec.signed, codec.unit
                 )
-            case Numbers():
+            case NumberListField():
                 each = 8 * codec.each.size_bytes
                 for number in range(codec.count):
                     place = bit + number * each
                     yield _Signal(
                         f"{whole}_{number + 1}", command, place, each, unit=codec.each.unit
                     )
-            case Flags():
+            case FlagsField():
                 for flag in codec.names:
                     (text,) = flag_names(codec.names, flag)
                     place = bit + int(flag).bit_length() - 1

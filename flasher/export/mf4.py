@@ -14,7 +14,7 @@ from flasher.export.names import key
 from flasher.export.signals import Row
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
-from flasher.protocol.fields import Flags, flag_names
+from flasher.protocol.fields import FlagsField, flag_names
 from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.explain import WALL_TIME_FROM
 
@@ -69,7 +69,7 @@ def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
     codecs = dict(messages.ROWS[command].LAYOUT if item is None else item.content.LAYOUT)
     for shown in event.fields:
         name, codec = f"{prefix}.{shown.name}", codecs[shown.name]
-        if isinstance(codec, Flags):
+        if isinstance(codec, FlagsField):
             for bit in codec.names:
                 (text,) = flag_names(codec.names, bit)
                 yield f"{name}.{key(text)}", "", int(text in shown.value)

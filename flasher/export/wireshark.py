@@ -17,16 +17,16 @@ from flasher.protocol.bittime import frame_tables
 from flasher.protocol.catalogue import ITEMS, UPGRADE_COMMANDS, Item, answer_of
 from flasher.protocol.contents import Faults
 from flasher.protocol.fields import (
-    Address,
-    Bytes,
+    AddressField,
+    BytesField,
     Codec,
-    Constant,
+    ConstantField,
     DateField,
-    Flags,
-    Latin,
-    Number,
-    Numbers,
-    Reserved,
+    FlagsField,
+    LatinField,
+    NumberField,
+    NumberListField,
+    ReservedField,
     TextField,
     flag_names,
     label,
@@ -137,7 +137,7 @@ def _row(row: type[messages.Row]) -> dict[str, Any]:
 
 def _limits(codec: Codec) -> dict[str, Any]:
     match codec:
-        case Constant():
+        case ConstantField():
             return {"must_be": codec.expected}
         case messages.PacketNumber():
             return {"least": 1}
@@ -162,29 +162,29 @@ def _field(filter_name: str, name: str, codec: Codec) -> dict[str, Any]:
 def _kind(filter_name: str, codec: Codec) -> dict[str, Any]:
     """How the bytes of a field become its value."""
     match codec:
-        case Address():
+        case AddressField():
             return {"kind": "address"}
-        case Number():
+        case NumberField():
             return {"kind": "number", "offset": codec.offset, "signed": codec.signed}
-        case Numbers():
+        case NumberListField():
             return {"kind": "numbers", "each": codec.each.size_bytes}
-        case Flags():
+        case FlagsField():
             bits = [1 << bit for bit in range(8 * codec.size_bytes)]
             return {"kind": "flags", "none": codec.none, "bits": [_bit(codec, bit) for bit in bits]}
         case TextField() | DateField():
             return {"kind": "text"}
-        case Latin():
+        case LatinField():
             return {"kind": "latin"}
-        case Constant():
+        case ConstantField():
             return {"kind": "constant", "expected": codec.expected}
-        case Reserved():
+        case ReservedField():
             return {"kind": "reserved"}
-        case Bytes():
+        case BytesField():
             return {"kind": "bytes"}
     raise TypeError(f"{filter_name} has a codec that Wireshark is not told of: {codec}")
 
 
-def _bit(codec: Flags, mask: int) -> dict[str, Any]:
+def _bit(codec: FlagsField, mask: int) -> dict[str, Any]:
     (text,) = flag_names(codec.names, mask)
     return {"mask": mask, "name": key(text), "text": text}
 

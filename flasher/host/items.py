@@ -18,11 +18,11 @@ from flasher.protocol import catalogue
 from flasher.protocol.catalogue import Item
 from flasher.protocol.contents import Empty
 from flasher.protocol.fields import (
-    Bytes,
+    BytesField,
     Codec,
     Content,
     DateField,
-    Reserved,
+    ReservedField,
     label,
 )
 from flasher.protocol.spec import Dialect, Mode, Node, Target
@@ -63,7 +63,9 @@ class Writable:
 
 def meaningful_fields(content: type[Content]) -> tuple[tuple[str, Codec], ...]:
     """The fields of a content without the reserved ones."""
-    return tuple((name, codec) for name, codec in content.LAYOUT if not isinstance(codec, Reserved))
+    return tuple(
+        (name, codec) for name, codec in content.LAYOUT if not isinstance(codec, ReservedField)
+    )
 
 
 def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
@@ -160,7 +162,7 @@ def make_content(writable: Writable, values: Sequence[object]) -> Content:
 def _value(name: str, codec: Codec, value: object) -> Any:
     if isinstance(codec, DateField) and isinstance(value, str):
         return check_date(value)
-    if not isinstance(codec, Bytes) or not isinstance(value, str):
+    if not isinstance(codec, BytesField) or not isinstance(value, str):
         return value
     try:
         return bytes.fromhex(value.removeprefix("0x").replace(":", " "))

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from flasher.protocol.fields import (
-    Address,
+    AddressField,
     Bits,
-    Bytes,
+    BytesField,
     Content,
     DateField,
-    Flags,
-    Number,
-    Numbers,
+    FlagsField,
+    NumberField,
+    NumberListField,
     TextField,
     WireText,
     constant,
@@ -127,7 +127,7 @@ class RunningInformation(Content):
     full_capacity_mah: int = number(2, "mAh")
     cell_temperature_c: int = _temperature()
     state_of_charge_percent: int = number(1, "%")
-    status: Status = field(Flags(1, Status, none="no flag (00)"))
+    status: Status = field(FlagsField(1, Status, none="no flag (00)"))
     state_of_health_percent: int = number(1, "%")
     """0 may be an older device's, which does not know it (R22)."""
     reserved: bytes = reserved(4)
@@ -137,14 +137,14 @@ class RunningInformation(Content):
 class CellVoltages(Content):
     """Voltages of up to 16 cells; absent cells are 0."""
 
-    cells_mv: tuple[int, ...] = field(Numbers(CELLS, Number(2, "mV")))
+    cells_mv: tuple[int, ...] = field(NumberListField(CELLS, NumberField(2, "mV")))
 
 
 @dataclass(frozen=True)
 class Faults(Content):
     """Faults, sent every 200 ms while there are any."""
 
-    faults: Fault = field(Flags(4, Fault))
+    faults: Fault = field(FlagsField(4, Fault))
 
 
 @dataclass(frozen=True)
@@ -171,14 +171,14 @@ class VersionInformation(Content):
 class PhysicalId(Content):
     """Physical ID; a short one is filled up with 01 (R13)."""
 
-    physical_id: bytes = field(Bytes(12))
+    physical_id: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
 class CheckCode(Content):
     """Check code; what it is made of is not documented."""
 
-    check_code: bytes = field(Bytes(12))
+    check_code: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
@@ -241,14 +241,14 @@ class SerialNumber(Content):
 class ReadMemory(Content):
     """Which memory to read; `end` is exclusive (R5)."""
 
-    start: int = field(Address(4))
-    end: int = field(Address(4))
+    start: int = field(AddressField(4))
+    end: int = field(AddressField(4))
 
 
 @dataclass(frozen=True)
 class Memory(Content):
     """What the memory holds; FF beyond the end."""
 
-    start: int = field(Address(4))
-    end: int = field(Address(4))
-    content: bytes = field(Bytes(MEMORY_PIECE_SIZE))
+    start: int = field(AddressField(4))
+    end: int = field(AddressField(4))
+    content: bytes = field(BytesField(MEMORY_PIECE_SIZE))

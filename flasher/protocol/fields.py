@@ -47,7 +47,7 @@ class Codec(Protocol):
 
 
 @dataclass(frozen=True)
-class Number:
+class NumberField:
     """An integer, little-endian; the value is what is on the wire minus `offset`."""
 
     size_bytes: int
@@ -66,7 +66,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Address(Number):
+class AddressField(NumberField):
     """A place in memory, shown in hexadecimal."""
 
     def show(self, value: int) -> str:
@@ -74,11 +74,11 @@ class Address(Number):
 
 
 @dataclass(frozen=True)
-class Numbers:
+class NumberListField:
     """A row of integers of the same kind."""
 
     count: int
-    each: Number
+    each: NumberField
 
     @property
     def size_bytes(self) -> int:
@@ -117,7 +117,7 @@ _ABBREVIATIONS: Final = re.compile(r"\b(?:afe|mcu|mos)\b")
 
 
 @dataclass(frozen=True)
-class Flags:
+class FlagsField:
     """A set of named bits, little-endian; unknown bits are kept."""
 
     size_bytes: int
@@ -201,7 +201,7 @@ class DateField:
 
 
 @dataclass(frozen=True)
-class Latin:
+class LatinField:
     """Text that fills its field, one character a byte, whatever the bytes are."""
 
     size_bytes: int
@@ -218,7 +218,7 @@ class Latin:
 
 
 @dataclass(frozen=True)
-class Bytes:
+class BytesField:
     """Bytes without a meaning of their own, shown in hexadecimal."""
 
     size_bytes: int
@@ -235,7 +235,7 @@ class Bytes:
 
 
 @dataclass(frozen=True)
-class Constant:
+class ConstantField:
     """Text that is always the same; another one is kept and shown."""
 
     expected: bytes
@@ -257,7 +257,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Reserved(Bytes):
+class ReservedField(BytesField):
     """Reserved bytes: zero when we send, kept when we receive."""
 
 
@@ -284,17 +284,17 @@ def field(codec: Codec, **options: Any) -> Any:
 
 def number(size_bytes: int, unit: str = "", *, offset: int = 0, signed: bool = False) -> Any:
     """An integer field."""
-    return field(Number(size_bytes, unit, offset, signed))
+    return field(NumberField(size_bytes, unit, offset, signed))
 
 
 def constant(text: bytes) -> Any:
     """A text that is always the same."""
-    return field(Constant(text), default=text)
+    return field(ConstantField(text), default=text)
 
 
 def reserved(size_bytes: int) -> Any:
     """Reserved bytes, zero by default."""
-    return field(Reserved(size_bytes), default=bytes(size_bytes))
+    return field(ReservedField(size_bytes), default=bytes(size_bytes))
 
 
 @dataclass(frozen=True)
@@ -336,7 +336,7 @@ class Content:
         """Label, value and unit of every field, for people; reserved bytes only if not zero."""
         for name, codec in self.LAYOUT:
             value = getattr(self, name)
-            if not isinstance(codec, Reserved) or any(value):
+            if not isinstance(codec, ReservedField) or any(value):
                 yield label(name, codec), codec.show(value), codec.unit
 
 

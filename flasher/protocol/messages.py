@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import ClassVar, Final, Self
 
-from flasher.protocol.fields import Bytes, Codec, Constant, Latin, Number
+from flasher.protocol.fields import BytesField, Codec, ConstantField, LatinField, NumberField
 from flasher.protocol.spec import (
     END_OF_TRANSFER_MARK,
     PACKET_DATA_SIZE,
@@ -26,14 +26,14 @@ from flasher.protocol.wire import Message
 
 
 @dataclass(frozen=True)
-class PacketNumber(Number):
+class PacketNumber(NumberField):
     """The number of a packet, or of all of them: 1 or more."""
 
     size_bytes: int = 2
 
 
 @dataclass(frozen=True)
-class UpdateText(Latin):
+class UpdateText(LatinField):
     """A text that names a target."""
 
     KNOWN: ClassVar[frozenset[str]] = frozenset(each.update_text for each in TARGETS.values())
@@ -87,7 +87,7 @@ class _Row:
 
 
 def _struct_format(codec: Codec) -> str:
-    if isinstance(codec, Number):
+    if isinstance(codec, NumberField):
         return {1: "B", 2: "H", 4: "I"}[codec.size_bytes]
     return f"{codec.size_bytes}s"
 
@@ -99,7 +99,7 @@ class _Constant(_Row):
     DATA: ClassVar[bytes]
 
     def __init_subclass__(cls) -> None:
-        cls.LAYOUT = (("data", Constant(cls.DATA)),)
+        cls.LAYOUT = (("data", ConstantField(cls.DATA)),)
         super().__init_subclass__()
 
     def data(self) -> bytes:
@@ -116,7 +116,7 @@ class _Constant(_Row):
 class _Numbered(_Row):
     """A row that holds one packet number (little-endian, R4)."""
 
-    LAYOUT = (("number", Number(2)),)
+    LAYOUT = (("number", NumberField(2)),)
 
     number: int
 
@@ -152,7 +152,7 @@ class BootVersion(_Row):
 
     MODE = Mode.REPORT
     COMMAND = Command.BOOT_VERSION
-    LAYOUT = (("name", Latin(3)), ("version", Latin(6)))
+    LAYOUT = (("name", LatinField(3)), ("version", LatinField(6)))
 
     name: str
     version: str
@@ -177,7 +177,7 @@ class UpdateCommand(_Row):
 
     MODE = Mode.WRITE
     COMMAND = Command.UPDATE
-    LAYOUT = (("text", UpdateText(7)), ("size_bytes", Number(4, "B")))
+    LAYOUT = (("text", UpdateText(7)), ("size_bytes", NumberField(4, "B")))
 
     text: str
     size_bytes: int
@@ -210,10 +210,10 @@ class Packet(_Row):
     MODE = Mode.WRITE
     COMMAND = Command.PACKET
     LAYOUT = (
-        ("start", Constant(bytes((PACKET_START,)))),
+        ("start", ConstantField(bytes((PACKET_START,)))),
         ("number", PacketNumber()),
         ("total", PacketNumber()),
-        ("payload", Bytes(PACKET_DATA_SIZE)),
+        ("payload", BytesField(PACKET_DATA_SIZE)),
     )
 
     number: int

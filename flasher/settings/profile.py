@@ -34,7 +34,7 @@ from flasher.image.image import Image
 from flasher.image.plausible import Cpu
 from flasher.protocol.catalogue import Item
 from flasher.protocol.contents import Empty, VersionInformation
-from flasher.protocol.fields import Bytes, Content, TextField, WireText
+from flasher.protocol.fields import BytesField, Content, TextField, WireText
 from flasher.protocol.fields import field as wire_field
 from flasher.protocol.spec import (
     COMMAND_SIZE,
@@ -159,9 +159,9 @@ def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> ty
     return make_dataclass(
         "VersionAnswer",
         [
-            ("before", bytes, wire_field(Bytes(before_bytes))),
+            ("before", bytes, wire_field(BytesField(before_bytes))),
             ("firmware_version", WireText, wire_field(TextField(text_bytes))),
-            ("behind", bytes, wire_field(Bytes(behind_bytes))),
+            ("behind", bytes, wire_field(BytesField(behind_bytes))),
         ],
         bases=(VersionAnswer,),
         frozen=True,

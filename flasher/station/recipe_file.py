@@ -26,7 +26,7 @@ from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
 from flasher.image.plan import plan
 from flasher.image.release import Release, check_target
-from flasher.protocol.fields import Codec, Number
+from flasher.protocol.fields import Codec, NumberField
 from flasher.protocol.spec import Target
 from flasher.settings.manifest import manifest_path, read_release
 from flasher.settings.profile import Profile, load_profile
@@ -315,10 +315,10 @@ def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
         except ValueError as error:
             yield Fault(where, f"{error}.")
         else:
-            if isinstance(codec, Number) != (limit.expected is None):
+            if isinstance(codec, NumberField) != (limit.expected is None):
                 kind = (
                     "a number: give low or high"
-                    if isinstance(codec, Number)
+                    if isinstance(codec, NumberField)
                     else "no number: give expected"
                 )
                 yield Fault(where, f"{limit.field} is {kind}.")

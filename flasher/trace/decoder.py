@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple
 from flasher.protocol import catalogue, messages
 from flasher.protocol.bittime import fixed_bits, frame_bits
 from flasher.protocol.contents import Faults
-from flasher.protocol.fields import Bits, Content, Reserved, WireText, flag_names, label
+from flasher.protocol.fields import Bits, Content, ReservedField, WireText, flag_names, label
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, Dialect, Mode, Node, can_id
 from flasher.protocol.text import printable
@@ -228,7 +228,7 @@ def content_fields(content: Content) -> tuple[Field, ...]:
     fields = []
     for name, codec in content.LAYOUT:
         value = getattr(content, name)
-        if not isinstance(codec, Reserved) or any(value):
+        if not isinstance(codec, ReservedField) or any(value):
             shown = Field(name, _plain_value(value), label(name, codec), codec.show(value))
             said = remark(name, codec.unit, value)
             if said:

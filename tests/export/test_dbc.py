@@ -14,7 +14,7 @@ from cantools.database.can import Database
 from flasher.export.dbc import FD_SIZE, dbc, joined
 from flasher.export.names import key
 from flasher.protocol import catalogue, messages
-from flasher.protocol.fields import Content, Flags, Number, Numbers, flag_names
+from flasher.protocol.fields import Content, FlagsField, NumberField, NumberListField, flag_names
 from flasher.protocol.spec import BMS
 from flasher.protocol.wire import Message, encode
 from tests.cli.conftest import Flasher
@@ -51,11 +51,11 @@ def _sayable(title: str, content: Content) -> Iterator[tuple[str, int, int]]:
         value, whole = getattr(content, name), f"{key(title)}_{name}"
         at += codec.size_bytes
         match codec:
-            case Number():
+            case NumberField():
                 yield whole, value, at
-            case Numbers():
+            case NumberListField():
                 yield from ((f"{whole}_{n}", each, at) for n, each in enumerate(value, 1))
-            case Flags():
+            case FlagsField():
                 set_flags = flag_names(codec.names, value)
                 for flag in codec.names:
                     (text,) = flag_names(codec.names, flag)
@@ -100,7 +100,7 @@ def test_signals_have_the_units_of_the_fields(database: Database) -> None:
     for item in catalogue.ITEMS:
         for name, codec in item.content.LAYOUT:
             whole = f"{key(item.title)}_{name}"
-            if isinstance(codec, Number) and whole in signals:
+            if isinstance(codec, NumberField) and whole in signals:
                 assert (signals[whole] or "") == codec.unit
     assert signals["running_information_cell_temperature_c"] == "°C"
     assert all(message.is_fd for message in database.messages)

@@ -17,7 +17,7 @@ import pytest
 
 from flasher.export.names import key
 from flasher.protocol import catalogue, messages
-from flasher.protocol.fields import Codec, Constant, Flags, Numbers
+from flasher.protocol.fields import Codec, ConstantField, FlagsField, NumberListField
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, DIALECTS, HEADER, TARGETS, Dialect, Mode
 from flasher.protocol.text import printable
@@ -195,12 +195,12 @@ def expected_of(event: BusEvent) -> list[tuple[str, str]]:
         name = own.get(field.name, f"{key(event.title)}.{field.name}")
         codec = codecs[field.name]
         match codec:
-            case Constant():
+            case ConstantField():
                 text = printable(bytes.fromhex(field.value).decode("latin-1"))
                 found.append((name, text))
-            case Numbers():
+            case NumberListField():
                 found += [(name, str(value)) for value in field.value]
-            case Flags():
+            case FlagsField():
                 found += [(f"{name}.{key(bit)}", "set") for bit in field.value]
             case _:
                 found.append((name, str(field.value)))
@@ -227,7 +227,7 @@ def shown(item: Item) -> list[tuple[str, str]]:
     kind = item.one("kind")
     found = []
     flags = {name: codec for row in catalogue.ITEMS for name, codec in row.content.LAYOUT
-             if isinstance(codec, Flags)}  # fmt: skip
+             if isinstance(codec, FlagsField)}  # fmt: skip
     for field in item.fields:
         name = field.name.removeprefix("welling.")
         if not field.name.startswith("welling.") or name in _AROUND or name.startswith("expert"):

@@ -10,17 +10,17 @@ import pytest
 
 from flasher.protocol import fields
 from flasher.protocol.fields import (
-    Address,
+    AddressField,
     Bits,
-    Bytes,
+    BytesField,
     Codec,
-    Constant,
+    ConstantField,
     Content,
     DateField,
-    Flags,
-    Number,
-    Numbers,
-    Reserved,
+    FlagsField,
+    NumberField,
+    NumberListField,
+    ReservedField,
     TextField,
     WireText,
     flag_names,
@@ -53,29 +53,29 @@ class Sample(Content):
 @each(
     "codec, value, raw",
     [
-        (Number(1), 0, "00"),
-        (Number(1), 255, "FF"),
-        (Number(2), 0x1234, "34 12"),
-        (Number(4), 0x12345678, "78 56 34 12"),
-        (Number(2, signed=True), -1, "FF FF"),
-        (Number(2, signed=True), -2, "FE FF"),
-        (Number(2, signed=True), -32768, "00 80"),
-        (Number(2, signed=True), 32767, "FF 7F"),
-        (Number(1, offset=40), -40, "00"),
-        (Number(1, offset=40), 0, "28"),
-        (Number(1, offset=40), 215, "FF"),
-        (Address(4), 0x08004000, "00 40 00 08"),
-        (Numbers(3, Number(2)), (1, 2, 0x300), "01 00 02 00 00 03"),
-        (Flags(1, Lamp), Lamp.FRONT | Lamp.REAR_LEFT, "05"),
-        (Flags(2, Lamp), Lamp(0x8001), "01 80"),
+        (NumberField(1), 0, "00"),
+        (NumberField(1), 255, "FF"),
+        (NumberField(2), 0x1234, "34 12"),
+        (NumberField(4), 0x12345678, "78 56 34 12"),
+        (NumberField(2, signed=True), -1, "FF FF"),
+        (NumberField(2, signed=True), -2, "FE FF"),
+        (NumberField(2, signed=True), -32768, "00 80"),
+        (NumberField(2, signed=True), 32767, "FF 7F"),
+        (NumberField(1, offset=40), -40, "00"),
+        (NumberField(1, offset=40), 0, "28"),
+        (NumberField(1, offset=40), 215, "FF"),
+        (AddressField(4), 0x08004000, "00 40 00 08"),
+        (NumberListField(3, NumberField(2)), (1, 2, 0x300), "01 00 02 00 00 03"),
+        (FlagsField(1, Lamp), Lamp.FRONT | Lamp.REAR_LEFT, "05"),
+        (FlagsField(2, Lamp), Lamp(0x8001), "01 80"),
         (TextField(4), WireText(b"AB. "), "41 42 2E 20"),
         (TextField(4), WireText(b"ABCD"), "41 42 43 44"),
         (TextField(4), WireText(b"\x00\xff\x80."), "00 FF 80 2E"),
         (DateField(), WireText(b"20220512"), "32 30 32 32 30 35 31 32"),
-        (Bytes(2), b"\xa5\x5a", "A5 5A"),
-        (Reserved(2), b"\x00\x01", "00 01"),
-        (Constant(b"OK"), b"OK", "4F 4B"),
-        (Constant(b"OK"), b"KO", "4B 4F"),
+        (BytesField(2), b"\xa5\x5a", "A5 5A"),
+        (ReservedField(2), b"\x00\x01", "00 01"),
+        (ConstantField(b"OK"), b"OK", "4F 4B"),
+        (ConstantField(b"OK"), b"KO", "4B 4F"),
     ],
 )
 def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str) -> None:
@@ -88,16 +88,16 @@ def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str
 @each(
     "codec, value, refusal",
     [
-        (Number(1), 256, "256 does not fit 1 bytes"),
-        (Number(2), -1, "-1 does not fit 2 bytes"),
-        (Number(2, signed=True), 40000, "40000 does not fit 2 bytes"),
-        (Number(1, offset=40), 216, "216 does not fit 1 bytes"),
-        (Number(1, offset=40), -41, "-41 does not fit 1 bytes"),
-        (Address(4), -1, "-1 does not fit 4 bytes"),
-        (Numbers(3, Number(2)), (1, 2), "2 numbers, not 3"),
-        (Numbers(3, Number(2)), (1, 2, 65536), "65536 does not fit 2 bytes"),
-        (Flags(1, Lamp), 256, "256 does not fit 1 bytes"),
-        (Flags(1, Lamp), -1, "-1 does not fit 1 bytes"),
+        (NumberField(1), 256, "256 does not fit 1 bytes"),
+        (NumberField(2), -1, "-1 does not fit 2 bytes"),
+        (NumberField(2, signed=True), 40000, "40000 does not fit 2 bytes"),
+        (NumberField(1, offset=40), 216, "216 does not fit 1 bytes"),
+        (NumberField(1, offset=40), -41, "-41 does not fit 1 bytes"),
+        (AddressField(4), -1, "-1 does not fit 4 bytes"),
+        (NumberListField(3, NumberField(2)), (1, 2), "2 numbers, not 3"),
+        (NumberListField(3, NumberField(2)), (1, 2, 65536), "65536 does not fit 2 bytes"),
+        (FlagsField(1, Lamp), 256, "256 does not fit 1 bytes"),
+        (FlagsField(1, Lamp), -1, "-1 does not fit 1 bytes"),
         (TextField(4), "ABCD", "longer than 3 characters"),
         (TextField(4), "A.", "ends a field"),
         (TextField(4), WireText(b"ABCDE"), "5 bytes, not 4"),
@@ -106,9 +106,9 @@ def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str
         (DateField(), "2022O512", "is not YYYYMMDD"),
         (DateField(), "2022051\u0662", "is not YYYYMMDD"),
         (DateField(), WireText(b"20220512."), "9 bytes, not 8"),
-        (Bytes(2), b"\x00", "1 bytes, not 2"),
-        (Reserved(2), b"\x00\x00\x00", "3 bytes, not 2"),
-        (Constant(b"OK"), b"", "0 bytes, not 2"),
+        (BytesField(2), b"\x00", "1 bytes, not 2"),
+        (ReservedField(2), b"\x00\x00\x00", "3 bytes, not 2"),
+        (ConstantField(b"OK"), b"", "0 bytes, not 2"),
     ],
 )
 def test_a_codec_refuses_what_does_not_fit(codec: Codec, value: object, refusal: str) -> None:
@@ -119,13 +119,13 @@ def test_a_codec_refuses_what_does_not_fit(codec: Codec, value: object, refusal:
 @each(
     "codec, value, shown",
     [
-        (Number(2, "mA", signed=True), -1234, "-1234"),
-        (Address(4), 0x4000, "0x00004000"),
-        (Numbers(4, Number(2)), (3600, 0, 3601, 0), "3600 0 3601"),
-        (Numbers(4, Number(2)), (0, 0, 0, 0), "none"),
-        (Flags(1, Lamp), Lamp(0), "none"),
-        (Flags(1, Lamp, none="dark"), Lamp(0), "dark"),
-        (Flags(1, Lamp), Lamp(0x87), "front, reserved bit 1, rear left, reserved bit 7"),
+        (NumberField(2, "mA", signed=True), -1234, "-1234"),
+        (AddressField(4), 0x4000, "0x00004000"),
+        (NumberListField(4, NumberField(2)), (3600, 0, 3601, 0), "3600 0 3601"),
+        (NumberListField(4, NumberField(2)), (0, 0, 0, 0), "none"),
+        (FlagsField(1, Lamp), Lamp(0), "none"),
+        (FlagsField(1, Lamp, none="dark"), Lamp(0), "dark"),
+        (FlagsField(1, Lamp), Lamp(0x87), "front, reserved bit 1, rear left, reserved bit 7"),
         (TextField(8), WireText(b"AB.     "), "AB"),
         (TextField(8), WireText(b"ABCDEFGH"), "ABCDEFGH"),
         (TextField(8), WireText(b"AB      "), "AB"),
@@ -140,10 +140,10 @@ def test_a_codec_refuses_what_does_not_fit(codec: Codec, value: object, refusal:
         (DateField(), WireText(b"        "), ""),
         (DateField(), WireText(b"\x00\x1b[2J\xff\n\r"), r"\x00\x1b[2J\xff\n\r"),
         (DateField(), "2022051\u0662", r"2022051\u0662"),
-        (Bytes(3), b"\x00\xa5\xff", "00 a5 ff"),
-        (Constant(b"READY"), b"READY", "READY"),
-        (Constant(b"READY"), b"REA\x1bY", r"REA\x1bY (not READY)"),
-        (Constant(b"OK"), b"\xff\x00", r"\xff\x00 (not OK)"),
+        (BytesField(3), b"\x00\xa5\xff", "00 a5 ff"),
+        (ConstantField(b"READY"), b"READY", "READY"),
+        (ConstantField(b"READY"), b"REA\x1bY", r"REA\x1bY (not READY)"),
+        (ConstantField(b"OK"), b"\xff\x00", r"\xff\x00 (not OK)"),
     ],
 )
 def test_a_value_is_shown_without_harm(codec: Codec, value: object, shown: str) -> None:
@@ -151,7 +151,7 @@ def test_a_value_is_shown_without_harm(codec: Codec, value: object, shown: str) 
 
 
 def test_the_unit_of_a_row_of_numbers_is_that_of_each() -> None:
-    assert Numbers(16, Number(2, "mV")).unit == "mV"
+    assert NumberListField(16, NumberField(2, "mV")).unit == "mV"
 
 
 def test_the_names_of_flags_are_in_the_order_of_their_bits() -> None:
@@ -184,7 +184,7 @@ def test_text_reads_up_to_its_terminator_and_keeps_its_bytes() -> None:
 def test_a_label_leaves_out_the_unit_that_follows_the_value(
     name: str, unit: str, expected: str
 ) -> None:
-    assert label(name, Number(1, unit)) == expected
+    assert label(name, NumberField(1, unit)) == expected
 
 
 # -- declarations ---------------------------------------------------------------------------------
