@@ -29,7 +29,7 @@ from flasher.host.outcome import (
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
 from flasher.protocol.catalogue import ITEMS
-from flasher.protocol.contents import Fault
+from flasher.protocol.contents import BatteryFault
 from flasher.protocol.fields import flag_names, label
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
@@ -67,7 +67,7 @@ def sentences() -> Iterator[str]:
     yield from message_titles()
     for item in ITEMS:
         yield from (label(*each) for each in meaningful_fields(item.content))
-    yield from flag_names(Fault, sum(Fault))
+    yield from flag_names(BatteryFault, sum(BatteryFault))
     yield from ("label", *(word.value.lower() for word in Word))  # what a scan means
 
 

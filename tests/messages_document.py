@@ -27,7 +27,7 @@ from flasher.protocol.fields import (
     flag_names,
     label,
 )
-from flasher.protocol.messages import ROWS
+from flasher.protocol.messages import UPGRADE_MESSAGES
 from flasher.protocol.spec import DIALECTS, Node
 
 MESSAGES: Final = Path(__file__).parents[1] / "docs" / "reference" / "messages.md"
@@ -75,7 +75,7 @@ def _upgrade() -> Iterator[str]:
     yield "Between the tool (75x) and a device (7x5), in the order of"
     yield from ("[the upgrade](../explanation/upgrade.md).", "")
     yield from _table("message", "command", "mode", "what", "data")
-    for row in ROWS.values():
+    for row in UPGRADE_MESSAGES.values():
         title = _words(row.__name__)
         data = ", ".join(_part(name, codec) for name, codec in row.LAYOUT)
         command = f"{row.COMMAND:04X}"

@@ -110,7 +110,7 @@ def _messages() -> dict[int, tuple[list[_Signal], dict[int, str]]]:
     for item in ITEMS:
         add(item.can_id, item.command, item.title, item.content.LAYOUT)
     for target in TARGETS.values():
-        for command, row in messages.ROWS.items():
+        for command, row in messages.UPGRADE_MESSAGES.items():
             of_id = target.answer_id if row.MODE == Mode.REPORT else target.request_id
             add(of_id, command, TITLES[row], row.LAYOUT)
     return dict(sorted(found.items()))

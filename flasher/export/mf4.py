@@ -11,7 +11,7 @@ import numpy
 from asammdf import MDF, Signal
 
 from flasher.export.names import key
-from flasher.export.signals import Row
+from flasher.export.signals import UpgradeMessage
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import FlagsField, flag_names
@@ -33,7 +33,7 @@ class _Group:
     channels: dict[str, _Channel] = field(default_factory=dict)
 
 
-def write_mf4(rows: Iterable[Row], to: Path) -> int:
+def write_mf4(rows: Iterable[UpgradeMessage], to: Path) -> int:
     """Write the numbers and flags of all messages, a channel each; returns how many channels there
     are. Raises OSError.
     """
@@ -66,7 +66,9 @@ def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
     """Name, unit and value of what can be plotted."""
     prefix, command = key(event.title), event.command or 0
     item = BY_KEY.get((event.can_id, command))
-    codecs = dict(messages.ROWS[command].LAYOUT if item is None else item.content.LAYOUT)
+    codecs = dict(
+        messages.UPGRADE_MESSAGES[command].LAYOUT if item is None else item.content.LAYOUT
+    )
     for shown in event.fields:
         name, codec = f"{prefix}.{shown.name}", codecs[shown.name]
         if isinstance(codec, FlagsField):

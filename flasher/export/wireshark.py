@@ -41,8 +41,8 @@ _SCRIPT: Final = "welling.lua"
 _MARK: Final = "{} --[[ tables ]]"
 _LINE_MAX: Final = 96
 _LUA_WORDS: Final = frozenset({"and", "end", "false", "function", "in", "nil", "not", "or", "true"})
-_ANSWERS: Final[dict[type[messages.Row], tuple[type[messages.Row], ...]]] = {
-    messages.Reset: (messages.GeneralFeedback,),
+_ANSWERS: Final[dict[type[messages.UpgradeMessage], tuple[type[messages.UpgradeMessage], ...]]] = {
+    messages.ResetCommand: (messages.FeedbackMessage,),
     messages.UpdateCommand: (messages.RequestTransfer,),
     messages.Packet: (messages.Ack, messages.Nak),
     messages.EndOfTransfer: (messages.Complete, messages.Nak),
@@ -95,7 +95,7 @@ def _tables() -> dict[str, Any]:
         ],
         "commands": {command.name: command.value for command in spec.Command},
         "items": [_item(item) for item in ITEMS],
-        "rows": [_row(row) for row in messages.ROWS.values()],
+        "rows": [_row(row) for row in messages.UPGRADE_MESSAGES.values()],
         "titles": {kind.value: wording(kind) for kind in Kind},
         "reasons": {reason.name: reason.value for reason in DamageReason},
         "reason_texts": {reason.value: wording(reason) for reason in DamageReason},
@@ -119,7 +119,7 @@ def _item(item: Item) -> dict[str, Any]:
     }
 
 
-def _row(row: type[messages.Row]) -> dict[str, Any]:
+def _row(row: type[messages.UpgradeMessage]) -> dict[str, Any]:
     """A message of the upgrade: what its fields may be is a part of its form."""
     title = TITLES[row]
     return {

@@ -15,7 +15,7 @@ from typing import Final
 from flasher.host.query import Query, Request, ask_all, count_answers, tell_two_devices
 from flasher.host.runner import Came, Runner, Signal, Stage, watched
 from flasher.protocol import catalogue, messages
-from flasher.protocol.contents import Fault, Faults
+from flasher.protocol.contents import BatteryFault, Faults
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import MOTINOVA, WELLING, Command, Dialect, Node, can_id
@@ -159,7 +159,7 @@ class Survey(Runner[None]):
             title = _title(decoded.item)
             heard.last[title] = decoded.content
             if isinstance(decoded.content, Faults) and heard.node is Node.BMS:
-                before = Fault(0) if self._faults is None else self._faults.faults
+                before = BatteryFault(0) if self._faults is None else self._faults.faults
                 self._faults = Faults(before | decoded.content.faults)
         elif found.command in _UPGRADE:
             row = messages.decode(found)

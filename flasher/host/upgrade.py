@@ -35,20 +35,20 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Malformed,
     Nak,
     RequestTransfer,
-    Row,
     Unknown,
     UpdateCommand,
+    UpgradeMessage,
     decode,
 )
 from flasher.protocol.spec import BOOT_VERSION_BURST, Command, Mode
 from flasher.protocol.text import boot_version_number, printable
 from flasher.protocol.wire import Damage, Message, encode, split
 
-Received = Row | Malformed | Unknown | Content | None
+Received = UpgradeMessage | Malformed | Unknown | Content | None
 """The message behind an event; None for a timer or the user's word."""
 
 _EVENTS: Final[dict[type, Event]] = {
@@ -57,7 +57,7 @@ _EVENTS: Final[dict[type, Event]] = {
     BootVersion: Event.BOOT_VERSION,
     RequestTransfer: Event.REQUEST,
     Complete: Event.COMPLETE,
-    GeneralFeedback: Event.FEEDBACK,
+    FeedbackMessage: Event.FEEDBACK,
 }
 """The events of messages; all others are unexpected."""
 _PHASES: Final = {
@@ -397,7 +397,7 @@ class UpgradeStage:
 
     # -- what is sent, and the timers that start when it has left ---------------------------------
 
-    def _send(self, row: Row, not_before: float = 0.0) -> None:
+    def _send(self, row: UpgradeMessage, not_before: float = 0.0) -> None:
         request_id = self._plan.target.request_id
         frames = split(request_id, encode(row.to_message(request_id)))
         self._timer_at = inf
@@ -590,7 +590,7 @@ class UpgradeStage:
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + self._burst_s)
 
-    def _watch_on(self, row: BootVersion | GeneralFeedback) -> None:
+    def _watch_on(self, row: BootVersion | FeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at
         if isinstance(row, BootVersion) and self._is_foreign(row):
             self._end(Ending.WRONG_DEVICE, row)

@@ -21,10 +21,10 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import (
@@ -138,7 +138,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
     host.add(
         row.to_message(target.request_id)
         for row in (
-            Reset(),
+            ResetCommand(),
             UpdateCommand(target.update_text, image.size_bytes),
             EndOfTransfer(),
         )
@@ -147,7 +147,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
     device.add(
         row.to_message(target.answer_id)
         for row in (
-            GeneralFeedback(),
+            FeedbackMessage(),
             BootVersion(target.boot_name, _NOMINAL_BOOT_VERSION),
             RequestTransfer(),
             Complete(),

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from flasher.protocol.contents import CELLS, Status
+from flasher.protocol.contents import CELLS, BatteryStatus
 
 CELLS_FITTED: Final = 10
 DESIGN_CAPACITY_MAH: Final = 10_000
@@ -48,7 +48,7 @@ class Reading:
     current_ma: int
     remaining_mah: int
     temperature_c: int
-    status: Status
+    status: BatteryStatus
     cells_mv: tuple[int, ...]
     """One voltage for each cell that the messages have room for; absent cells are 0."""
 
@@ -77,7 +77,7 @@ class Battery:
             self._began_at = now
         elapsed_s = now - self._began_at
         if self._use == "resting":
-            return self._reading(elapsed_s, RESTING_CURRENT_MA, _RIDES_FROM, 0.0, Status(0))
+            return self._reading(elapsed_s, RESTING_CURRENT_MA, _RIDES_FROM, 0.0, BatteryStatus(0))
         at_s = (elapsed_s + _FIRST_RIDE_AT_S) % (_RIDE_S + _CHARGE_S)
         share = _RIDES_FROM - _RIDES_TO
         if at_s < _RIDE_S:
@@ -88,14 +88,19 @@ class Battery:
             used_s = at_s + _SWAY * _SWAY_S / (2 * math.pi) * (1 - math.cos(phase))
             charge = _RIDES_FROM - share * used_s / _RIDE_S
             warmth = math.sin(math.pi * at_s / _RIDE_S)
-            return self._reading(elapsed_s, current_ma, charge, warmth, Status(0))
+            return self._reading(elapsed_s, current_ma, charge, warmth, BatteryStatus(0))
         charging_s = at_s - _RIDE_S
         current_ma = share * FULL_CAPACITY_MAH * 3600 / _CHARGE_S
         charge = _RIDES_TO + share * charging_s / _CHARGE_S
-        return self._reading(elapsed_s, current_ma, charge, 0.0, Status.CHARGER_CONNECTED)
+        return self._reading(elapsed_s, current_ma, charge, 0.0, BatteryStatus.CHARGER_CONNECTED)
 
     def _reading(
-        self, elapsed_s: float, current_ma: float, charge: float, warmth: float, status: Status
+        self,
+        elapsed_s: float,
+        current_ma: float,
+        charge: float,
+        warmth: float,
+        status: BatteryStatus,
     ) -> Reading:
         open_mv = _EMPTY_CELL_MV + (_FULL_CELL_MV - _EMPTY_CELL_MV) * charge
         cell_mv = open_mv + _CELL_RESISTANCE_OHM * current_ma

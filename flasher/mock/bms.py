@@ -24,7 +24,7 @@ from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import MemoryMap
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
-from flasher.protocol.contents import CheckCode, Fault, PhysicalId, ProductionInformation
+from flasher.protocol.contents import BatteryFault, CheckCode, PhysicalId, ProductionInformation
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.spec import (
     DIALECTS,
@@ -108,7 +108,7 @@ class BmsApplication(Application):
         super().__init__(Node.BMS, DIALECTS[profile.dialect])
         self.profile = profile
         self.battery = Battery(profile.battery_use, profile.battery_seed)
-        self.faults = Fault(profile.faults)
+        self.faults = BatteryFault(profile.faults)
         self.kept = _factory_settings(profile)
         self._memory = memory
         self._firmware = ""
@@ -165,7 +165,7 @@ class BmsApplication(Application):
 
     # -- what happens to it -----------------------------------------------------------------------
 
-    def set_faults(self, faults: Fault, now: float) -> None:
+    def set_faults(self, faults: BatteryFault, now: float) -> None:
         """These faults are set from now on, and no other."""
         self.faults = faults
         if not faults:

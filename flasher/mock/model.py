@@ -48,7 +48,7 @@ from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
 """Firmware text of an application in whose image no version was found."""
-AnyRow = messages.Row | messages.Malformed | messages.Unknown
+AnyRow = messages.UpgradeMessage | messages.Malformed | messages.Unknown
 """A message as the bootloader takes it."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 _DEAF: Final = frozenset((State.OFF, State.RESTARTING))
@@ -250,7 +250,7 @@ class MockDevice(Machine):
         if self.state is State.APPLICATION:
             return _in_application(row)
         match row:
-            case messages.Reset():
+            case messages.ResetCommand():
                 announces = self.state is State.ANNOUNCING
                 profile = self.profile
                 choice = profile.reset_in_bootloader if announces else profile.reset_in_transfer
@@ -347,7 +347,7 @@ class MockDevice(Machine):
 
     def _send_feedback(self, now: float) -> str:
         if self.profile.upgrade_in_application == "general_feedback":
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         return ""
 
     def _answer(self, now: float) -> str:
@@ -356,7 +356,7 @@ class MockDevice(Machine):
         return ""
 
     def _confirm_reset(self, now: float) -> str:
-        self._send(messages.GeneralFeedback())
+        self._send(messages.FeedbackMessage())
         self._await_restart(now)
         return "reset"
 
@@ -426,7 +426,7 @@ class MockDevice(Machine):
     def _request(self, now: float) -> str:
         return self._reply(messages.RequestTransfer(), now)
 
-    def _reply(self, row: messages.Row | None, now: float) -> str:
+    def _reply(self, row: messages.UpgradeMessage | None, now: float) -> str:
         """Answer, or say nothing, and wait for what the host sends next."""
         if row is not None:
             self._send(row)
@@ -509,7 +509,7 @@ class MockDevice(Machine):
             vars(self).pop(name, None)
         return ""
 
-    def _send(self, row: messages.Row) -> None:
+    def _send(self, row: messages.UpgradeMessage) -> None:
         """Send one of the upgrade's messages to the tool."""
         self.send(row.to_message(self.target.answer_id))
 
@@ -517,7 +517,7 @@ class MockDevice(Machine):
 def _in_application(row: AnyRow) -> Event:
     """The event that a message to the running application is."""
     match row:
-        case messages.Reset():
+        case messages.ResetCommand():
             return Event.RESET
         case messages.UpdateCommand() | messages.Packet() | messages.EndOfTransfer():
             return Event.UPGRADE_IN_APPLICATION

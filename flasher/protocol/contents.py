@@ -34,13 +34,13 @@ def _temperature() -> Any:
     return number(1, "°C", offset=TEMPERATURE_OFFSET_C)
 
 
-class Status(Bits):
+class BatteryStatus(Bits):
     """Status bits of the running information; 0 may mean asleep, or awake without charger (R21)."""
 
     CHARGER_CONNECTED = 0x01
 
 
-class Fault(Bits):
+class BatteryFault(Bits):
     """Faults: warnings in the upper half, protections and defects in the lower (5.1). The document
     has nothing on the other bits, and does not reserve them (R24).
     """
@@ -127,7 +127,7 @@ class RunningInformation(Content):
     full_capacity_mah: int = number(2, "mAh")
     cell_temperature_c: int = _temperature()
     state_of_charge_percent: int = number(1, "%")
-    status: Status = field(FlagsField(1, Status, none="no flag (00)"))
+    status: BatteryStatus = field(FlagsField(1, BatteryStatus, none="no flag (00)"))
     state_of_health_percent: int = number(1, "%")
     """0 may be an older device's, which does not know it (R22)."""
     reserved: bytes = reserved(4)
@@ -144,7 +144,7 @@ class CellVoltages(Content):
 class Faults(Content):
     """Faults, sent every 200 ms while there are any."""
 
-    faults: Fault = field(FlagsField(4, Fault))
+    faults: BatteryFault = field(FlagsField(4, BatteryFault))
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _UpgradeMessage:
     """What all rows share: their mode and command, and the way to a message."""
 
     MODE: ClassVar[Mode]
@@ -93,7 +93,7 @@ def _struct_format(codec: Codec) -> str:
 
 
 @dataclass(frozen=True)
-class _Constant(_Row):
+class _Constant(_UpgradeMessage):
     """A row whose data never change."""
 
     DATA: ClassVar[bytes]
@@ -113,7 +113,7 @@ class _Constant(_Row):
 
 
 @dataclass(frozen=True)
-class _Numbered(_Row):
+class _Numbered(_UpgradeMessage):
     """A row that holds one packet number (little-endian, R4)."""
 
     LAYOUT = (("number", NumberField(2)),)
@@ -129,7 +129,7 @@ class _Numbered(_Row):
 
 
 @dataclass(frozen=True)
-class Reset(_Constant):
+class ResetCommand(_Constant):
     """Tool to application: restart into the bootloader."""
 
     MODE = Mode.WRITE
@@ -138,7 +138,7 @@ class Reset(_Constant):
 
 
 @dataclass(frozen=True)
-class GeneralFeedback(_Constant):
+class FeedbackMessage(_Constant):
     """Application to tool: the write was received."""
 
     MODE = Mode.REPORT
@@ -147,7 +147,7 @@ class GeneralFeedback(_Constant):
 
 
 @dataclass(frozen=True)
-class BootVersion(_Row):
+class BootVersion(_UpgradeMessage):
     """Bootloader to tool: who it is. Texts are kept as received, well formed or not (SE-02)."""
 
     MODE = Mode.REPORT
@@ -172,7 +172,7 @@ class BootVersion(_Row):
 
 
 @dataclass(frozen=True)
-class UpdateCommand(_Row):
+class UpdateCommand(_UpgradeMessage):
     """Tool to bootloader: prepare for an image of `size_bytes`; the text names the target."""
 
     MODE = Mode.WRITE
@@ -204,7 +204,7 @@ class RequestTransfer(_Constant):
 
 
 @dataclass(frozen=True)
-class Packet(_Row):
+class Packet(_UpgradeMessage):
     """Tool to bootloader: packet `number` of `total`, 128 bytes of the image."""
 
     MODE = Mode.WRITE
@@ -267,9 +267,9 @@ class Complete(_Constant):
     DATA = b"\x00\x00"
 
 
-Row = (
-    Reset
-    | GeneralFeedback
+UpgradeMessage = (
+    ResetCommand
+    | FeedbackMessage
     | BootVersion
     | UpdateCommand
     | RequestTransfer
@@ -280,11 +280,11 @@ Row = (
     | Complete
 )
 
-ROWS: Final[dict[int, type[Row]]] = {
+UPGRADE_MESSAGES: Final[dict[int, type[UpgradeMessage]]] = {
     row.COMMAND: row
     for row in (
-        Reset,
-        GeneralFeedback,
+        ResetCommand,
+        FeedbackMessage,
         BootVersion,
         UpdateCommand,
         RequestTransfer,
@@ -298,9 +298,9 @@ ROWS: Final[dict[int, type[Row]]] = {
 """Every row, by its command."""
 
 
-def decode(message: Message) -> Row | Malformed | Unknown:
+def decode(message: Message) -> UpgradeMessage | Malformed | Unknown:
     """The typed form of an intact message. Never raises."""
-    row = ROWS.get(message.command)
+    row = UPGRADE_MESSAGES.get(message.command)
     if row is None:
         return Unknown(message)
     if message.mode != row.MODE:

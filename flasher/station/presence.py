@@ -16,7 +16,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     BootVersion,
     Complete,
-    GeneralFeedback,
+    FeedbackMessage,
     RequestTransfer,
     decode,
 )
@@ -138,7 +138,7 @@ class TargetWatcher:
                 self.version = printable(version)
             case RequestTransfer():
                 self.transfer_requests += 1
-            case GeneralFeedback():
+            case FeedbackMessage():
                 self.confirmations += 1
             case Complete():
                 self.completions += 1

@@ -121,9 +121,9 @@ ROUTES: Final = {
 _TO_DEVICE: Final = frozenset(target.request_id for target in TARGETS.values())
 _TO_TOOL: Final = frozenset(target.answer_id for target in TARGETS.values())
 
-TITLES: Final[dict[type[messages.Row], str]] = {
-    messages.Reset: "reset",
-    messages.GeneralFeedback: "general feedback",
+TITLES: Final[dict[type[messages.UpgradeMessage], str]] = {
+    messages.ResetCommand: "reset",
+    messages.FeedbackMessage: "general feedback",
     messages.BootVersion: "boot version",
     messages.UpdateCommand: "update command",
     messages.RequestTransfer: "request transfer",
@@ -247,7 +247,7 @@ def remark(name: str, unit: str, value: object) -> str:
     return _OLDER if name == _HEALTH and value == 0 else ""
 
 
-def _row_fields(row: messages.Row) -> tuple[Field, ...]:
+def _row_fields(row: messages.UpgradeMessage) -> tuple[Field, ...]:
     """The fields of a message of the upgrade."""
     values = vars(row)
     return tuple(

@@ -31,7 +31,10 @@ def test_an_item_is_read_by_its_name(dialect: Dialect) -> None:
     answer = wire_to(Battery()).device(dialect=dialect).read("running-information")
     assert isinstance(answer, contents.RunningInformation)
     assert (answer.voltage_mv, answer.mean_current_ma) == (36_000, -1000)
-    assert (answer.cell_temperature_c, answer.status) == (25, contents.Status.CHARGER_CONNECTED)
+    assert (answer.cell_temperature_c, answer.status) == (
+        25,
+        contents.BatteryStatus.CHARGER_CONNECTED,
+    )
 
 
 def test_a_sleeping_device_that_misses_the_first_messages_is_read_all_the_same() -> None:
@@ -225,7 +228,8 @@ def test_info_hears_faults() -> None:
     found = wire_to(Battery(repeats=(FAULTS,))).device().identify()
     assert found.survey.faults is not None
     assert found.survey.faults.faults == (
-        contents.Fault.SHORT_CIRCUIT_PROTECTION | contents.Fault.CHARGE_OVER_VOLTAGE_WARNING
+        contents.BatteryFault.SHORT_CIRCUIT_PROTECTION
+        | contents.BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
     )
 
 

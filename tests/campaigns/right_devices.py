@@ -49,7 +49,7 @@ class _ConfirmsUnknown(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
         is_write = isinstance(row, messages.Unknown) and row.message.mode == Mode.WRITE
         if is_write and self.state in _BOOTLOADER:
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 
 
@@ -59,7 +59,7 @@ class _ConfirmsAll(_ConfirmsUnknown):
     def _take_row(self, row: AnyRow, now: float) -> None:
         upgrade = messages.UpdateCommand | messages.Packet | messages.EndOfTransfer
         if isinstance(row, upgrade) and self.state in _BOOTLOADER:
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 
 

@@ -117,7 +117,7 @@ class Confirming(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if self.state is not State.APPLICATION:
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 
     def _acknowledge(self, now: float) -> str:

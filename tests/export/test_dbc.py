@@ -88,7 +88,7 @@ def test_every_message_is_decoded_as_flasher_decodes_it(
     ],
 )  # fmt: skip
 def test_messages_of_the_upgrade_are_decoded(
-    database: Database, row: messages.Row, can_id: int, expected: dict[str, int]
+    database: Database, row: messages.UpgradeMessage, can_id: int, expected: dict[str, int]
 ) -> None:
     assert _decoded(database, row.to_message(can_id)) == expected
 

@@ -22,14 +22,14 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Malformed,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     Unknown,
     UpdateCommand,
+    UpgradeMessage,
     decode,
 )
 from flasher.protocol.spec import BMS, WELLING, Target
@@ -37,7 +37,7 @@ from flasher.protocol.wire import Message, Reassembler, encode, split
 from tests.firmware import VECTORS
 
 BOOT = BootVersion("BMS", "V1.2.3")
-SentRow = TypeVar("SentRow", bound=Row | Message)
+SentRow = TypeVar("SentRow", bound=UpgradeMessage | Message)
 """What the host sends: rows of the upgrade, and queries of chapter 3 as they are on the wire."""
 
 
@@ -47,7 +47,7 @@ def image_of(size_bytes: int, seed: int = 1) -> Image:
     return Image.from_bytes(data[:size_bytes])
 
 
-def answer_frames(row: Row, target: Target = BMS) -> list[Frame]:
+def answer_frames(row: UpgradeMessage, target: Target = BMS) -> list[Frame]:
     """A message of the device as CAN frames."""
     return split(target.answer_id, encode(row.to_message(target.answer_id)))
 
@@ -68,7 +68,7 @@ class Bench:
         self.now = 100.0
         self.engine = Upgrade(plan(self.image, target, WELLING.bitrate_bps), options)
         self.events: list[object] = []
-        self.sent: list[tuple[float, Row | Message]] = []
+        self.sent: list[tuple[float, UpgradeMessage | Message]] = []
         """Every message that has left the host, with the time at which its last frame had."""
         self.on_frame: Callable[[int], None] | None = None
         """Called with the number of frames sent so far, before the engine is told of each."""
@@ -105,7 +105,7 @@ class Bench:
         return row
 
     @property
-    def unread(self) -> list[Row | Message]:
+    def unread(self) -> list[UpgradeMessage | Message]:
         """What the host has sent and no `expect` has taken."""
         return [row for _, row in self.sent[self._read :]]
 
@@ -129,7 +129,7 @@ class Bench:
 
     # -- the device ------------------------------------------------------------------------------
 
-    def say(self, *rows: Row | Message) -> None:
+    def say(self, *rows: UpgradeMessage | Message) -> None:
         """The device sends messages now, in no time."""
         for row in rows:
             message = row if isinstance(row, Message) else row.to_message(self.target.answer_id)
@@ -140,8 +140,8 @@ class Bench:
 
     def to_boot(self) -> None:
         """Up to the boot version, which is not announced yet."""
-        self.expect(Reset)
-        self.say(GeneralFeedback())
+        self.expect(ResetCommand)
+        self.say(FeedbackMessage())
 
     def to_request(self) -> None:
         """Up to the update command, which is not answered yet."""

@@ -21,11 +21,11 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     RequestTransfer,
-    Row,
     UpdateCommand,
+    UpgradeMessage,
 )
 from tests.host.bench import Bench
 
@@ -38,7 +38,7 @@ rows = st.one_of(
     st.just(BootVersion("BMS", "V1.2.3")),
     st.just(RequestTransfer()),
     st.just(Complete()),
-    st.just(GeneralFeedback()),
+    st.just(FeedbackMessage()),
 )
 frames = st.builds(
     Frame,
@@ -56,10 +56,10 @@ script = st.lists(st.tuples(pauses, st.one_of(rows, rows, rows, frames)), max_si
 @given(script)
 @settings(max_examples=200, deadline=None, derandomize=True)
 def test_the_host_ends_explicitly_whatever_the_device_says(
-    steps: list[tuple[float, Row | Frame]],
+    steps: list[tuple[float, UpgradeMessage | Frame]],
 ) -> None:
     bench = Bench(300, options=UpgradeOptions(timeout_s=TIMEOUT_S, attempts=2))
-    said: list[tuple[float, Row]] = []
+    said: list[tuple[float, UpgradeMessage]] = []
     for pause_s, what in steps:
         bench.wait(pause_s)
         if isinstance(what, Frame):
@@ -74,7 +74,7 @@ def test_the_host_ends_explicitly_whatever_the_device_says(
     _watch_update_commands(bench, said)
 
 
-def _watch_update_commands(bench: Bench, said: list[tuple[float, Row]]) -> None:
+def _watch_update_commands(bench: Bench, said: list[tuple[float, UpgradeMessage]]) -> None:
     commands = [at for at, row in bench.sent if isinstance(row, UpdateCommand)]
     asking = [at for at, row in said if isinstance(row, BootVersion | RequestTransfer)]
     assert len(commands) <= len(asking)
@@ -90,7 +90,7 @@ def _watch_update_commands(bench: Bench, said: list[tuple[float, Row]]) -> None:
 @given(script, st.booleans(), st.integers(1, 2))
 @settings(max_examples=100, deadline=None, derandomize=True)
 def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application(
-    steps: list[tuple[float, Row | Frame]],
+    steps: list[tuple[float, UpgradeMessage | Frame]],
     at_power_up: bool,
     attempts: int,
 ) -> None:
@@ -99,7 +99,7 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
         timeout_s=120.0, attempts=attempts, in_session=True, at_power_up=at_power_up
     )
     bench = Bench(300, options=options)
-    said: list[tuple[float, Row]] = []
+    said: list[tuple[float, UpgradeMessage]] = []
     for pause_s, what in steps:
         bench.wait(pause_s)
         if not isinstance(what, Frame):
@@ -120,14 +120,14 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
     assert len(unheard(0.0)) <= bench.outcome.sent_into_silence <= len(unheard(leaving_s))
     for at in unheard(0.0):
         if at == commands[0]:
-            assert GeneralFeedback() not in [row for said_at, row in said if said_at < at]
+            assert FeedbackMessage() not in [row for said_at, row in said if said_at < at]
 
 
 @pytest.mark.slow
 @given(st.lists(rows, min_size=1, max_size=6))
 @settings(max_examples=40, deadline=None, derandomize=True)
 def test_memory_and_time_are_bounded_when_a_device_repeats_itself_for_ever(
-    babble: list[Row],
+    babble: list[UpgradeMessage],
 ) -> None:
     """SE-01: endless valid messages of no use."""
     bench = Bench(300, options=UpgradeOptions(timeout_s=5.0))

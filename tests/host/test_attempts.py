@@ -10,11 +10,11 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.timing import Timings
@@ -55,7 +55,7 @@ def test_a_packet_that_is_refused_to_the_last_try_begins_another_attempt() -> No
         if bench.engine.state is State.RESETTING:
             break
         bench.expect(Packet)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
 
 
 def test_the_last_attempt_ends_with_the_packet() -> None:
@@ -93,8 +93,8 @@ def test_an_adapter_that_is_back_before_the_update_command_begins_again() -> Non
     bench = Bench(options=options(3))
     bench.to_boot()
     bench.engine.link_back(bench.now)
-    bench.expect(Reset)
-    bench.say(GeneralFeedback(), BOOT)
+    bench.expect(ResetCommand)
+    bench.say(FeedbackMessage(), BOOT)
     bench.expect(UpdateCommand)
     assert bench.seen(events.AttemptStarted)
 
@@ -126,7 +126,7 @@ def test_a_packet_in_flight_that_is_not_answered_after_all_begins_again() -> Non
     bench.to_packet(2)
     bench.engine.link_back(bench.now)
     bench.expect(Packet)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     assert bench.seen(events.AttemptStarted)
 
 
@@ -212,7 +212,7 @@ def lose_request(bench: Bench) -> None:
     bench.to_request()
     bench.wait(10.01)
     while bench.engine.state is State.RESETTING:
-        bench.expect(Reset)
+        bench.expect(ResetCommand)
         bench.wait(0.2)
 
 
@@ -259,7 +259,7 @@ def test_a_device_that_answers_the_reset_is_reset_again_and_not_told_to_update()
     bench.to_request()
     bench.wait(10.01)
     bench.to_boot()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
 
 
 def test_the_deadline_counts_all_attempts_together() -> None:

@@ -17,13 +17,13 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     UpdateCommand,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.protocol.text import encode_text
@@ -99,7 +99,7 @@ def test_a_doubled_nak_counts_once() -> None:
 def test_general_feedback_after_the_end_is_ignored() -> None:
     bench = Bench(200)
     bench.to_end()
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     bench.wait(1.0)
     assert bench.unread == []
     assert bench.complete().ok
@@ -422,7 +422,7 @@ def test_cancelling_in_the_middle_of_a_message_finishes_the_message() -> None:
     ],
 )
 def test_a_message_finished_after_the_users_word_counts_for_the_state_of_the_device(
-    stage: str, kind: type[Row], left: DeviceLeft
+    stage: str, kind: type[UpgradeMessage], left: DeviceLeft
 ) -> None:
     bench = Bench(100)
     if stage == "boot":
@@ -471,6 +471,6 @@ def test_what_arrives_after_the_end_is_not_looked_at() -> None:
 
 def test_the_outcome_cannot_be_read_before_there_is_one() -> None:
     bench = Bench(200)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     with pytest.raises(RuntimeError, match="not ended"):
         _ = bench.engine.outcome

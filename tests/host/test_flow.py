@@ -19,10 +19,10 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
@@ -39,8 +39,8 @@ def test_a_right_device_is_upgraded_with_every_message_once(
     target: Target, boot_name: str, text: str
 ) -> None:
     bench = Bench(300, target=target)
-    bench.expect(Reset)
-    bench.say(GeneralFeedback())
+    bench.expect(ResetCommand)
+    bench.say(FeedbackMessage())
     bench.say(BootVersion(boot_name, "V1.2.3"))
     assert bench.expect(UpdateCommand) == UpdateCommand(text, 300)
     bench.say(RequestTransfer())
@@ -84,7 +84,7 @@ def test_the_phases_and_packets_are_reported_in_order() -> None:
 def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
     bench = Bench()
     bench.wait(3.0)
-    resets = [at for at, row in bench.sent if isinstance(row, Reset)]
+    resets = [at for at, row in bench.sent if isinstance(row, ResetCommand)]
     assert len(resets) == 5
     gaps = [later - earlier for earlier, later in pairwise(resets)]
     assert gaps == pytest.approx([0.2] * 4, abs=0.003)
@@ -93,8 +93,8 @@ def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
 
 def test_reset_stops_at_general_feedback() -> None:
     bench = Bench()
-    bench.expect(Reset)
-    bench.say(GeneralFeedback())
+    bench.expect(ResetCommand)
+    bench.say(FeedbackMessage())
     bench.wait(1.5)
     assert bench.unread == []
 
@@ -102,7 +102,7 @@ def test_reset_stops_at_general_feedback() -> None:
 def test_a_boot_version_without_general_feedback_is_answered() -> None:
     """RS-06, and a device that sits in its bootloader already."""
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.say(BOOT)
     assert bench.expect(UpdateCommand).size_bytes == 300
 
@@ -139,9 +139,9 @@ def test_the_boot_version_may_come_up_to_five_seconds_after_the_reset(
 ) -> None:
     """TM-01."""
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     left_at = bench.sent[-1][0]
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     bench.wait(left_at + 5.0 + late_s - bench.now)
     if answered:
         bench.say(BOOT)

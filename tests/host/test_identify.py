@@ -10,7 +10,7 @@ from flasher.host.twins import LISTENS_ON_S
 from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.bittime import frame_bits
-from flasher.protocol.contents import RunningInformation, Status, VersionInformation
+from flasher.protocol.contents import BatteryStatus, RunningInformation, VersionInformation
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
@@ -21,7 +21,7 @@ from tests.host.bench import answer_frames, image_of
 from tests.loops import each
 
 VERSION, RUNNING = (0x720, 0x1540), (0x720, 0x1010)
-BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
+BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, BatteryStatus(0), 98, bytes(4))
 
 
 def version(serial: str = "W1", firmware: str = "V1r0r0_20220512") -> VersionInformation:

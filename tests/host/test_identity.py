@@ -21,7 +21,7 @@ from flasher.host.table import Ending
 from flasher.image.image import Image
 from flasher.image.plausible import Cpu
 from flasher.image.release import Release
-from flasher.protocol.contents import RunningInformation, Status, VersionInformation
+from flasher.protocol.contents import BatteryStatus, RunningInformation, VersionInformation
 from flasher.protocol.fields import WireText
 from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.protocol.text import encode_text
@@ -32,7 +32,7 @@ from tests.loops import each
 NEW, OLD = "V2r0r1_20260102", "V1r0r0_20220512"
 IMAGE = replace(Image.from_bytes(VECTORS + bytes(64) + NEW.encode()), version=NEW)
 NAMELESS = Image.from_bytes(VECTORS + bytes(64))
-BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
+BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, BatteryStatus(0), 98, bytes(4))
 
 
 def release(**stated: object) -> Release:

@@ -14,11 +14,11 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import BMS, WELLING
@@ -35,8 +35,8 @@ ERASE_S = DEFAULT_TIMINGS.request_transfer_timeout_s
 def resets(bench: Bench) -> int:
     """Take all resets that were sent."""
     count = 0
-    while bench.unread and isinstance(bench.unread[0], Reset):
-        bench.expect(Reset)
+    while bench.unread and isinstance(bench.unread[0], ResetCommand):
+        bench.expect(ResetCommand)
         count += 1
     return count
 
@@ -122,8 +122,8 @@ def test_an_application_that_answers_the_reset_is_never_told_to_update_unasked(
     options: UpgradeOptions,
 ) -> None:
     bench = Bench(options=options)
-    bench.expect(Reset)
-    bench.say(GeneralFeedback())
+    bench.expect(ResetCommand)
+    bench.say(FeedbackMessage())
     bench.wait(120.0)
     assert bench.unread == []
     wanted = Ending.NO_ANNOUNCEMENT if options.at_power_up else Ending.NO_BOOT_VERSION
@@ -137,7 +137,7 @@ def test_feedback_that_comes_late_counts_as_well(options: UpgradeOptions) -> Non
     bench = Bench(options=options)
     bench.wait(4.0)
     assert resets(bench)
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     bench.wait(120.0)
     assert bench.unread == []
     assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
@@ -186,7 +186,7 @@ def test_an_adapter_that_was_away_has_heard_nothing_meanwhile(options: UpgradeOp
     assert resets(bench)
     bench.engine.link_back(bench.now)
     bench.wait(ERASE_S - 0.01)
-    assert isinstance(bench.unread[0], Reset)
+    assert isinstance(bench.unread[0], ResetCommand)
     resets(bench)
     assert bench.unread == []
     bench.expect(UpdateCommand, within_s=0.1)

@@ -22,13 +22,13 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     UpdateCommand,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import BMS
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -40,7 +40,7 @@ HURRIED = Timings(ack_timeout_s=0.05, packet_tries=2)
 PATIENT = UpgradeOptions(timings=HURRIED)
 
 
-def count(bench: Bench, kind: type[Row]) -> int:
+def count(bench: Bench, kind: type[UpgradeMessage]) -> int:
     return sum(isinstance(row, kind) for _, row in bench.sent)
 
 
@@ -235,7 +235,7 @@ def tried(options: UpgradeOptions) -> int:
     """How often packet 1 is sent before the device is reset."""
     bench = Bench(options=options)
     bench.to_transfer()
-    while not isinstance(bench.sent[-1][1], Reset) and not bench.engine.done:
+    while not isinstance(bench.sent[-1][1], ResetCommand) and not bench.engine.done:
         bench.wait(0.5)
     return count(bench, Packet)
 
@@ -310,14 +310,14 @@ def test_another_tool_is_waited_for_once_the_device_was_told_to_erase(state: str
     bench.wait(0.2)
     bench.engine.second_tool(SEEN, bench.now)
     bench._read = len(bench.sent)
-    for answer in (RequestTransfer(), Ack(2), Nak(1), BOOT, Complete(), GeneralFeedback()):
+    for answer in (RequestTransfer(), Ack(2), Nak(1), BOOT, Complete(), FeedbackMessage()):
         bench.say(answer)
     bench.wait(1.5)
     bench.engine.second_tool(SEEN, bench.now)
     bench.engine.link_back(bench.now)
     bench.wait(1.99)
     assert bench.unread == []
-    bench.expect(Reset, within_s=0.02)
+    bench.expect(ResetCommand, within_s=0.02)
     bench.say(BOOT)
     bench.expect(UpdateCommand)
     bench.say(RequestTransfer())

@@ -8,10 +8,10 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.protocol.messages import (
     BootVersion,
-    GeneralFeedback,
+    FeedbackMessage,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.timing import Timings
@@ -50,8 +50,8 @@ def test_every_announcement_of_the_burst_is_answered_until_one_is_heard() -> Non
     assert bench.expect(Packet).number == 1
 
 
-@each("row", [GeneralFeedback(), RequestTransfer()])
-def test_nothing_else_that_the_device_says_is_answered(row: GeneralFeedback) -> None:
+@each("row", [FeedbackMessage(), RequestTransfer()])
+def test_nothing_else_that_the_device_says_is_answered(row: FeedbackMessage) -> None:
     bench = Bench(options=WAITING)
     bench.say(row)
     bench.wait(1.0)
@@ -97,10 +97,10 @@ def test_after_a_lost_packet_the_device_is_reset_and_the_power_is_asked_for_agai
     bench.say(RequestTransfer())
     bench.expect(Packet)
     bench.expect(Packet)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.wait(2.0)
     assert len(bench.seen(events.PowerCycleAwaited)) == 2
-    assert all(isinstance(row, Reset) for row in bench.unread)
+    assert all(isinstance(row, ResetCommand) for row in bench.unread)
     bench._read = len(bench.sent)
     bench.say(BOOT)
     bench.expect(UpdateCommand)

@@ -11,7 +11,7 @@ from flasher.host.items import check_date, readable, writable
 from flasher.host.query import Request
 from flasher.host.survey import Survey
 from flasher.protocol.catalogue import BY_KEY, decode
-from flasher.protocol.contents import Fault, Faults
+from flasher.protocol.contents import BatteryFault, Faults
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from flasher.protocol.wire import Message
@@ -148,9 +148,9 @@ def test_all_faults_of_the_battery_are_kept_together() -> None:
     engine.tick(0.0)
     assert survey().faults is None
     heard(engine, 0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0)))
-    assert engine.faults == Faults(Fault(0x00010004))
+    assert engine.faults == Faults(BatteryFault(0x00010004))
     heard(engine, 0x720, 0x0C, 0x1204, bytes((8, 0, 0, 0)))
-    assert engine.faults == Faults(Fault(0x0001000C))
+    assert engine.faults == Faults(BatteryFault(0x0001000C))
 
 
 @each(

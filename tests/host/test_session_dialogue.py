@@ -22,18 +22,23 @@ from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY
-from flasher.protocol.contents import RunningInformation, Shutdown, Status, VersionInformation
+from flasher.protocol.contents import (
+    BatteryStatus,
+    RunningInformation,
+    Shutdown,
+    VersionInformation,
+)
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import BMS, OBC, WELLING
@@ -48,7 +53,7 @@ NEW, OLD = "V2r0r1_20260102", "V1r0r0_20220512"
 IMAGE = replace(Image.from_bytes(VECTORS + bytes(64) + NEW.encode()), version=NEW)
 PLAN = plan(IMAGE, BMS, WELLING.bitrate_bps)
 VERSION, RUNNING = (0x720, 0x1540), (0x720, 0x1010)
-BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
+BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, BatteryStatus(0), 98, bytes(4))
 OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA1605420501FF"))
 OPEN = UpgradeOptions(in_session=True)
 SHUTDOWN = next(item for item in catalogue.ITEMS if item.content is Shutdown)
@@ -128,8 +133,8 @@ def test_a_battery_is_asked_before_the_reset_and_what_it_answered_is_kept() -> N
 
 def test_without_an_identity_nothing_is_asked_and_no_version_is_known() -> None:
     dialogue = Dialogue()
-    dialogue.expect(Reset)
-    dialogue.say(GeneralFeedback())
+    dialogue.expect(ResetCommand)
+    dialogue.say(FeedbackMessage())
     dialogue.engine.cancel(dialogue.now)
     assert dialogue.result.previous_version is None
     assert dialogue.seen(events.CheckMade) == []
@@ -199,7 +204,7 @@ def test_a_device_that_announces_itself_while_it_is_asked_gets_the_reset_once_mo
     dialogue = Dialogue(identity=Identity())
     assert dialogue.asked() == 0x3300
     dialogue.say(BOOT)
-    dialogue.expect(Reset)
+    dialogue.expect(ResetCommand)
     dialogue.expect(UpdateCommand, within_s=0.1)
     assert dialogue.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
 
@@ -244,7 +249,7 @@ def test_another_tool_ends_it_while_it_listens() -> None:
 )
 def test_an_application_that_sends_is_in_no_session(can_id: int, *, is_application: bool) -> None:
     dialogue = Dialogue(OPEN)
-    dialogue.expect(Reset)
+    dialogue.expect(ResetCommand)
     dialogue.engine.receive(Frame(can_id, b"\x05"), dialogue.now)
     dialogue.wait(60.0)
     updates = [row for row in dialogue.unread if isinstance(row, UpdateCommand)]
@@ -253,7 +258,7 @@ def test_an_application_that_sends_is_in_no_session(can_id: int, *, is_applicati
 
 def test_a_frame_that_is_no_payload_is_no_application() -> None:
     dialogue = Dialogue(OPEN)
-    dialogue.expect(Reset)
+    dialogue.expect(ResetCommand)
     dialogue.engine.receive(Frame(0x720, b"", is_remote=True), dialogue.now)
     dialogue.wait(60.0)
     assert [row for row in dialogue.unread if isinstance(row, UpdateCommand)]
@@ -279,11 +284,11 @@ def test_an_adapter_may_be_lost_once_for_each_attempt_but_the_last(
     attempts: int | None, losses: int
 ) -> None:
     dialogue = Dialogue(UpgradeOptions(attempts=attempts))
-    dialogue.expect(Reset)
+    dialogue.expect(ResetCommand)
     for _ in range(losses):
         assert dialogue.may_begin_again()
         dialogue.session.link_back(dialogue.now)
-        dialogue.expect(Reset)
+        dialogue.expect(ResetCommand)
     assert not dialogue.may_begin_again()
 
 
@@ -311,7 +316,7 @@ def test_questions_are_asked_anew_when_the_adapter_is_back() -> None:
     dialogue._flush()
     assert dialogue.session.standing == "listening for another tool"
     dialogue.identified()
-    dialogue.expect(Reset)
+    dialogue.expect(ResetCommand)
 
 
 def test_a_lost_adapter_does_not_disturb_a_verification() -> None:
@@ -445,7 +450,7 @@ def test_one_that_is_in_no_session_is_refused_at_once(
         dialogue.say(BOOT)
     dialogue.wait(2.0)
     assert dialogue.ended.ending is Ending.UNCHECKED
-    assert not [row for row in dialogue.unread if isinstance(row, Reset)]
+    assert not [row for row in dialogue.unread if isinstance(row, ResetCommand)]
 
 
 def test_other_findings_refuse_a_silent_device_as_ever() -> None:

@@ -17,12 +17,12 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Row,
     UpdateCommand,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import BMS
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -109,7 +109,7 @@ def test_the_number_of_tries_is_the_users() -> None:
 
 
 @each("stale", [Nak(1), Ack(0), Nak(0)])
-def test_an_answer_for_an_older_packet_is_ignored(stale: Row) -> None:
+def test_an_answer_for_an_older_packet_is_ignored(stale: UpgradeMessage) -> None:
     bench = Bench()
     bench.to_packet(2)
     bench.say(stale)
@@ -120,7 +120,7 @@ def test_an_answer_for_an_older_packet_is_ignored(stale: Row) -> None:
 
 
 @each("future", [Ack(3), Nak(3), Ack(65535), Nak(65535)])
-def test_an_answer_for_a_later_packet_is_reported_and_ignored(future: Row) -> None:
+def test_an_answer_for_a_later_packet_is_reported_and_ignored(future: UpgradeMessage) -> None:
     bench = Bench()
     bench.to_packet(2)
     bench.say(future)
@@ -452,7 +452,7 @@ def test_general_feedback_in_the_transfer_is_ignored() -> None:
     """R15."""
     bench = Bench()
     bench.to_packet(1)
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     bench.wait(0.3)
     assert bench.unread == []
     bench.say(Ack(1))

@@ -22,11 +22,11 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import OBC, WELLING, WMC
@@ -222,7 +222,7 @@ def test_one_nak_beside_an_ack_is_a_packet_whose_first_frame_was_doubled() -> No
 
 @each("row", [BootVersion("WMC", "V1.2.3"), RequestTransfer()])
 def test_an_ack_of_a_device_that_seems_to_have_restarted_is_another_devices(
-    row: messages.Row,
+    row: messages.UpgradeMessage,
 ) -> None:
     bench = in_transfer(5)
     bench.wait(0.07)
@@ -252,7 +252,7 @@ def test_feedbacks_that_begin_in_the_middle_are_another_devices() -> None:
     bench.say(RequestTransfer())
     bench.on_to_packet(8, first=1)
     for number in range(8, 20):
-        bench.say(GeneralFeedback(), Ack(number))
+        bench.say(FeedbackMessage(), Ack(number))
         if bench.engine.done:
             break
         bench.expect(Packet)
@@ -260,7 +260,7 @@ def test_feedbacks_that_begin_in_the_middle_are_another_devices() -> None:
 
 
 @each("row", [Nak(3), RequestTransfer(), Ack(6)])
-def test_who_goes_on_after_complete_is_another_device(row: messages.Row) -> None:
+def test_who_goes_on_after_complete_is_another_device(row: messages.UpgradeMessage) -> None:
     """Nothing more is asked of a WMC: it is listened for a moment."""
     stage = Stage("wmc")
     said = split(WMC.answer_id, encode(row.to_message(WMC.answer_id)))
@@ -310,7 +310,7 @@ class Confirming(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if self.state not in (State.APPLICATION, State.OFF, State.RESTARTING):
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 
 
@@ -406,15 +406,15 @@ def test_a_question_that_was_not_received_here_makes_no_second_device() -> None:
 
 def test_a_general_feedback_to_somebody_else_before_the_reset_is_none_to_it() -> None:
     stage = Stage("wmc")
-    feedback = split(WMC.answer_id, encode(GeneralFeedback().to_message(WMC.answer_id)))
+    feedback = split(WMC.answer_id, encode(FeedbackMessage().to_message(WMC.answer_id)))
     stage.bus.attach(Speaker(*feedback, every_s=0.001, begins_at=0.05, limit=4))
     assert stage.flash().ok
 
 
 def test_a_link_that_doubles_every_frame_is_no_second_device() -> None:
     bench = Bench(300)
-    bench.expect(Reset)
-    for frame in split(0x725, encode(GeneralFeedback().to_message(0x725))) * 2:
+    bench.expect(ResetCommand)
+    for frame in split(0x725, encode(FeedbackMessage().to_message(0x725))) * 2:
         bench.engine.receive(frame, bench.now)
     bench.say(BOOT)
     bench.expect(UpdateCommand)

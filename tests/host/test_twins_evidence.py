@@ -8,9 +8,9 @@ from flasher.host.twins import Twins
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import (
+    BatteryStatus,
     CheckCode,
     RunningInformation,
-    Status,
     VersionInformation,
 )
 from flasher.protocol.fields import Content, WireText
@@ -19,10 +19,10 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     Complete,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     RequestTransfer,
-    Row,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import Command
 from flasher.protocol.text import encode_text
@@ -44,7 +44,7 @@ TIMINGS = Timings(
 VERSION, RUNNING = BY_KEY[0x720, 0x1540], BY_KEY[0x720, 0x1010]
 WRITTEN = BY_KEY[0x725, 0x5503]
 """The answer to each write."""
-BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
+BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, BatteryStatus(0), 98, bytes(4))
 BOOT = BootVersion("BMS", "V1.2.3")
 TWO_ANSWERED = "two devices answered"
 CONFIRMED_TWICE = "one message was confirmed twice"
@@ -84,7 +84,7 @@ class Watch:
         self.twins.left(command, self.now, packet)
         return self
 
-    def hears(self, *rows: Row, can_id: int = 0x725) -> Watch:
+    def hears(self, *rows: UpgradeMessage, can_id: int = 0x725) -> Watch:
         """Each a tick after the one before."""
         for row in rows:
             self.now += TICK_S
@@ -200,8 +200,8 @@ def test_the_same_message_at_once_was_doubled_by_the_link(
     watch = at(-TICK_S).asks().answers()
     watch.twins.heard(catalogue.encode(VERSION, version()), apart_s)
     assert watch.doubts == ([VERSION] if is_second else [])
-    watch = at(-2 * TICK_S).sends(Command.RESET).hears(GeneralFeedback())
-    watch.twins.heard(GeneralFeedback().to_message(0x725), apart_s)
+    watch = at(-2 * TICK_S).sends(Command.RESET).hears(FeedbackMessage())
+    watch.twins.heard(FeedbackMessage().to_message(0x725), apart_s)
     assert watch.evidence == (CONFIRMED_TWICE if is_second else "")
 
 
@@ -241,9 +241,9 @@ def test_an_answer_of_another_size_counts_and_is_not_read() -> None:
 
 
 def test_a_write_that_is_confirmed_twice_is_two_devices_at_once() -> None:
-    watch = Watch().asks(WRITTEN).hears(GeneralFeedback())
+    watch = Watch().asks(WRITTEN).hears(FeedbackMessage())
     assert watch.evidence == ""
-    assert watch.hears(GeneralFeedback()).evidence == CONFIRMED_TWICE
+    assert watch.hears(FeedbackMessage()).evidence == CONFIRMED_TWICE
     assert watch.doubts == [WRITTEN]
 
 
@@ -291,13 +291,13 @@ def test_an_answer_that_was_begun_counts_unless_its_frame_was_doubled(
 
 
 def test_a_confirmation_that_was_spoilt_counts() -> None:
-    watch = Watch().sends(Command.RESET).hears(GeneralFeedback()).wait(1)
-    watch.twins.heard(garbled(GeneralFeedback().to_message(0x725)), watch.now)
+    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
+    watch.twins.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
     assert watch.evidence == CONFIRMED_TWICE
     watch = Watch().announces(0).sends(Command.RESET).wait(1)
-    watch.twins.heard(garbled(GeneralFeedback().to_message(0x725)), watch.now)
+    watch.twins.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
     assert watch.twins.is_beside
-    watch = Watch().sends(Command.RESET).hears(GeneralFeedback()).wait(1)
+    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
     watch.twins.heard(garbled(Ack(1).to_message(0x725)), watch.now)
     assert watch.evidence == ""
 
@@ -314,13 +314,13 @@ def test_an_update_command_ends_all_questions() -> None:
 
 def test_each_reset_may_be_confirmed_once() -> None:
     watch = Watch().sends(Command.RESET).sends(Command.RESET)
-    assert watch.hears(GeneralFeedback(), GeneralFeedback()).evidence == ""
-    assert watch.hears(GeneralFeedback()).evidence == CONFIRMED_TWICE
+    assert watch.hears(FeedbackMessage(), FeedbackMessage()).evidence == ""
+    assert watch.hears(FeedbackMessage()).evidence == CONFIRMED_TWICE
 
 
 def test_a_confirmation_before_anything_was_sent_is_somebody_elses() -> None:
-    watch = Watch().hears(GeneralFeedback(), GeneralFeedback()).sends(Command.RESET)
-    assert watch.hears(GeneralFeedback()).evidence == ""
+    watch = Watch().hears(FeedbackMessage(), FeedbackMessage()).sends(Command.RESET)
+    assert watch.hears(FeedbackMessage()).evidence == ""
 
 
 @each("after_ticks, is_beside", [(79, True), (80, False)])
@@ -331,19 +331,19 @@ def test_a_reset_that_is_confirmed_while_a_bootloader_announces_itself(
     watch = Watch().announces(0).sends(Command.RESET).wait(after_ticks - 1)
     assert watch.twins.announces(0x725, watch.now)
     assert not watch.twins.announces(0x720, watch.now)
-    watch.hears(GeneralFeedback())
+    watch.hears(FeedbackMessage())
     assert watch.twins.is_beside is is_beside
-    assert watch.wait(500).sends(Command.RESET).hears(GeneralFeedback()).twins.is_beside is False
+    assert watch.wait(500).sends(Command.RESET).hears(FeedbackMessage()).twins.is_beside is False
 
 
 def test_it_stays_so_until_the_next_reset_or_update_command() -> None:
     assert not Watch().twins.is_beside
     for command in (Command.RESET, Command.UPDATE):
-        watch = Watch().announces(0).sends(Command.RESET).hears(GeneralFeedback()).wait(500)
-        assert watch.sends(Command.END_OF_TRANSFER).hears(GeneralFeedback()).twins.is_beside
+        watch = Watch().announces(0).sends(Command.RESET).hears(FeedbackMessage()).wait(500)
+        assert watch.sends(Command.END_OF_TRANSFER).hears(FeedbackMessage()).twins.is_beside
         watch.sends(command)
         assert not watch.twins.is_beside
-    watch.announces(1).hears(GeneralFeedback())
+    watch.announces(1).hears(FeedbackMessage())
     assert not watch.twins.is_beside, "a bootloader may confirm the update command"
 
 
@@ -500,7 +500,7 @@ def test_request_transfer_after_an_ack_is_another_devices_only_if_the_transfer_g
 
 
 @each("row", [RequestTransfer(), Ack(1), Nak(1)])
-def test_who_goes_on_after_the_end_is_another_device(row: Row) -> None:
+def test_who_goes_on_after_the_end_is_another_device(row: UpgradeMessage) -> None:
     going_on = "one device continued a transfer that another one had completed"
     watch = Watch().transfers(1).sends(Command.END_OF_TRANSFER).hears(Complete())
     assert watch.evidence == ""
@@ -647,24 +647,24 @@ def test_feedbacks_that_begin_or_end_in_a_transfer_are_another_devices(
     packets: str, *, is_odd: bool
 ) -> None:
     """Each packet with an ACK: + also with a general feedback."""
-    watch = Watch().sends(Command.RESET).hears(GeneralFeedback()).transfers(0)
+    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).transfers(0)
     for number, kind in enumerate(packets, 1):
         watch.sends(Command.PACKET, number)
-        watch.hears(*[GeneralFeedback()] * (kind == "+"), Ack(number))
+        watch.hears(*[FeedbackMessage()] * (kind == "+"), Ack(number))
     mixed = "some packets were confirmed by general feedback, others were not"
     assert watch.evidence == (mixed if is_odd else "")
 
 
 def test_in_the_transfer_one_feedback_too_many_is_an_odd_answer() -> None:
     watch = Watch().transfers(0)
-    watch.sends(Command.PACKET, 1).hears(*[GeneralFeedback()] * 3)
+    watch.sends(Command.PACKET, 1).hears(*[FeedbackMessage()] * 3)
     assert watch.evidence == "", "one for the update command, one for the packet, and one odd"
-    watch.hears(GeneralFeedback())
+    watch.hears(FeedbackMessage())
     assert watch.evidence == TOO_OFTEN
 
 
 def test_what_was_seen_first_is_what_is_told() -> None:
-    watch = Watch().sends(Command.RESET).hears(GeneralFeedback(), GeneralFeedback())
+    watch = Watch().sends(Command.RESET).hears(FeedbackMessage(), FeedbackMessage())
     assert watch.announces(1).announces(1, boot=BootVersion("BMS", "V9.9.9")).evidence == (
         CONFIRMED_TWICE
     )

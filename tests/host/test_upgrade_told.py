@@ -18,13 +18,13 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     UpdateCommand,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import OBC
 from flasher.protocol.timing import Timings
@@ -85,9 +85,9 @@ def test_it_has_begun_to_erase_with_the_first_frame_of_the_update_command() -> N
     begun: list[bool] = []
     bench = Bench()
     bench.on_frame = lambda _number: begun.append(stage(bench).has_begun_to_erase)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     assert not any(begun)
-    bench.say(GeneralFeedback(), BOOT)
+    bench.say(FeedbackMessage(), BOOT)
     begun.clear()
     bench.expect(UpdateCommand)
     assert begun == [False, True, True]
@@ -98,10 +98,10 @@ def test_it_has_begun_to_erase_with_the_first_frame_of_the_update_command() -> N
 
 def test_a_reset_that_is_half_sent_erases_nothing() -> None:
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     begun: list[bool] = []
     bench.on_frame = lambda _number: begun.append(stage(bench).has_begun_to_erase)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     assert begun == [False, False]
 
 
@@ -128,7 +128,7 @@ def test_after_a_lost_adapter_it_goes_on_or_needs_an_attempt(
 
 def test_one_that_ends_may_finish_its_message_on_an_adapter_that_is_back() -> None:
     bench = Bench(options=ONCE)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
 
     def cancel(_number: int) -> None:
         if bench._frames % 2 == 0:
@@ -237,7 +237,9 @@ OUT_OF_PLACE = "message that has no place here"
          "message C202 from 725 ignored: mode is 16, not 0C"),
     ],
 )  # fmt: skip
-def test_a_message_that_has_no_place_is_reported_by_name(row: Row | Message, what: str) -> None:
+def test_a_message_that_has_no_place_is_reported_by_name(
+    row: UpgradeMessage | Message, what: str
+) -> None:
     bench = Bench()
     bench.to_boot()
     bench.say(row)
@@ -344,7 +346,7 @@ def test_a_session_that_was_not_to_be_checked_names_the_check_that_refused() -> 
     rule = CheckResult(Check.HARDWARE, CheckVerdict.REFUSED, "no hardware told")
     bench = Bench(options=replace(ONCE, in_session=True))
     stage(bench).unchecked = rule
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.say(BOOT)
     outcome = bench.outcome
     assert outcome.ending is Ending.UNCHECKED
@@ -404,18 +406,18 @@ def test_an_adapter_that_is_back_while_an_erased_device_is_reset_takes_no_attemp
     bench = Bench(options=UpgradeOptions(timings=HURRIED))
     bench.to_packet(2)
     bench.expect(Packet)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     before = len(bench.seen(events.AttemptStarted))
     for _ in range(5):
         bench.engine.link_back(bench.now)
-        bench.expect(Reset, within_s=0.19)
+        bench.expect(ResetCommand, within_s=0.19)
     assert len(bench.seen(events.AttemptStarted)) == before == 1
 
 
 # -- an adapter that takes nothing for a while ----------------------------------------------------
 
 
-def hears(bench: Bench, row: Row) -> None:
+def hears(bench: Bench, row: UpgradeMessage) -> None:
     """The device speaks while the adapter takes nothing."""
     for frame in answer_frames(row):
         bench.engine.receive(frame, bench.now)
@@ -436,11 +438,11 @@ def test_a_timer_begins_when_the_message_has_left_and_not_before() -> None:
         events.MessageRepeated("end of transfer", Reason.END_REFUSED.value, 2)
     ]
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.engine.link_back(bench.now)
     passes(bench, 0.3)
     bench._flush()
-    assert bench.unread == [Reset()]
+    assert bench.unread == [ResetCommand()]
     bench = Bench()
     bench.to_transfer()
     hears(bench, Ack(1))
@@ -450,9 +452,9 @@ def test_a_timer_begins_when_the_message_has_left_and_not_before() -> None:
 
 def test_a_reset_that_has_not_left_when_it_is_needed_no_more_is_not_sent() -> None:
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     passes(bench, 0.25)
-    hears(bench, GeneralFeedback())
+    hears(bench, FeedbackMessage())
     bench._flush()
     assert bench.unread == []
 
@@ -471,7 +473,7 @@ def test_an_adapter_that_is_back_before_the_update_command_has_left_begins_with_
     bench = update_that_waits()
     bench.engine.link_back(bench.now)
     bench._flush()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
 
 
 def test_a_request_before_the_update_command_has_left_is_reported_and_not_answered() -> None:
@@ -532,7 +534,7 @@ def test_no_request_after_a_failed_packet_is_named_by_whether_the_device_came_ba
     bench = Bench(options=UpgradeOptions(timings=HURRIED, attempts=attempts))
     bench.to_packet(2)
     bench.expect(Packet)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     if comes_back:
         bench.say(BOOT)
         bench.expect(UpdateCommand)
@@ -549,7 +551,7 @@ def test_nobody_is_asked_for_power_before_an_update_command_went_into_the_silenc
     bench.expect(UpdateCommand)
     bench.wait(12.0)
     assert bench.seen(events.PowerCycleAwaited) == []
-    assert Reset() in bench.unread
+    assert ResetCommand() in bench.unread
 
 
 def test_the_wait_for_the_power_begins_anew_when_the_adapter_is_back() -> None:

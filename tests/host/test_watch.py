@@ -15,12 +15,12 @@ from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
     BootVersion,
-    GeneralFeedback,
+    FeedbackMessage,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     UpdateCommand,
+    UpgradeMessage,
 )
 from flasher.protocol.spec import BMS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -36,7 +36,7 @@ AWAITED = UpgradeOptions(at_power_up=True, power_up_timeout_s=30.0)
 SHORT = replace(DEFAULT_TIMINGS, boot_watch_s=0.01)
 
 
-def begins(bench: Bench, kind: type[Row]) -> float:
+def begins(bench: Bench, kind: type[UpgradeMessage]) -> float:
     """When the next message began to be sent, which must be of this kind."""
     times: list[float] = []
     bench.on_frame = lambda _number: times.append(bench.now)
@@ -68,7 +68,7 @@ def test_the_update_command_follows_the_boot_version_after_the_watch(timings: Ti
 
 def test_it_is_counted_from_where_a_message_that_is_being_sent_has_left() -> None:
     bench = Bench()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     second_at: list[float] = []
 
     def announce(_number: int) -> None:
@@ -80,7 +80,7 @@ def test_it_is_counted_from_where_a_message_that_is_being_sent_has_left() -> Non
                 bench.engine.receive(frame, bench.now)
 
     bench.on_frame = announce
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     assert begins(bench, UpdateCommand) == pytest.approx(bench.sent[1][0] + WATCH_S, abs=1e-6)
 
 
@@ -110,17 +110,17 @@ def test_an_announcement_of_another_kind_of_device_ends_it() -> None:
 def beside(options: UpgradeOptions | None = None) -> tuple[Bench, float]:
     """A bootloader announces itself, and the reset is confirmed; when it was."""
     bench = Bench(options=options)
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.say(BOOT)
     bench.wait(0.005)
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     return bench, bench.now
 
 
 def test_the_application_is_reset_again_when_the_announcements_have_ended() -> None:
     bench, confirmed_at = beside()
-    assert begins(bench, Reset) == pytest.approx(confirmed_at + BURST_S)
-    bench.say(GeneralFeedback())
+    assert begins(bench, ResetCommand) == pytest.approx(confirmed_at + BURST_S)
+    bench.say(FeedbackMessage())
     bench.wait(1.0)
     bench.say(BOOT)
     bench.expect(UpdateCommand, within_s=WATCH_S + 3 * FRAME_S)
@@ -130,16 +130,16 @@ def test_the_application_is_reset_again_when_the_announcements_have_ended() -> N
 
 def test_that_reset_is_repeated_as_ever() -> None:
     bench, _ = beside()
-    bench.expect(Reset)
-    bench.expect(Reset, within_s=0.3)
+    bench.expect(ResetCommand)
+    bench.expect(ResetCommand, within_s=0.3)
 
 
 def test_it_is_reset_again_once() -> None:
     bench, _ = beside()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.say(BOOT)
     bench.wait(0.005)
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     confirmed_at = bench.now
     assert begins(bench, UpdateCommand) == pytest.approx(confirmed_at + BURST_S)
 
@@ -162,7 +162,7 @@ def test_a_device_that_was_heard_gets_a_reset_that_only_another_application_answ
     bench = heard_before()
     assert bench.seen(events.PhaseEntered) == [events.PhaseEntered(Phase.BOOT, 1)]
     assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     left_at = bench.sent[0][0]
     assert begins(bench, UpdateCommand) == pytest.approx(left_at + WATCH_S, abs=1e-6)
     assert bench.seen(events.PhaseEntered)[-1] == events.PhaseEntered(Phase.UPDATE, 1)
@@ -170,7 +170,7 @@ def test_a_device_that_was_heard_gets_a_reset_that_only_another_application_answ
 
 def test_another_kind_of_device_that_announces_itself_after_that_reset_is_refused() -> None:
     bench = heard_before()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.say(BootVersion("OBC", "V1.2.3"))
     assert bench.outcome.ending is Ending.WRONG_DEVICE
 
@@ -183,7 +183,7 @@ def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
     bench.engine.tick(bench.now)
     bench.now += 1.0  # the adapter takes nothing
     bench._step()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     left_at = bench.sent[0][0]
     bench.wait(0.01)
     bench.say(BOOT)
@@ -192,9 +192,9 @@ def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
 
 def test_an_application_that_answers_that_reset_is_waited_for() -> None:
     bench = heard_before()
-    bench.expect(Reset)
+    bench.expect(ResetCommand)
     bench.wait(0.01)
-    bench.say(GeneralFeedback())
+    bench.say(FeedbackMessage())
     bench.wait(1.0)
     assert bench.unread == []
     bench.say(BOOT)

@@ -151,11 +151,11 @@ class Bench:
     def put_hex(self, text: str) -> None:
         self.put_wire(bytes.fromhex(text))
 
-    def send(self, *rows: messages.Row | VersionQuery) -> None:
+    def send(self, *rows: messages.UpgradeMessage | VersionQuery) -> None:
         for row in rows:
             self.put_wire(self.encoded(row))
 
-    def encoded(self, row: messages.Row | VersionQuery) -> bytes:
+    def encoded(self, row: messages.UpgradeMessage | VersionQuery) -> bytes:
         return encode(row.to_message(self.target.request_id))
 
     # -- from the device --------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class Bench:
 
     def enter_bootloader(self) -> None:
         """Reset the application; the first announcement has been sent afterwards."""
-        self.send(messages.Reset())
+        self.send(messages.ResetCommand())
         self.run_to(State.ANNOUNCING)
         self.take_sent()
 
@@ -216,7 +216,7 @@ class Bench:
     def upgrade(self, image: bytes) -> None:
         """A whole upgrade of a device that announces itself or will do so."""
         if self.device.state is State.APPLICATION:
-            self.send(messages.Reset())
+            self.send(messages.ResetCommand())
         self.run_to(State.ANNOUNCING)
         self.take_sent()
         self.enter_transfer(len(image))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher.mock.battery import FULL_CAPACITY_MAH, Battery, Reading
-from flasher.protocol.contents import Status
+from flasher.protocol.contents import BatteryStatus
 
 CYCLE_S = 5 * 3600
 
@@ -46,7 +46,7 @@ def test_the_charge_is_the_integral_of_the_current() -> None:
 def test_it_discharges_while_riding_and_charges_with_the_charger_connected() -> None:
     seen = set()
     for reading in readings(60.0, CYCLE_S):
-        is_charging = reading.status == Status.CHARGER_CONNECTED
+        is_charging = reading.status == BatteryStatus.CHARGER_CONNECTED
         assert (reading.current_ma > 0) is is_charging
         seen.add(is_charging)
     assert seen == {True, False}

@@ -13,7 +13,7 @@ from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
-from flasher.protocol.contents import Fault
+from flasher.protocol.contents import BatteryFault
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from tests.loops import each
@@ -50,10 +50,10 @@ def test_faults_are_told_every_200_ms_while_any_is_set() -> None:
     talk.run(1.0)
     assert talk.take() == []
     application_of(talk).set_faults(
-        Fault.CHARGE_OVER_VOLTAGE_WARNING
-        | Fault.MOS_OVER_TEMPERATURE_WARNING
-        | Fault.SHORT_CIRCUIT_PROTECTION
-        | Fault.MCU_FAULT,
+        BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
+        | BatteryFault.MOS_OVER_TEMPERATURE_WARNING
+        | BatteryFault.SHORT_CIRCUIT_PROTECTION
+        | BatteryFault.MCU_FAULT,
         talk.now,
     )
     talk.run(0.9)
@@ -61,7 +61,7 @@ def test_faults_are_told_every_200_ms_while_any_is_set() -> None:
     assert [one.at_s - START_S - 1.0 for one in heard] == pytest.approx(FIVE)
     # Low byte first: the protections' half, then the warnings'.
     assert {one[1:] for one in heard} == {(0x720, REPORT, 0x1204, bytes.fromhex("04800101"))}
-    application_of(talk).set_faults(Fault(0), talk.now)
+    application_of(talk).set_faults(BatteryFault(0), talk.now)
     talk.run(5.0)
     assert talk.take() == []
 
@@ -82,7 +82,7 @@ def test_faults_of_the_profile_are_set_from_the_start_and_again_after_a_power_cu
 def test_other_faults_do_not_change_the_cadence() -> None:
     talk = battery(faults=1)
     talk.run(0.3)
-    application_of(talk).set_faults(Fault(2), talk.now)
+    application_of(talk).set_faults(BatteryFault(2), talk.now)
     talk.run(0.6)
     heard = talk.take()
     assert [one.at_s - START_S for one in heard] == pytest.approx(FIVE)

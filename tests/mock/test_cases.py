@@ -57,18 +57,18 @@ def finish(bench: Bench, packets: list[Packet], image: bytes) -> None:
 def test_a_second_reset_during_the_restart_makes_one_clean_restart() -> None:
     """RS-02."""
     bench = Bench()
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     bench.run(0.02)
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     bench.run(0.3)
-    assert [type(row) for row in bench.take()] == [messages.GeneralFeedback] + 4 * [
+    assert [type(row) for row in bench.take()] == [messages.FeedbackMessage] + 4 * [
         messages.BootVersion
     ]
 
 
 def test_half_a_message_from_before_the_restart_does_not_spoil_the_first_one_after_it() -> None:
     bench = Bench()
-    reset = bench.encoded(messages.Reset())
+    reset = bench.encoded(messages.ResetCommand())
     bench.put_wire(reset[:8])
     bench.put(Frame(0x752, reset[8:15]))
     bench.put(Frame(0x752, reset[15:] + bench.encoded(PACKETS[0])[:7]))
@@ -84,7 +84,7 @@ def test_a_reset_during_the_announcements_is_ignored_by_default() -> None:
     bench = Bench()
     bench.enter_bootloader()
     bench.run(0.06)
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     bench.run(0.12)
     assert [type(row) for row in bench.take()] == 3 * [messages.BootVersion]
     bench.run(1.0)
@@ -96,7 +96,7 @@ def test_a_reset_during_the_announcements_may_restart_them_without_feedback() ->
     bench.enter_bootloader()
     bench.run(0.06)
     bench.take()
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     assert bench.device.state is State.RESTARTING
     bench.run(1.0)
     assert [type(row) for row in bench.take()] == 4 * [messages.BootVersion]
@@ -105,10 +105,10 @@ def test_a_reset_during_the_announcements_may_restart_them_without_feedback() ->
 def test_what_follows_a_reset_in_the_same_bytes_is_not_heard() -> None:
     """A message that is found inside of a damaged one counts, and the device restarts on it."""
     bench = Bench()
-    inner = bench.encoded(messages.Reset()) + bench.encoded(READ_VERSION)
+    inner = bench.encoded(messages.ResetCommand()) + bench.encoded(READ_VERSION)
     bench.put_wire(bench.encoded(Packet(1, 1, inner.ljust(128, b"\xff")))[:-1] + b"\x00")
     bench.run(0.04)
-    assert bench.take() == [messages.GeneralFeedback()]
+    assert bench.take() == [messages.FeedbackMessage()]
     assert bench.device.state is State.RESTARTING
 
 
@@ -129,7 +129,7 @@ def test_a_reset_that_is_none_is_ignored(can_id: int, mode: Mode, data: bytes) -
     bench.run(1.0)
     # 2.2.1(2): an application confirms every write.
     is_write = (can_id, mode) == (0x752, Mode.WRITE)
-    assert bench.take() == ([messages.GeneralFeedback()] if is_write else [])
+    assert bench.take() == ([messages.FeedbackMessage()] if is_write else [])
     assert bench.device.state is State.APPLICATION
 
 
@@ -410,7 +410,7 @@ def test_damage_that_does_not_begin_like_a_packet_is_not_answered() -> None:
 
 @each("choice, answer", [("ack", Ack(2)), ("nak_next", Nak(3))])
 def test_a_repeated_packet_is_answered_as_the_profile_says_and_nothing_is_written_twice(
-    choice: str, answer: messages.Row
+    choice: str, answer: messages.UpgradeMessage
 ) -> None:
     """TX-02, R10."""
     bench = bench_in_transfer(profile_with(repeated_packet=choice), stored=2)
@@ -452,7 +452,7 @@ def test_a_packet_after_the_last_one_is_rejected() -> None:
 
 @each("choice, answer", [("ack", [Ack(1)]), ("nak", [Nak(4)]), ("silence", [])])
 def test_an_older_packet_is_answered_as_the_profile_says(
-    choice: str, answer: list[messages.Row]
+    choice: str, answer: list[messages.UpgradeMessage]
 ) -> None:
     """TX-03."""
     bench = bench_in_transfer(profile_with(older_packet=choice), stored=3)
@@ -542,10 +542,10 @@ def test_a_long_pause_may_end_the_transfer_and_the_device_is_reachable_again() -
 def test_a_reset_during_the_transfer_is_ignored_by_default() -> None:
     """TX-13."""
     bench = bench_in_transfer(SMALL, stored=2)
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     bench.run(1.0)
     assert bench.take() == []
-    bench.send(PACKETS[2], messages.Reset())
+    bench.send(PACKETS[2], messages.ResetCommand())
     bench.run(1.0)
     assert bench.take() == [Ack(3)]
     finish(bench, PACKETS[3:], IMAGE)
@@ -568,7 +568,7 @@ def test_a_reset_during_the_upgrade_may_restart_and_the_device_is_rescuable(stat
         bench.send(PACKETS[-1])
     assert bench.device.state is state
     bench.run(0.001)
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     assert bench.device.state is State.RESTARTING
     bench.run(0.2)
     assert {type(row) for row in bench.take()} == {messages.BootVersion}
@@ -619,7 +619,7 @@ def test_a_second_end_is_answered_as_the_profile_says(choice: str, answer: list[
     assert bench.take() == answer
     bench.run_to(State.APPLICATION)
     bench.send(EndOfTransfer())
-    assert bench.take() == [messages.GeneralFeedback()]
+    assert bench.take() == [messages.FeedbackMessage()]
 
 
 def test_an_update_command_or_a_reset_after_complete_does_not_touch_the_new_image() -> None:
@@ -627,7 +627,7 @@ def test_an_update_command_or_a_reset_after_complete_does_not_touch_the_new_imag
     bench = bench_in_transfer(profile_with(reset_in_transfer="restarts"), stored=5)
     bench.end()
     erased = bench.device.erase_count
-    bench.send(bench.update_row(600), messages.Reset(), PACKETS[0])
+    bench.send(bench.update_row(600), messages.ResetCommand(), PACKETS[0])
     assert bench.take() == []
     (report,) = bench.events_of(DeviceReported)
     assert "600 bytes refused while starting" in report.what
@@ -696,7 +696,7 @@ def test_after_a_refusal_the_second_end_may_meet_silence_and_an_update_command_s
     bench.enter_bootloader()
     bench.enter_transfer(600)
     bench.transfer(*PACKETS)
-    bench.send(EndOfTransfer(), EndOfTransfer(), messages.Reset())
+    bench.send(EndOfTransfer(), EndOfTransfer(), messages.ResetCommand())
     assert bench.take() == [Nak(5)]
     bench.send(bench.update_row(0))
     assert bench.device.state is State.REFUSED
@@ -746,8 +746,8 @@ def test_random_traffic_leaves_the_device_reachable_and_an_application_old_or_no
     )
     bench = Bench(profile)
     factory = bench.device.stored_image
-    rows: list[messages.Row | VersionQuery] = [
-        messages.Reset(),
+    rows: list[messages.UpgradeMessage | VersionQuery] = [
+        messages.ResetCommand(),
         READ_VERSION,
         bench.update_row(600),
         bench.update_row(100),
@@ -766,7 +766,7 @@ def test_random_traffic_leaves_the_device_reachable_and_an_application_old_or_no
         assert bench.device.stored_image in {factory, None}
     bench.run(5.0)
     if bench.device.state not in {State.APPLICATION, State.ANNOUNCING}:
-        bench.send(messages.Reset())
+        bench.send(messages.ResetCommand())
     bench.upgrade(IMAGE)
     assert bench.device.stored_image == IMAGE
 
@@ -792,7 +792,7 @@ def test_a_device_is_an_engine() -> None:
 def test_cancelled_it_finishes_the_message_under_way_and_is_done() -> None:
     bench = Bench()
     bench.accepts_frames = False
-    bench.send(messages.Reset(), messages.Reset())
+    bench.send(messages.ResetCommand(), messages.ResetCommand())
     device = bench.device
     first = device.next_frame(bench.now)
     assert first is not None
@@ -802,7 +802,7 @@ def test_cancelled_it_finishes_the_message_under_way_and_is_done() -> None:
     assert device.deadline() is not None
     bench.accepts_frames = True
     bench._partial = first.data
-    assert bench.take() == [messages.GeneralFeedback()]
+    assert bench.take() == [messages.FeedbackMessage()]
     assert (finished_early, device.done) == (False, True)
     assert device.deadline() is None
 

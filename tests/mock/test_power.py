@@ -55,7 +55,7 @@ def boots_only_what_is_whole(bench: Bench) -> bytes | None:
     return stored
 
 
-def upgrade_rows(bench: Bench) -> list[messages.Row]:
+def upgrade_rows(bench: Bench) -> list[messages.UpgradeMessage]:
     return [bench.update_row(len(NEW)), *packets_of(NEW), messages.EndOfTransfer()]
 
 
@@ -83,7 +83,7 @@ def run_until(bench: Bench, reached: Callable[[], bool]) -> None:
 def bench_with_old(profile: DeviceProfile = SMALL) -> Bench:
     bench = Bench(profile)
     bench.upgrade(OLD)
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     bench.run_to(State.ANNOUNCING)
     bench.take_sent()
     return bench
@@ -194,7 +194,7 @@ def test_what_was_being_sent_or_received_is_gone_with_the_power() -> None:
     bench = Bench(SMALL)
     device = bench.device
     bench.accepts_frames = False
-    bench.send(messages.Reset())
+    bench.send(messages.ResetCommand())
     assert device.next_frame(bench.now) is not None
     device.power_cut(bench.now)
     device.frame_sent(bench.now)
@@ -206,7 +206,7 @@ def test_without_power_nothing_is_heard_and_nothing_is_said() -> None:
     bench = Bench(SMALL)
     bench.device.power_cut(bench.now)
     bench.device.power_cut(bench.now)
-    bench.send(messages.Reset(), READ_VERSION)
+    bench.send(messages.ResetCommand(), READ_VERSION)
     bench.run(10.0)
     assert bench.take() == []
     assert bench.device.state is State.OFF

@@ -374,7 +374,7 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         (
             (0x720, 0x1010),
             contents.RunningInformation(
-                41250, -1234, 9000, 10000, 25, 90, contents.Status.CHARGER_CONNECTED, 99
+                41250, -1234, 9000, 10000, 25, 90, contents.BatteryStatus.CHARGER_CONNECTED, 99
             ),
             (
                 "running information: 41.250 V, -1.234 A, 9000 of 10000 mAh, 25 C, 90 %, "
@@ -391,10 +391,10 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         (
             (0x720, 0x1204),
             contents.Faults(
-                contents.Fault.CHARGE_OVER_VOLTAGE_WARNING
-                | contents.Fault.MOS_OVER_TEMPERATURE_WARNING
-                | contents.Fault.SHORT_CIRCUIT_PROTECTION
-                | contents.Fault.MCU_FAULT
+                contents.BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
+                | contents.BatteryFault.MOS_OVER_TEMPERATURE_WARNING
+                | contents.BatteryFault.SHORT_CIRCUIT_PROTECTION
+                | contents.BatteryFault.MCU_FAULT
             ),
             (
                 "faults: charge over-voltage warning, MOS over-temperature warning, "

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS
-from flasher.protocol.contents import Fault, Status
+from flasher.protocol.contents import BatteryFault, BatteryStatus
 from flasher.protocol.fields import Content, WireText
 from tests.loops import each
 
@@ -38,25 +38,25 @@ EXAMPLES: Final[list[tuple[str, Content, bytes]]] = [
     (
         "running information, discharging at 20 A in the cold, charger connected",
         contents.RunningInformation(
-            36000, -20000, 5000, 10000, -5, 50, Status.CHARGER_CONNECTED, 97
+            36000, -20000, 5000, 10000, -5, 50, BatteryStatus.CHARGER_CONNECTED, 97
         ),
         wire("A0 8C", "E0 B1", "88 13", "10 27", "23", "32", "01", "61", "00 00 00 00"),
     ),
     (
         "running information, lowest values",
-        contents.RunningInformation(0, -32768, 0, 0, -40, 0, Status(0), 0),
+        contents.RunningInformation(0, -32768, 0, 0, -40, 0, BatteryStatus(0), 0),
         wire("00 00", "00 80", "00 00", "00 00", "00", "00", "00", "00", "00 00 00 00"),
     ),
     (
         "running information, highest values, reserved bits and bytes set",
         contents.RunningInformation(
-            65535, 32767, 65535, 65535, 215, 255, Status(0xFF), 255, b"\x01\x02\x03\x04"
+            65535, 32767, 65535, 65535, 215, 255, BatteryStatus(0xFF), 255, b"\x01\x02\x03\x04"
         ),
         wire("FF FF", "FF 7F", "FF FF", "FF FF", "FF", "FF", "FF", "FF", "01 02 03 04"),
     ),
     (
         "running information, one milliampere of discharge at 0 degrees",
-        contents.RunningInformation(1, -1, 256, 1, 0, 100, Status(0), 100),
+        contents.RunningInformation(1, -1, 256, 1, 0, 100, BatteryStatus(0), 100),
         wire("01 00", "FF FF", "00 01", "01 00", "28", "64", "00", "64", "00 00 00 00"),
     ),
     (
@@ -72,15 +72,15 @@ EXAMPLES: Final[list[tuple[str, Content, bytes]]] = [
         contents.CellVoltages((0,) * 15 + (65535,)),
         bytes(30) + wire("FF FF"),
     ),
-    ("no faults", contents.Faults(Fault(0)), wire("00 00 00 00")),
+    ("no faults", contents.Faults(BatteryFault(0)), wire("00 00 00 00")),
     (
         "the lowest fault of each half",
         contents.Faults(
-            Fault.SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION | Fault.CHARGE_OVER_VOLTAGE_WARNING
+            BatteryFault.SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION | BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
         ),
         wire("01 00 01 00"),
     ),
-    ("faults with all bits set", contents.Faults(Fault(0xFFFFFFFF)), wire("FF FF FF FF")),
+    ("faults with all bits set", contents.Faults(BatteryFault(0xFFFFFFFF)), wire("FF FF FF FF")),
     (
         "design information",
         contents.DesignInformation(14000, 48, WireText(b"INR18. \x20")),
@@ -371,18 +371,18 @@ def shown_faults(data: bytes) -> str:
 def test_a_warning_is_the_bit_of_the_upper_half(bits: int, name: str) -> None:
     data = b"\x00\x00" + half(bits)
     assert shown_faults(data) == name
-    assert contents.Faults(Fault[name.upper().replace(" ", "_")]).data() == data
+    assert contents.Faults(BatteryFault[name.upper().replace(" ", "_")]).data() == data
 
 
 @each("bits, name", LOWER_HALF)
 def test_a_protection_or_defect_is_the_bit_of_the_lower_half(bits: int, name: str) -> None:
     data = half(bits) + b"\x00\x00"
     assert shown_faults(data) == name
-    assert contents.Faults(Fault[name.upper().replace(" ", "_")]).data() == data
+    assert contents.Faults(BatteryFault[name.upper().replace(" ", "_")]).data() == data
 
 
 def test_no_other_bit_has_a_name() -> None:
-    assert len(Fault) == len(UPPER_HALF) + len(LOWER_HALF) == 25
+    assert len(BatteryFault) == len(UPPER_HALF) + len(LOWER_HALF) == 25
 
 
 @each("bit", range(25, 32))

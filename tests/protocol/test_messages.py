@@ -12,15 +12,15 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    FeedbackMessage,
     Malformed,
     Nak,
     Packet,
     RequestTransfer,
-    Reset,
-    Row,
+    ResetCommand,
     Unknown,
     UpdateCommand,
+    UpgradeMessage,
     decode,
 )
 from flasher.protocol.wire import Message, encode
@@ -31,9 +31,9 @@ from .cases import CASES
 _PAYLOAD: Final = bytes(range(128))
 
 # The typed form, its CAN id, and the message typed from the tables: mode, command, data.
-_ROWS: Final[list[tuple[Row, int, str]]] = [
-    (Reset(), 0x751, "16 4205 52 45 53 45 54"),
-    (GeneralFeedback(), 0x715, "0C 5503 41 43 4B"),
+_ROWS: Final[list[tuple[UpgradeMessage, int, str]]] = [
+    (ResetCommand(), 0x751, "16 4205 52 45 53 45 54"),
+    (FeedbackMessage(), 0x715, "0C 5503 41 43 4B"),
     (BootVersion("WMC", "V1.2.3"), 0x715, "0C C109 57 4D 43 56 31 2E 32 2E 33"),
     (BootVersion("BMS", "V1.2.3"), 0x725, "0C C109 42 4D 53 56 31 2E 32 2E 33"),
     (BootVersion("PBU", "V1.2.3"), 0x735, "0C C109 50 42 55 56 31 2E 32 2E 33"),
@@ -65,20 +65,22 @@ every_row = each("row, can_id, text", _ROWS)
 
 
 @every_row
-def test_a_row_becomes_the_documents_bytes(row: Row, can_id: int, text: str) -> None:
+def test_a_row_becomes_the_documents_bytes(row: UpgradeMessage, can_id: int, text: str) -> None:
     message = row.to_message(can_id)
     assert message == _message(can_id, text)
     assert encode(message)[2:3] == bytes.fromhex(text)[:1]
 
 
 @every_row
-def test_the_documents_bytes_become_the_row(row: Row, can_id: int, text: str) -> None:
+def test_the_documents_bytes_become_the_row(row: UpgradeMessage, can_id: int, text: str) -> None:
     assert decode(_message(can_id, text)) == row
 
 
 @every_row
 @each("mode", [0x00, 0x0C, 0x11, 0x16, 0xFF])
-def test_a_row_in_another_mode_is_malformed(row: Row, can_id: int, text: str, mode: int) -> None:
+def test_a_row_in_another_mode_is_malformed(
+    row: UpgradeMessage, can_id: int, text: str, mode: int
+) -> None:
     message = _message(can_id, text)
     if mode == message.mode:
         assert decode(message) == row
@@ -93,7 +95,7 @@ _CONSTANT: Final = [entry for entry in _ROWS if not vars(entry[0]) and entry[2][
 
 
 @each("row, can_id, text", _CONSTANT)
-def test_no_byte_of_a_constant_row_may_differ(row: Row, can_id: int, text: str) -> None:
+def test_no_byte_of_a_constant_row_may_differ(row: UpgradeMessage, can_id: int, text: str) -> None:
     message = _message(can_id, text)
     assert decode(message) == row
     for position in range(len(message.data)):

@@ -74,7 +74,7 @@ class TwoRestarts(MockDevice):
     def receive(self, frame: Frame, now: float) -> None:
         if self.state is State.RESTARTING and frame.can_id == self.target.request_id:
             for found in self._meanwhile.feed(frame.data, now):
-                if isinstance(found, Message) and messages.decode(found) == messages.Reset():
+                if isinstance(found, Message) and messages.decode(found) == messages.ResetCommand():
                     self._waiting_reset = True
         super().receive(frame, now)
 
@@ -117,7 +117,7 @@ class ResetByAnyText(MockDevice):
     """Takes a reset with a wrong text."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        super()._take_row(messages.Reset() if bad_write(row, Command.RESET) else row, now)
+        super()._take_row(messages.ResetCommand() if bad_write(row, Command.RESET) else row, now)
 
 
 @variant("resets-on-read", "RS-04")
@@ -126,8 +126,11 @@ class ResetByRead(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = row.message if isinstance(row, messages.Malformed) else None
-        if message and (message.command, message.data) == (Command.RESET, messages.Reset.DATA):
-            row = messages.Reset()
+        if message and (message.command, message.data) == (
+            Command.RESET,
+            messages.ResetCommand.DATA,
+        ):
+            row = messages.ResetCommand()
         super()._take_row(row, now)
 
 
@@ -255,8 +258,8 @@ class ResetTextOfFour(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = bad_write(row, Command.RESET)
-        if message and message.data.startswith(messages.Reset.DATA[:_POINTER_BYTES]):
-            row = messages.Reset()
+        if message and message.data.startswith(messages.ResetCommand.DATA[:_POINTER_BYTES]):
+            row = messages.ResetCommand()
         super()._take_row(row, now)
 
 
@@ -278,7 +281,7 @@ class ResetFromAnyNode(MockDevice):
     """
 
     def _take_message(self, message: Message, now: float) -> None:
-        if messages.decode(message) == messages.Reset():
+        if messages.decode(message) == messages.ResetCommand():
             message = message._replace(can_id=self.target.request_id)
         super()._take_message(message, now)
 
@@ -312,7 +315,7 @@ class FeedbackAfterVersion(MockDevice):
         detail = super()._announce(now)
         if self._owes_feedback:
             self._owes_feedback = False
-            self._send(messages.GeneralFeedback())
+            self._send(messages.FeedbackMessage())
         return detail
 
 
@@ -370,7 +373,7 @@ class ResetWhileErasingHangs(HangingDevice):
     """Hangs at a reset while it erases until power is cut."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Reset) and self.state is State.ERASING:
+        if isinstance(row, messages.ResetCommand) and self.state is State.ERASING:
             self._hang()
         else:
             super()._take_row(row, now)

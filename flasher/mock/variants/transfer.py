@@ -201,7 +201,7 @@ class ResetHangs(HangingDevice):
     """Hangs at a reset during the upgrade until power is cut."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Reset) and self.state in _UPGRADING:
+        if isinstance(row, messages.ResetCommand) and self.state in _UPGRADING:
             self._hang()
         else:
             super()._take_row(row, now)
@@ -211,9 +211,9 @@ class ResetHangs(HangingDevice):
 class BigEndianNumbers(MockDevice):
     """Sends the numbers of ACK and NAK high byte first (against R4)."""
 
-    big_endian: ClassVar[tuple[type[messages.Row], ...]] = (messages.Ack, messages.Nak)
+    big_endian: ClassVar[tuple[type[messages.UpgradeMessage], ...]] = (messages.Ack, messages.Nak)
 
-    def _send(self, row: messages.Row) -> None:
+    def _send(self, row: messages.UpgradeMessage) -> None:
         if isinstance(row, messages.Ack | messages.Nak) and isinstance(row, self.big_endian):
             swapped = int.from_bytes(row.number.to_bytes(2, "big"), "little")
             row = dataclasses.replace(row, number=swapped)
