@@ -52,7 +52,7 @@ from flasher.host.verify import (
 from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
-from flasher.image.sample import is_sample, refused_sample
+from flasher.image.sample import is_sample, sample_error
 from flasher.log import log_event
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
@@ -622,7 +622,7 @@ def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:
 def check_sample(image: Image, link: Link) -> None:
     """Raise ImageError for a firmware sample that would go out on a physical adapter."""
     if is_sample(image) and link.is_physical:
-        raise refused_sample(image, str(link))
+        raise sample_error(image, str(link))
 
 
 def _may_end(session: Session) -> Callable[[], bool]:

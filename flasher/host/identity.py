@@ -18,7 +18,7 @@ from flasher.host.options import firmware_version
 from flasher.host.table import Ending
 from flasher.i18n import text
 from flasher.image.image import Image
-from flasher.image.plausible import Cpu, doubt
+from flasher.image.plausible import Cpu, find_doubt
 from flasher.image.release import Release, target_problem
 from flasher.protocol.contents import RunningInformation
 from flasher.protocol.fields import Content
@@ -207,7 +207,7 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
     """Whether the bytes can be a program for the device; nothing where they look like one."""
-    found = doubt(image)
+    found = find_doubt(image)
     if found is None:
         return
     text = f"the image {found.text}"

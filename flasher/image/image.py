@@ -16,7 +16,7 @@ ADDRESS_SPACE: Final = 1 << 32
 
 
 @dataclass(frozen=True)
-class Span:
+class AddressSpan:
     """A stretch of addresses without gaps; `end` is one past the last."""
 
     start: int
@@ -43,7 +43,7 @@ class Image:
     """The format that the file was read as, in words: "Intel HEX", "raw binary", ..."""
     source: str
     """File name as given, for messages."""
-    segments: tuple[Span, ...]
+    segments: tuple[AddressSpan, ...]
     """Where the file has bytes; offsets instead of addresses when `base` is None."""
     filled_bytes: int
     """How many bytes of `data` are filler and not from the file."""
@@ -60,7 +60,7 @@ class Image:
             base=base,
             format="raw binary",
             source=source,
-            segments=(Span(base or 0, len(data)),),
+            segments=(AddressSpan(base or 0, len(data)),),
             filled_bytes=0,
             version=find_firmware_version(data),
         )

@@ -21,7 +21,7 @@ from flasher.image import elf
 from flasher.image.cortexm import check_starts_inside
 from flasher.image.image import ADDRESS_SPACE, Image
 from flasher.image.records import read_hex, read_srec
-from flasher.image.segments import SparseBytes, too_large
+from flasher.image.segments import SparseBytes, too_large_error
 from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version, printable
 
@@ -183,7 +183,7 @@ def _binary(
     low, high = window or (start, end)
     low, high = max(low, start), min(high, end)
     if high - low > IMAGE_MAX_SIZE:
-        raise too_large(source, high - low)
+        raise too_large_error(source, high - low)
     if end > ADDRESS_SPACE:
         raise UsageError(f"{source} does not end below 4 GiB with the base 0x{start:08X}")
     if size_bytes:

@@ -13,7 +13,7 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.image.image import Image
-from flasher.image.segments import empty, too_large
+from flasher.image.segments import empty_error, too_large_error
 from flasher.protocol.bittime import message_bits, stream_bits
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
@@ -127,9 +127,9 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
     if bitrate_bps <= 0:
         raise UsageError(f"{bitrate_bps} bit/s is no bit rate")
     if not image.size_bytes:
-        raise empty(image.source)
+        raise empty_error(image.source)
     if image.size_bytes > IMAGE_MAX_SIZE:
-        raise too_large(image.source, image.size_bytes)
+        raise too_large_error(image.source, image.size_bytes)
     total = packet_count(image.size_bytes)
     packet_bits = _packet_bits(image.data, total, target.request_id)
     acks = _Traffic()

@@ -82,7 +82,7 @@ class Doubt(NamedTuple):
         return "" if self.is_certain else _OTHER_WAYS
 
 
-def doubt(image: Image) -> Doubt | None:
+def find_doubt(image: Image) -> Doubt | None:
     """What speaks against an image being a program for the device; None when nothing does."""
     foreign = _foreign(image)
     if foreign is not None:
@@ -98,7 +98,7 @@ def doubt(image: Image) -> Doubt | None:
 
 def check_plausible(image: Image) -> None:
     """Raise ImageError when there is a doubt, for commands that know no manifest or profile."""
-    found = doubt(image)
+    found = find_doubt(image)
     if found is not None:
         raise ImageError(
             f"{image.source} {found.text}: not plausible as firmware.",

@@ -21,7 +21,7 @@ from zlib import crc32
 
 from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
-from flasher.image.segments import PIECES_MAX, SparseBytes, scattered
+from flasher.image.segments import PIECES_MAX, SparseBytes, scattered_error
 
 LINES_MAX: Final = 1_100_000
 """The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
@@ -176,7 +176,7 @@ class _Reading:
             return
         self._loads_left -= 1
         if self._loads_left < 0:
-            raise scattered(self._into.source)
+            raise scattered_error(self._into.source)
         sources = [source for _, source in ascending]
         loaded = self._loaded(sources)
         if _digest(loaded) != _digest(checked):

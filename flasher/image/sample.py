@@ -25,7 +25,7 @@ def is_sample(image: Image) -> bool:
     return MARK in image.data or _MARK_IN_RECORDS in image.data.lower()
 
 
-def refused_sample(image: Image, adapter: str) -> ImageError:
+def sample_error(image: Image, adapter: str) -> ImageError:
     """The error for a sample that was to be sent through a physical adapter. Nothing waives it."""
     return ImageError(
         text("{image} is a firmware sample: no device can run it.", image=image.source),

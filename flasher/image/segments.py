@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 from flasher.errors import ErrorCode, ImageError
-from flasher.image.image import Span
+from flasher.image.image import AddressSpan
 from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_COUNT_MAX, PACKET_FILLER
 
 PIECES_MAX: Final = 32_768
@@ -76,14 +76,14 @@ class SparseBytes:
         low, high = self._seen or (start, end)
         self._seen = min(low, start), max(high, end)
 
-    def spans(self) -> tuple[Span, ...]:
+    def spans(self) -> tuple[AddressSpan, ...]:
         """Where there are bytes, ascending, neighbours joined."""
-        spans: list[Span] = []
+        spans: list[AddressSpan] = []
         for start, piece in zip(self._starts, self._pieces, strict=True):
             if spans and spans[-1].end == start:
-                spans[-1] = Span(spans[-1].start, spans[-1].size_bytes + len(piece))
+                spans[-1] = AddressSpan(spans[-1].start, spans[-1].size_bytes + len(piece))
             else:
-                spans.append(Span(start, len(piece)))
+                spans.append(AddressSpan(start, len(piece)))
         return tuple(spans)
 
     def join(self, fill_gaps_up_to: int) -> tuple[bytes, int]:
@@ -103,7 +103,7 @@ class SparseBytes:
                 raise self._gap(end, span.start, spans)
             end = span.end
         if end - first > IMAGE_MAX_SIZE:
-            raise too_large(self.source, end - first)
+            raise too_large_error(self.source, end - first)
         parts: list[bytes | bytearray] = []
         end = first
         for start, piece in zip(self._starts, self._pieces, strict=True):
@@ -118,12 +118,12 @@ class SparseBytes:
         """Put `data` before piece `index`, or on the end of the one before; where to go on."""
         self.size_bytes += len(data)
         if self.size_bytes > IMAGE_MAX_SIZE:
-            raise too_large(self.source, self.size_bytes, more=True)
+            raise too_large_error(self.source, self.size_bytes, more=True)
         if index and self._end(index - 1) == start:
             self._pieces[index - 1] += data
             return index
         if len(self._pieces) == PIECES_MAX:
-            raise scattered(self.source)
+            raise scattered_error(self.source)
         # A piece that ends where the next one starts is left apart: joining it would copy the next
         # one, again and again for a file in descending order.
         self._starts.insert(index, start)
@@ -148,7 +148,7 @@ class SparseBytes:
 
     def _empty(self) -> ImageError:
         if not (self._seen and self.window):
-            return empty(self.source)
+            return empty_error(self.source)
         start, end = self.window
         low, high = self._seen
         return ImageError(
@@ -158,7 +158,7 @@ class SparseBytes:
             code=ErrorCode.IMAGE_EMPTY,
         )
 
-    def _gap(self, start: int, end: int, spans: tuple[Span, ...]) -> ImageError:
+    def _gap(self, start: int, end: int, spans: tuple[AddressSpan, ...]) -> ImageError:
         named = ", ".join(str(span) for span in spans[:_NAMED_SPANS_MAX])
         if len(spans) > _NAMED_SPANS_MAX:
             named += f" and {len(spans) - _NAMED_SPANS_MAX} more"
@@ -174,7 +174,7 @@ class SparseBytes:
         )
 
 
-def empty(source: str) -> ImageError:
+def empty_error(source: str) -> ImageError:
     """The refusal of an image without bytes (R9)."""
     return ImageError(
         f"{source} is empty: it holds no bytes to send",
@@ -184,7 +184,7 @@ def empty(source: str) -> ImageError:
     )
 
 
-def scattered(source: str) -> ImageError:
+def scattered_error(source: str) -> ImageError:
     """The refusal of more pieces than any linker makes."""
     return ImageError(
         f"{source} holds more than {PIECES_MAX} separate pieces of data",
@@ -194,7 +194,7 @@ def scattered(source: str) -> ImageError:
     )
 
 
-def too_large(source: str, size_bytes: int, *, more: bool = False) -> ImageError:
+def too_large_error(source: str, size_bytes: int, *, more: bool = False) -> ImageError:
     """The refusal of more than 65535 packets (R9); `more`: the size is a lower bound."""
     return ImageError(
         f"{source} is too large: {'at least ' if more else ''}{size_bytes} bytes to send, "

@@ -22,7 +22,7 @@ from flasher.bus.detect import (
 from flasher.bus.inspect_interface import SYSFS
 from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, UsageError
-from flasher.image.sample import is_sample, refused_sample
+from flasher.image.sample import is_sample, sample_error
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
 from flasher.station.messages import VirtualUnits, WorkerSetup
@@ -102,7 +102,7 @@ def check_samples(sockets: Iterable[Resolved], recipe: LoadedRecipe) -> None:
         interface, channel = str(each.bus["interface"]), str(each.bus["channel"])
         if is_physical(interface, channel):
             socket = printable(f"socket {each.config.name}, {interface} {channel}")
-            raise refused_sample(samples[0], socket)
+            raise sample_error(samples[0], socket)
 
 
 def worker_setups(

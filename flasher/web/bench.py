@@ -26,7 +26,7 @@ from flasher.host.outcome import AGAIN
 from flasher.host.query import piece_of
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
-from flasher.image.sample import is_sample, refused_sample
+from flasher.image.sample import is_sample, sample_error
 from flasher.procedures import nobody_heard
 from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
@@ -412,7 +412,7 @@ class Bench:
         """Raises ImageError for a firmware sample on a real bus; the upgrade looks again."""
         adapter = self._adapter()
         if is_sample(image) and self._place.is_physical(adapter):
-            raise refused_sample(image, adapter.name)
+            raise sample_error(image, adapter.name)
 
     def _check_device(self, job: Job) -> None:
         """Raises WrongDeviceError for an image that does not belong into the device that answered;

@@ -15,7 +15,7 @@ import pytest
 from flasher.errors import ErrorCode, ExitCode, ImageError, UsageError
 from flasher.image import load as load_module
 from flasher.image import records
-from flasher.image.image import Image, Span
+from flasher.image.image import AddressSpan, Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, load
 from flasher.image.plausible import check_plausible
 from flasher.protocol.spec import IMAGE_MAX_SIZE
@@ -206,9 +206,9 @@ def test_a_forced_format_must_fit_the_content() -> None:
 
 def test_a_raw_binary_has_no_address_until_the_user_says_one() -> None:
     image = load(SAMPLES / "obc.bin")
-    assert (image.base, image.segments) == (None, (Span(0, 4000),))
+    assert (image.base, image.segments) == (None, (AddressSpan(0, 4000),))
     placed = load(SAMPLES / "obc.bin", base=0x0800_2000)
-    assert (placed.base, placed.segments) == (0x0800_2000, (Span(0x0800_2000, 4000),))
+    assert (placed.base, placed.segments) == (0x0800_2000, (AddressSpan(0x0800_2000, 4000),))
     assert placed.data == image.data == (SAMPLES / "obc.bin").read_bytes()
 
 
@@ -223,7 +223,7 @@ def test_a_range_of_a_raw_binary_can_be_chosen_when_it_has_a_base() -> None:
     assert (image.base, image.data) == (0x1100, whole[0x100:])
     image = load(SAMPLES / "obc.bin", base=0x1000, range_=(0x0FFE, 0x1004))
     assert (image.base, image.data, image.filled_bytes) == (0x0FFE, b"\xff\xff" + whole[:4], 2)
-    assert image.segments == (Span(0x1000, 4),)
+    assert image.segments == (AddressSpan(0x1000, 4),)
 
 
 def test_a_range_beside_a_raw_binary_is_refused() -> None:

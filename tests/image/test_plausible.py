@@ -11,7 +11,7 @@ import pytest
 from flasher.errors import ExitCode, ImageError
 from flasher.image.image import Image
 from flasher.image.load import load
-from flasher.image.plausible import check_plausible, doubt
+from flasher.image.plausible import check_plausible, find_doubt
 from tests.firmware import VECTORS
 from tests.loops import each
 
@@ -41,7 +41,7 @@ MARKED = [
 
 @each("data, words", MARKED)
 def test_another_kind_of_file_is_named_and_is_certain(data: bytes, words: str) -> None:
-    found = doubt(Image.from_bytes(data))
+    found = find_doubt(Image.from_bytes(data))
     assert found is not None
     assert found.is_certain
     assert found.ways == ""
@@ -53,18 +53,18 @@ def test_another_kind_of_file_is_named_and_is_certain(data: bytes, words: str) -
 
 def test_an_elf_of_another_machine_is_no_firmware_whatever_it_begins_with(tmp_path: Path) -> None:
     elf = bytearray((SAMPLES / "obc.elf").read_bytes())
-    assert doubt(load(SAMPLES / "obc.elf")) is None
+    assert find_doubt(load(SAMPLES / "obc.elf")) is None
     elf[18:20] = (243).to_bytes(2, "little")
     path = tmp_path / "riscv.elf"
     path.write_bytes(elf)
-    found = doubt(load(path))
+    found = find_doubt(load(path))
     assert found is not None
     assert found.text == "is a program for another processor (RISC-V)"
     assert found.is_certain
 
 
 def test_two_bytes_as_a_mark_of_utf_16_make_no_text() -> None:
-    found = doubt(Image.from_bytes(b"\xff\xfe" + random.Random(2).randbytes(500)))
+    found = find_doubt(Image.from_bytes(b"\xff\xfe" + random.Random(2).randbytes(500)))
     assert found is not None
     assert not found.is_certain, "an encrypted image may begin with any two bytes"
 
@@ -73,7 +73,7 @@ def test_no_random_bytes_begin_like_a_program() -> None:
     """One word alone would let one in fifty pass."""
     for seed in range(2000):
         data = random.Random(seed).randbytes(4096)
-        found = doubt(Image.from_bytes(data, base=None if seed % 2 else 0x0800_4000))
+        found = find_doubt(Image.from_bytes(data, base=None if seed % 2 else 0x0800_4000))
         assert found is not None
         assert not found.is_certain
         assert "cpu" in found.ways
@@ -82,11 +82,11 @@ def test_no_random_bytes_begin_like_a_program() -> None:
 @each("base", [None, 0x0800_4000])
 def test_a_vector_table_is_enough(base: int | None) -> None:
     program = VECTORS + random.Random(1).randbytes(4096)
-    assert doubt(Image.from_bytes(program, base=base)) is None
+    assert find_doubt(Image.from_bytes(program, base=base)) is None
 
 
 def test_seven_bytes_have_no_vector_table() -> None:
-    found = doubt(Image.from_bytes(VECTORS[:7]))
+    found = find_doubt(Image.from_bytes(VECTORS[:7]))
     assert found is not None
     assert "too short" in found.text
 
@@ -114,7 +114,7 @@ def test_every_good_sample_is_plausible(name: str) -> None:
 def test_what_is_certain_and_what_is_only_unlikely(
     data: bytes, text: str, *, is_certain: bool
 ) -> None:
-    found = doubt(Image.from_bytes(data))
+    found = find_doubt(Image.from_bytes(data))
     assert found is not None
     assert text in found.text
     assert found.is_certain is is_certain

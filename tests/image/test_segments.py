@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from flasher.errors import ImageError
 from flasher.image import segments
-from flasher.image.image import Span
+from flasher.image.image import AddressSpan
 from flasher.image.segments import SparseBytes
 from flasher.protocol.spec import IMAGE_MAX_SIZE
 
@@ -26,19 +26,19 @@ def sparse(*pieces: tuple[int, bytes], window: tuple[int, int] | None = None) ->
 
 def test_neighbours_in_any_order_are_one_span() -> None:
     result = sparse((8, b"cc"), (4, b"aabb"), (10, b"d"))
-    assert result.spans() == (Span(4, 7),)
+    assert result.spans() == (AddressSpan(4, 7),)
     assert result.join(0) == (b"aabbccd", 4)
 
 
 def test_neighbours_after_a_gap_are_joined_to_the_span_before_them() -> None:
     result = sparse((4, b"a"), (10, b"c"), (8, b"bb"))
-    assert result.spans() == (Span(4, 1), Span(8, 3))
+    assert result.spans() == (AddressSpan(4, 1), AddressSpan(8, 3))
 
 
 def test_a_gap_within_the_limit_is_filled_with_ff() -> None:
     result = sparse((4, b"a"), (8, b"b"))
     assert result.join(3) == (b"a\xff\xff\xffb", 4)
-    assert result.spans() == (Span(4, 1), Span(8, 1))
+    assert result.spans() == (AddressSpan(4, 1), AddressSpan(8, 1))
 
 
 def test_a_gap_beyond_the_limit_is_refused_with_the_segments_named() -> None:
@@ -120,10 +120,10 @@ def test_more_bytes_than_an_image_can_have_are_refused_when_they_come() -> None:
 
 def test_too_many_pieces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments, "PIECES_MAX", 3)
-    scattered = sparse((0, b"a"), (2, b"a"), (4, b"a"))
-    scattered.add(5, b"on the end of one", place)
+    scattered_error = sparse((0, b"a"), (2, b"a"), (4, b"a"))
+    scattered_error.add(5, b"on the end of one", place)
     with pytest.raises(ImageError, match="more than 3 separate pieces"):
-        scattered.add(50, b"a", place)
+        scattered_error.add(50, b"a", place)
 
 
 PIECES = st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=12)), max_size=12)
