@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 
-class State(Enum):
+class UpgradeState(Enum):
     """Where the host stands; the value is how the documentation names it."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
@@ -32,7 +32,7 @@ class State(Enum):
     DONE = "done"
 
 
-class Event(Enum):
+class UpgradeEvent(Enum):
     """What happened; the value is its name in diagrams."""
 
     __hash__ = object.__hash__
@@ -91,7 +91,7 @@ class Ending(Enum):
     CANCELLED = "cancelled"
 
 
-BEFORE_THE_START: Final = frozenset(
+ENDED_BEFORE_START: Final = frozenset(
     {
         Ending.IMPLAUSIBLE,
         Ending.NOT_FOR_DEVICE,
@@ -131,22 +131,22 @@ class Reason(Enum):
     QUERY_UNANSWERED = "query_unanswered"
 
 
-class Move(NamedTuple):
+class UpgradeTransition(NamedTuple):
     """What follows an event: the name of the action, and where it may lead."""
 
     action: str
-    leads_to: tuple[State | Ending, ...]
+    leads_to: tuple[UpgradeState | Ending, ...]
     """Beside the same state, to which every event may lead."""
 
 
-def _do(action: str, *leads_to: State | Ending) -> Move:
-    return Move(action, leads_to)
+def _do(action: str, *leads_to: UpgradeState | Ending) -> UpgradeTransition:
+    return UpgradeTransition(action, leads_to)
 
 
 IGNORED: Final = _do("ignore")
 REPORTED: Final = _do("report")
-_Row = dict[Event, Move]
-_S, _E, _X = State, Event, Ending
+_Row = dict[UpgradeEvent, UpgradeTransition]
+_S, _E, _X = UpgradeState, UpgradeEvent, Ending
 
 _OF_THE_DEVICE: Final = (
     _E.BOOT_VERSION, _E.REQUEST, _E.ACK, _E.NAK, _E.COMPLETE, _E.UNEXPECTED
@@ -177,7 +177,7 @@ _ANNOUNCED: Final = _do("take_boot_in_transfer", _S.WATCHING, _X.WRONG_DEVICE, _
 _END_REFUSED: Final = _do("take_end_nak", _S.ENDING, _X.REFUSED)
 _COMPLETED: Final = _do("complete", _X.COMPLETED, _X.BROKEN_PROTOCOL)
 
-TABLE: Final[Mapping[State, _Row]] = {
+TABLE: Final[Mapping[UpgradeState, _Row]] = {
     _S.RESETTING: _EVERYWHERE | {
         _E.FEEDBACK: _do("await_boot", _S.AWAITING_BOOT),
         _E.BOOT_VERSION: _TAKE_BOOT,
@@ -269,7 +269,7 @@ TABLE: Final[Mapping[State, _Row]] = {
     _S.DONE: {},
 }  # fmt: skip
 
-TIMERS: Final[Mapping[State, Event]] = {
+TIMERS: Final[Mapping[UpgradeState, UpgradeEvent]] = {
     _S.RESETTING: _E.RESET_UNANSWERED,
     _S.AWAITING_BOOT: _E.BOOT_MISSING,
     _S.WATCHING: _E.WATCHED,

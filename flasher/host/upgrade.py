@@ -24,7 +24,7 @@ from flasher.host.options import (
 )
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
 from flasher.host.runner import Came, Runner, Signal, Stage
-from flasher.host.table import TABLE, TIMERS, Ending, Event, Reason, State
+from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
 from flasher.host.twins import Twins
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
@@ -51,24 +51,24 @@ from flasher.protocol.wire import Damage, Message, encode, split
 Received = UpgradeMessage | Malformed | Unknown | Content | None
 """The message behind an event; None for a timer or the user's word."""
 
-_EVENTS: Final[dict[type, Event]] = {
-    Ack: Event.ACK,
-    Nak: Event.NAK,
-    BootVersion: Event.BOOT_VERSION,
-    RequestTransfer: Event.REQUEST,
-    Complete: Event.COMPLETE,
-    FeedbackMessage: Event.FEEDBACK,
+_EVENTS: Final[dict[type, UpgradeEvent]] = {
+    Ack: UpgradeEvent.ACK,
+    Nak: UpgradeEvent.NAK,
+    BootVersion: UpgradeEvent.BOOT_VERSION,
+    RequestTransfer: UpgradeEvent.REQUEST,
+    Complete: UpgradeEvent.COMPLETE,
+    FeedbackMessage: UpgradeEvent.FEEDBACK,
 }
 """The events of messages; all others are unexpected."""
 _PHASES: Final = {
-    State.RESETTING: Phase.RESET,
-    State.AWAITING_BOOT: Phase.BOOT,
-    State.WATCHING: Phase.BOOT,
-    State.AWAITING_REQUEST: Phase.UPDATE,
-    State.TRANSFERRING: Phase.TRANSFER,
-    State.SETTLING: Phase.TRANSFER,
-    State.ENDING: Phase.END,
-    State.CONFIRMING: Phase.CONFIRM,
+    UpgradeState.RESETTING: Phase.RESET,
+    UpgradeState.AWAITING_BOOT: Phase.BOOT,
+    UpgradeState.WATCHING: Phase.BOOT,
+    UpgradeState.AWAITING_REQUEST: Phase.UPDATE,
+    UpgradeState.TRANSFERRING: Phase.TRANSFER,
+    UpgradeState.SETTLING: Phase.TRANSFER,
+    UpgradeState.ENDING: Phase.END,
+    UpgradeState.CONFIRMING: Phase.CONFIRM,
 }
 """Phases that people are told, by state; the other states leave the phase as it is."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
@@ -155,7 +155,7 @@ class UpgradeStage:
         self.unchecked: CheckResult | None = None
         """A rule that the silent device could not be asked for. It refuses the device unless that
         turns out to sit in a session, and so to have no application."""
-        self.state = State.RESETTING
+        self.state = UpgradeState.RESETTING
         """The row of the table that is in force."""
         self._state_since = 0.0
         self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
@@ -221,7 +221,7 @@ class UpgradeStage:
     @property
     def has_begun_to_erase(self) -> bool:
         """True once an update command is sent, or being sent."""
-        is_leaving = self.state is State.AWAITING_REQUEST and self._tx.begun
+        is_leaving = self.state is UpgradeState.AWAITING_REQUEST and self._tx.begun
         return self._was_told_to_update or is_leaving
 
     @property
@@ -262,7 +262,7 @@ class UpgradeStage:
     @property
     def is_yielding(self) -> bool:
         """True while another tool is waited for to be silent."""
-        return self.state is State.YIELDING
+        return self.state is UpgradeState.YIELDING
 
     @property
     def _is_last_attempt(self) -> bool:
@@ -300,16 +300,16 @@ class UpgradeStage:
         self._run.listen_always(self._plan.target.answer_id)
         self._asks_for_power = self._options.at_power_up and not self.in_session
         is_awaited = self._asks_for_power or self.heard is not None
-        self.state = State.AWAITING_BOOT if is_awaited else State.RESETTING
+        self.state = UpgradeState.AWAITING_BOOT if is_awaited else UpgradeState.RESETTING
         self._phase = _PHASES[self.state]
         self._run.tell(events.PhaseEntered(self._phase, self._attempt))
-        if self.state is State.RESETTING:
+        if self.state is UpgradeState.RESETTING:
             self._send_reset()
         else:
             self._wait_for_boot()
         if self.heard is not None:
             self._take(self.heard)
-        if self.state is State.WATCHING and not self._options.at_power_up:
+        if self.state is UpgradeState.WATCHING and not self._options.at_power_up:
             # A bootloader does not know the reset (R18), but another device's application does.
             self._send_reset()
         while self._outcome is None:
@@ -319,12 +319,12 @@ class UpgradeStage:
             except LinkBack:
                 self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * WELL_BEYOND)
                 self._heard_at = self._run.now  # nobody knows what it said meanwhile
-                self._dispatch(Event.LINK_BACK)
+                self._dispatch(UpgradeEvent.LINK_BACK)
             except SecondTool as heard:
                 # Not one frame more is sent, not even the rest of a message.
                 self._tx.abandon(self._run.now)
                 self._second_tool = heard.seen
-                self._dispatch(Event.SECOND_TOOL)
+                self._dispatch(UpgradeEvent.SECOND_TOOL)
             else:
                 self._take(came)
         return self._outcome
@@ -339,12 +339,12 @@ class UpgradeStage:
             case Signal.LEFT:
                 self._message_left()
             case Signal.TIME if self._run.now >= self._deadline_at:
-                self._dispatch(Event.OUT_OF_TIME)
+                self._dispatch(UpgradeEvent.OUT_OF_TIME)
             case Signal.TIME:
                 self._timer_at = inf
                 self._dispatch(TIMERS[self.state])
             case Signal.CANCEL:
-                self._dispatch(Event.CANCEL)
+                self._dispatch(UpgradeEvent.CANCEL)
             case Damage():
                 self._run.tell_damage(came)
             case Message():
@@ -353,21 +353,21 @@ class UpgradeStage:
     def _message(self, message: Message) -> None:
         self._heard_at = self._run.now
         if self._twins.evidence and not self.is_yielding:
-            self._dispatch(Event.TWO_DEVICES)
+            self._dispatch(UpgradeEvent.TWO_DEVICES)
             return
         item = self._version_item
         if item is not None and message[:3] == (item.can_id, item.mode, item.command):
-            self._dispatch(Event.VERSION, item.content.from_data(message.data))
+            self._dispatch(UpgradeEvent.VERSION, item.content.from_data(message.data))
             return
         row = decode(message)
-        event = _EVENTS.get(type(row), Event.UNEXPECTED)
-        if event is Event.FEEDBACK:
+        event = _EVENTS.get(type(row), UpgradeEvent.UNEXPECTED)
+        if event is UpgradeEvent.FEEDBACK:
             self._at.feedback_came, self.in_session = True, False
-        elif event is Event.NAK:
+        elif event is UpgradeEvent.NAK:
             self._naks += 1
         self._dispatch(event, row)
 
-    def _dispatch(self, event: Event, row: Received = None) -> None:
+    def _dispatch(self, event: UpgradeEvent, row: Received = None) -> None:
         if self._ending is not None:
             self._finish()
             return
@@ -381,10 +381,10 @@ class UpgradeStage:
             raise RuntimeError(f"{event} led from {before} to {led_to}")
 
     @property
-    def _led_to(self) -> State | Ending:
+    def _led_to(self) -> UpgradeState | Ending:
         return self.state if self._ending is None else self._ending[0]
 
-    def _go(self, state: State) -> None:
+    def _go(self, state: UpgradeState) -> None:
         """Another state begins, perhaps another phase with it."""
         if state is self.state:
             return
@@ -454,18 +454,21 @@ class UpgradeStage:
         """How long the answer to a message that has left is waited for in this state."""
         timings = self._timings
         match tag, self.state:
-            case _, State.WATCHING:
+            case _, UpgradeState.WATCHING:
                 self._at.watched_until = self._tx.left_at + timings.boot_watch_s
                 return timings.boot_watch_s
-            case Command.PACKET, State.TRANSFERRING:
+            case Command.PACKET, UpgradeState.TRANSFERRING:
                 return timings.ack_timeout_s
-            case Command.PACKET, State.SETTLING:
+            case Command.PACKET, UpgradeState.SETTLING:
                 return timings.quiet_after_repeat_s
-            case Command.UPDATE, State.AWAITING_REQUEST:
+            case Command.UPDATE, UpgradeState.AWAITING_REQUEST:
                 return timings.request_transfer_timeout_s
-            case Command.END_OF_TRANSFER, State.ENDING if self._at.announced_at is None:
+            case Command.END_OF_TRANSFER, UpgradeState.ENDING if self._at.announced_at is None:
                 return timings.complete_timeout_s
-            case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
+            case (Command.RESET, UpgradeState.RESETTING) | (
+                Command.READ_VERSION,
+                UpgradeState.CONFIRMING,
+            ):
                 return timings.command_repeat_s
         return None
 
@@ -474,7 +477,7 @@ class UpgradeStage:
     def _ignore(self, row: Received) -> None:
         pass
 
-    def _report(self, row: Received, what: str = Event.UNEXPECTED.value) -> None:
+    def _report(self, row: Received, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
         """Tell of something that came where it has no place."""
         match row:
             case Malformed(message, problem):
@@ -501,11 +504,11 @@ class UpgradeStage:
 
     def _begin_again(self, row: Received, reason: Reason = Reason.LINK_BACK) -> None:
         """Another attempt, from the reset on."""
-        if self.state is State.RESETTING and self.goes_on:
+        if self.state is UpgradeState.RESETTING and self.goes_on:
             self._send_reset()  # nothing was begun in this attempt
             return
         self._next_attempt(reason)
-        self._go(State.RESETTING)
+        self._go(UpgradeState.RESETTING)
         self._send_reset()
 
     def _start_over(self, row: Received, reason: Reason) -> None:
@@ -514,7 +517,7 @@ class UpgradeStage:
         if isinstance(row, BootVersion):
             self._note_boot(row)
         if row is None:
-            self._go(State.AWAITING_REQUEST)
+            self._go(UpgradeState.AWAITING_REQUEST)
             self._send_update()
         else:
             self._watch()
@@ -544,7 +547,7 @@ class UpgradeStage:
             self._send_reset()
 
     def _await_boot(self, row: Received) -> None:
-        self._go(State.AWAITING_BOOT)
+        self._go(UpgradeState.AWAITING_BOOT)
         self._wait_for_boot()
 
     def _wait_for_boot(self) -> None:
@@ -583,7 +586,7 @@ class UpgradeStage:
         answered the reset, by the announcements that follow.
         """
         now, timings, at = self._run.now, self._timings, self._at
-        self._go(State.WATCHING)
+        self._go(UpgradeState.WATCHING)
         self._tx.drop_unstarted()
         wait_s = timings.boot_version_timeout_s if self._twins.is_beside else timings.boot_watch_s
         at.watched_since, at.watched_until = now, now + wait_s
@@ -621,10 +624,10 @@ class UpgradeStage:
         if self._twins.is_beside and has_ended and not at.was_reset_again:
             # The announcements have ended, and an application is there: it is reset.
             at.was_reset_again = True
-            self._go(State.RESETTING)
+            self._go(UpgradeState.RESETTING)
             self._send_reset()
         else:
-            self._go(State.AWAITING_REQUEST)
+            self._go(UpgradeState.AWAITING_REQUEST)
             self._send_update()
 
     def _is_foreign(self, boot: BootVersion) -> bool:
@@ -718,7 +721,7 @@ class UpgradeStage:
         if self._at.first_update_left_at is None:
             self._report(row)  # it answers another update command: a late copy
             return
-        self._go(State.TRANSFERRING)
+        self._go(UpgradeState.TRANSFERRING)
         self._tx.drop_unstarted()
         minimum = self._options.minimum_boot_version
         if minimum is not None and not self._has_begun:
@@ -755,7 +758,7 @@ class UpgradeStage:
             not at.copies_unanswered and not (accepts and first_copy_is_out)
         )
         if is_stale:
-            if self.state is State.SETTLING:
+            if self.state is UpgradeState.SETTLING:
                 self._await_quiet(answer)
             return
         at.copies_unanswered = max(0, at.copies_unanswered - 1)
@@ -775,11 +778,11 @@ class UpgradeStage:
         self._tx.all_left(self._run.now)
         self._run.tell(events.PacketAcknowledged(at.packet, total, at.tries))
         if at.packet < total:
-            self._go(State.TRANSFERRING)
+            self._go(UpgradeState.TRANSFERRING)
             self._next_packet(at.packet + 1)
             return
         self._transfer_s = self._run.now - at.request_at
-        self._go(State.ENDING)
+        self._go(UpgradeState.ENDING)
         at.end_tries += 1
         self._send(EndOfTransfer(), self._after_packet_gap())
 
@@ -792,7 +795,7 @@ class UpgradeStage:
         if self._is_last_try:
             self._packet_lost(row)
             return
-        self._go(State.TRANSFERRING)
+        self._go(UpgradeState.TRANSFERRING)
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
 
@@ -804,7 +807,7 @@ class UpgradeStage:
         self._repeated(f"packet {self._at.packet}", Reason.LINK_BACK, self._at.tries)
 
     def _await_quiet(self, row: Received) -> None:
-        self._go(State.SETTLING)
+        self._go(UpgradeState.SETTLING)
         # While a copy is still leaving, the time starts when it has (see _message_left).
         if self._tx.idle:
             quiet_s = self._timings.quiet_after_repeat_s
@@ -818,7 +821,7 @@ class UpgradeStage:
             self._await_quiet(row)
         elif self._is_last_try:
             self._packet_lost(row)
-        elif self.state is State.SETTLING:
+        elif self.state is UpgradeState.SETTLING:
             self._await_quiet(row)
         else:
             self._repeat_packet(row, Reason.REQUEST_AGAIN)
@@ -844,7 +847,7 @@ class UpgradeStage:
             self._end(Ending.REFUSED, nak)
             return
         self._run.listen()
-        self._go(State.ENDING)
+        self._go(UpgradeState.ENDING)
         self._repeat_end(Reason.END_REFUSED)
 
     def _repeat_end(self, reason: Reason) -> None:
@@ -863,7 +866,7 @@ class UpgradeStage:
         elif self._version_item is None:
             self._end(Ending.UNCONFIRMED, row)
         else:
-            self._go(State.CONFIRMING)
+            self._go(UpgradeState.CONFIRMING)
             self._run.listen(self._version_item.can_id)
             self._query_version(row)
 
@@ -887,7 +890,7 @@ class UpgradeStage:
         if now - at.announced_at >= self._timings.announcing_on_s:
             self._run.listen()
             self._restarted(boot, Reason.RESTARTED)
-        elif self.state is State.ENDING:
+        elif self.state is UpgradeState.ENDING:
             self._tx.drop_unstarted()
             self._timer_at = now + self._burst_s
             self._report(boot, "boot version after end of transfer")
@@ -931,7 +934,7 @@ class UpgradeStage:
             return
         if not self.is_yielding:
             self._run.tell(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
-        self._go(State.YIELDING)
+        self._go(UpgradeState.YIELDING)
         self._yield_on(row)
 
     def _yield_on(self, row: Received) -> None:
@@ -973,7 +976,7 @@ class UpgradeStage:
         elif ending is Ending.PACKET_FAILED and self._phase is not Phase.TRANSFER:
             detail = "and no boot version came after it"
         self._ending = (ending, detail)
-        self.state = State.STOPPING
+        self.state = UpgradeState.STOPPING
         self._tx.drop_unstarted()
         self._tx.hurry()
         if self._tx.idle:
@@ -983,7 +986,7 @@ class UpgradeStage:
         if self._ending is None:
             raise RuntimeError("stopping without an ending")
         ending, detail = self._ending
-        self.state = State.DONE
+        self.state = UpgradeState.DONE
         phase, packet, boot = self._phase, self._packet, self._last_boot
         if ending is Ending.PACKET_FAILED and packet is None:
             # It failed in an earlier attempt, and the device did not come back for this one.
@@ -1031,7 +1034,7 @@ class Upgrade(Runner[Outcome]):
         return self.result
 
     @property
-    def state(self) -> State:
+    def state(self) -> UpgradeState:
         """The row of the table that is in force."""
         return self._upgrade.state
 

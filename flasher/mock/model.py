@@ -24,7 +24,7 @@ from flasher.mock.machine import Machine
 from flasher.mock.memory import FlashController, Operation
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import ApplicationStore, MemoryMap, checksum_fits, factory_image
-from flasher.mock.table import TABLE, Event, State
+from flasher.mock.table import TABLE, BootloaderEvent, BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.spec import (
     BOOT_VERSION_BURST,
@@ -51,21 +51,23 @@ NO_VERSION: Final = "unknown"
 AnyRow = messages.UpgradeMessage | messages.Malformed | messages.Unknown
 """A message as the bootloader takes it."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
-_DEAF: Final = frozenset((State.OFF, State.RESTARTING))
-_WORKS_ON_FLASH: Final = frozenset((State.ERASING, State.PROGRAMMING, State.CHECKING))
+_DEAF: Final = frozenset((BootloaderState.OFF, BootloaderState.RESTARTING))
+_WORKS_ON_FLASH: Final = frozenset(
+    (BootloaderState.ERASING, BootloaderState.PROGRAMMING, BootloaderState.CHECKING)
+)
 _UNTOLD: Final = (
-    (State.TRANSFER, State.PROGRAMMING),
-    (State.PROGRAMMING, State.TRANSFER),
+    (BootloaderState.TRANSFER, BootloaderState.PROGRAMMING),
+    (BootloaderState.PROGRAMMING, BootloaderState.TRANSFER),
 )
 """Changes of state that happen with every packet."""
-_DURING_END: Final = frozenset((State.CHECKING, State.STARTING))
-_AFTER_END: Final = _DURING_END | {State.REFUSED}
-_WAITS_FOR_UPDATE: Final = frozenset((State.ANNOUNCING, State.REFUSED))
+_DURING_END: Final = frozenset((BootloaderState.CHECKING, BootloaderState.STARTING))
+_AFTER_END: Final = _DURING_END | {BootloaderState.REFUSED}
+_WAITS_FOR_UPDATE: Final = frozenset((BootloaderState.ANNOUNCING, BootloaderState.REFUSED))
 _TIMER_EVENTS: Final = {
-    State.RESTARTING: Event.RESTART_DUE,
-    State.TRANSFER: Event.PAUSE_OVER,
-    State.REFUSED: Event.HOLD_OVER,
-    **dict.fromkeys(_WORKS_ON_FLASH, Event.FLASH_DONE),
+    BootloaderState.RESTARTING: BootloaderEvent.RESTART_DUE,
+    BootloaderState.TRANSFER: BootloaderEvent.PAUSE_OVER,
+    BootloaderState.REFUSED: BootloaderEvent.HOLD_OVER,
+    **dict.fromkeys(_WORKS_ON_FLASH, BootloaderEvent.FLASH_DONE),
 }
 """What the timer of a state means when it expires; in the others it depends."""
 _UPGRADE: Final = frozenset((Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER))
@@ -141,7 +143,7 @@ class MockDevice(Machine):
             bitrate_bps=bitrate_bps,
             timings=timings,
         )
-        self.state = State.APPLICATION if has_application else State.ANNOUNCING
+        self.state = BootloaderState.APPLICATION if has_application else BootloaderState.ANNOUNCING
         self._controller = FlashController(
             self.store.flash,
             erase_time_s=profile.erase_time_s,
@@ -204,15 +206,15 @@ class MockDevice(Machine):
 
     @property
     def has_power(self) -> bool:
-        return self.state is not State.OFF
+        return self.state is not BootloaderState.OFF
 
     def power_cut(self, now: float) -> None:
         """The power goes: all is lost but the flash, and an operation under way stays torn."""
-        self._handle(Event.POWER_CUT, now)
+        self._handle(BootloaderEvent.POWER_CUT, now)
 
     def power_on(self, now: float) -> None:
         """The power comes back; the device passes through its bootloader (R19)."""
-        self._handle(Event.POWER_ON, now)
+        self._handle(BootloaderEvent.POWER_ON, now)
         self._run_timer(now)
 
     # -- from messages and timers to events -------------------------------------------------------
@@ -223,7 +225,7 @@ class MockDevice(Machine):
         if message.can_id == self.target.request_id:
             self._take_row(messages.decode(message), now)
         else:
-            self._handle(Event.QUERY, now)
+            self._handle(BootloaderEvent.QUERY, now)
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet):
@@ -237,67 +239,77 @@ class MockDevice(Machine):
 
     def _take_damage(self, damage: Damage, now: float) -> None:
         is_own = damage.can_id == self.target.request_id
-        if is_own and is_damaged_packet(damage) and self.state is State.TRANSFER:
+        if is_own and is_damaged_packet(damage) and self.state is BootloaderState.TRANSFER:
             number = damage.data[_NUMBER_AT:_NUMBER_END]
             is_whole = len(number) == _NUMBER_END - _NUMBER_AT
             self._number = int.from_bytes(number, "little") if is_whole else None
-            self._handle(Event.PACKET_BAD, now)
+            self._handle(BootloaderEvent.PACKET_BAD, now)
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         """The event that a message is. Where the profile decides whether it changes the state, that
         is decided here; where it decides what is answered only, the action does.
         """
-        if self.state is State.APPLICATION:
+        if self.state is BootloaderState.APPLICATION:
             return _in_application(row)
         match row:
             case messages.ResetCommand():
-                announces = self.state is State.ANNOUNCING
+                announces = self.state is BootloaderState.ANNOUNCING
                 profile = self.profile
                 choice = profile.reset_in_bootloader if announces else profile.reset_in_transfer
-                return Event.RESET if choice == "restarts" else Event.RESET_IGNORED
+                return (
+                    BootloaderEvent.RESET if choice == "restarts" else BootloaderEvent.RESET_IGNORED
+                )
             case messages.Unknown():
-                return Event.QUERY
+                return BootloaderEvent.QUERY
             case messages.UpdateCommand() if row.text == self.target.update_text:
                 return self._classify_update(row)
-            case messages.Packet() if self.state is State.TRANSFER:
+            case messages.Packet() if self.state is BootloaderState.TRANSFER:
                 return self._classify_packet(row)
             case messages.EndOfTransfer():
                 return self._classify_end()
             case messages.Packet():
-                return Event.OUT_OF_TURN
+                return BootloaderEvent.OUT_OF_TURN
             case messages.Malformed() if row.message.command == Command.PACKET:
-                return Event.PACKET_BAD if self.state is State.TRANSFER else Event.OUT_OF_TURN
-        return Event.NO_CONCERN
+                return (
+                    BootloaderEvent.PACKET_BAD
+                    if self.state is BootloaderState.TRANSFER
+                    else BootloaderEvent.OUT_OF_TURN
+                )
+        return BootloaderEvent.NO_CONCERN
 
-    def _classify_update(self, row: messages.UpdateCommand) -> Event:
+    def _classify_update(self, row: messages.UpdateCommand) -> BootloaderEvent:
         state, transfer = self.state, self._transfer
         if not 0 < row.size_bytes <= self.profile.image_limit_bytes or state in _DURING_END:
-            return Event.UPDATE_REFUSED
+            return BootloaderEvent.UPDATE_REFUSED
         if state in _WAITS_FOR_UPDATE:
-            return Event.UPDATE
+            return BootloaderEvent.UPDATE
         # One transfer, however often the host says it before packet 1 (UP-05).
-        is_begun = state is State.PROGRAMMING or transfer.stored
+        is_begun = state is BootloaderState.PROGRAMMING or transfer.stored
         if not is_begun and row.size_bytes == transfer.size_bytes:
-            return Event.UPDATE_AGAIN
+            return BootloaderEvent.UPDATE_AGAIN
         starts_over = self.profile.update_in_transfer == "starts_over"
-        return Event.UPDATE if starts_over else Event.UPDATE_REFUSED
+        return BootloaderEvent.UPDATE if starts_over else BootloaderEvent.UPDATE_REFUSED
 
-    def _classify_packet(self, row: messages.Packet) -> Event:
+    def _classify_packet(self, row: messages.Packet) -> BootloaderEvent:
         transfer = self._transfer
         if row.total != transfer.total or row.number > min(row.total, transfer.stored + 1):
-            return Event.PACKET_BAD
+            return BootloaderEvent.PACKET_BAD
         if row.number > transfer.stored:
-            return Event.PACKET_NEXT
-        return Event.PACKET_REPEATED if row.number == transfer.stored else Event.PACKET_OLDER
+            return BootloaderEvent.PACKET_NEXT
+        return (
+            BootloaderEvent.PACKET_REPEATED
+            if row.number == transfer.stored
+            else BootloaderEvent.PACKET_OLDER
+        )
 
-    def _classify_end(self) -> Event:
+    def _classify_end(self) -> BootloaderEvent:
         if self.state in _AFTER_END:
-            return Event.END_AGAIN
-        if self.state is not State.TRANSFER:
-            return Event.OUT_OF_TURN
+            return BootloaderEvent.END_AGAIN
+        if self.state is not BootloaderState.TRANSFER:
+            return BootloaderEvent.OUT_OF_TURN
         if self._transfer.stored != self._transfer.total:
-            return Event.END_EARLY
-        return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
+            return BootloaderEvent.END_EARLY
+        return BootloaderEvent.END_WHOLE if self._accepts_image() else BootloaderEvent.END_WRONG
 
     def _accepts_image(self) -> bool:
         """False when the product's images carry a checksum and this one's is wrong (R7)."""
@@ -311,18 +323,18 @@ class MockDevice(Machine):
         else:
             self._handle(self._elapsed(), now)
 
-    def _elapsed(self) -> Event:
+    def _elapsed(self) -> BootloaderEvent:
         """What the expired timer means."""
-        if self.state is State.ANNOUNCING:
+        if self.state is BootloaderState.ANNOUNCING:
             if self._announced < self.burst or not self._has_whole_application:
-                return Event.ANNOUNCEMENT_DUE
-            return Event.WINDOW_OVER
-        if self.state is State.STARTING:
+                return BootloaderEvent.ANNOUNCEMENT_DUE
+            return BootloaderEvent.WINDOW_OVER
+        if self.state is BootloaderState.STARTING:
             restarts = self.profile.after_complete == "restarts"
-            return Event.START_BY_RESTART_DUE if restarts else Event.START_DUE
+            return BootloaderEvent.START_BY_RESTART_DUE if restarts else BootloaderEvent.START_DUE
         return _TIMER_EVENTS[self.state]
 
-    def _handle(self, event: Event, now: float) -> None:
+    def _handle(self, event: BootloaderEvent, now: float) -> None:
         before = self.state
         move = TABLE[before].get(event)
         if move is None:
@@ -333,8 +345,8 @@ class MockDevice(Machine):
             )
         self.state = move.state or before
         self._is_deaf = self.state in _DEAF
-        self._runs_application = self.state is State.APPLICATION
-        if before is State.APPLICATION and not self._runs_application:
+        self._runs_application = self.state is BootloaderState.APPLICATION
+        if before is BootloaderState.APPLICATION and not self._runs_application:
             self.application.stop()
         detail = getattr(self, f"_{move.action}")(now)
         if self.state is not before and (self.state, before) not in _UNTOLD:
@@ -491,7 +503,7 @@ class MockDevice(Machine):
     def _refuse_end(self, now: float) -> str:
         """The number in it is that of the packet wanted, of the last one when all are there."""
         self._send(messages.Nak(self._transfer.wanted))
-        if self.state is State.REFUSED:
+        if self.state is BootloaderState.REFUSED:
             self._due_at = now + self.profile.refused_hold_s
         else:
             self._await_host(now)
@@ -514,17 +526,17 @@ class MockDevice(Machine):
         self.send(row.to_message(self.target.answer_id))
 
 
-def _in_application(row: AnyRow) -> Event:
+def _in_application(row: AnyRow) -> BootloaderEvent:
     """The event that a message to the running application is."""
     match row:
         case messages.ResetCommand():
-            return Event.RESET
+            return BootloaderEvent.RESET
         case messages.UpdateCommand() | messages.Packet() | messages.EndOfTransfer():
-            return Event.UPGRADE_IN_APPLICATION
+            return BootloaderEvent.UPGRADE_IN_APPLICATION
         case messages.Malformed():
             # A write like others, which may be confirmed (2.2.1(2), R17).
             is_upgrade = row.message.mode == Mode.WRITE and row.message.command in _UPGRADE
-            return Event.UPGRADE_IN_APPLICATION if is_upgrade else Event.QUERY
+            return BootloaderEvent.UPGRADE_IN_APPLICATION if is_upgrade else BootloaderEvent.QUERY
         case messages.Unknown():
-            return Event.QUERY
-    return Event.NO_CONCERN
+            return BootloaderEvent.QUERY
+    return BootloaderEvent.NO_CONCERN

@@ -1,6 +1,6 @@
 """The upgrade as a table, seen from the device: what it does on every event in every state.
 
-A received message or an expired timer is classified into an `Event` first (see `model`; a choice
+A received message or an expired timer is classified into an `BootloaderEvent` first (see `model`; a choice
 of the profile that changes the state is made there). Then `TABLE[state][event]` names the action, a
 method of `flasher.mock.model.MockDevice`, and the next state. A pair that is not listed cannot
 happen: it is a bug. The state diagram in the documentation is drawn from this table.
@@ -13,7 +13,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 
-class State(Enum):
+class BootloaderState(Enum):
     """Where the device stands; the value is how the documentation names it."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
@@ -30,7 +30,7 @@ class State(Enum):
     REFUSED = "refused"
 
 
-class Event(Enum):
+class BootloaderEvent(Enum):
     """A received message or an expired timer, classified; the value is its name in diagrams."""
 
     __hash__ = object.__hash__
@@ -67,39 +67,44 @@ class Event(Enum):
     POWER_ON = "power on"
 
 
-_S, _E = State, Event
-MESSAGE_EVENTS: Final = frozenset(Event) - {
+_S, _E = BootloaderState, BootloaderEvent
+MESSAGE_EVENTS: Final = frozenset(BootloaderEvent) - {
     _E.RESTART_DUE, _E.ANNOUNCEMENT_DUE, _E.WINDOW_OVER, _E.FLASH_DONE, _E.PAUSE_OVER,
     _E.HOLD_OVER, _E.START_DUE, _E.START_BY_RESTART_DUE, _E.POWER_CUT, _E.POWER_ON,
 }  # fmt: skip
 """The events that a message on the bus can be."""
 
 
-class Move(NamedTuple):
+class BootloaderTransition(NamedTuple):
     """What follows an event: the name of the action, and the next state (None: the same one)."""
 
     action: str
-    state: State | None = None
+    state: BootloaderState | None = None
 
 
-IGNORED: Final = Move("ignore")
-_Row = dict[Event, Move]
+IGNORED: Final = BootloaderTransition("ignore")
+_Row = dict[BootloaderEvent, BootloaderTransition]
 
-_POWERED: Final[_Row] = {_E.POWER_CUT: Move("switch_off", _S.OFF), _E.POWER_ON: IGNORED}
-_HEARING: Final[_Row] = _POWERED | {event: IGNORED for event in Event if event in MESSAGE_EVENTS}
-_IN_BOOTLOADER: Final[_Row] = _HEARING | {_E.UPDATE_REFUSED: Move("refuse_update")}
-_RESTARTED: Final = Move("restart", _S.RESTARTING)
-_ERASED: Final = Move("erase", _S.ERASING)
-_BOOTED: Final = Move("boot", _S.ANNOUNCING)
+_POWERED: Final[_Row] = {
+    _E.POWER_CUT: BootloaderTransition("switch_off", _S.OFF),
+    _E.POWER_ON: IGNORED,
+}
+_HEARING: Final[_Row] = _POWERED | {
+    event: IGNORED for event in BootloaderEvent if event in MESSAGE_EVENTS
+}
+_IN_BOOTLOADER: Final[_Row] = _HEARING | {_E.UPDATE_REFUSED: BootloaderTransition("refuse_update")}
+_RESTARTED: Final = BootloaderTransition("restart", _S.RESTARTING)
+_ERASED: Final = BootloaderTransition("erase", _S.ERASING)
+_BOOTED: Final = BootloaderTransition("boot", _S.ANNOUNCING)
 
-TABLE: Final[Mapping[State, _Row]] = {
+TABLE: Final[Mapping[BootloaderState, _Row]] = {
     # No power, no reception.
     _S.OFF: {_E.POWER_ON: _RESTARTED, _E.POWER_CUT: IGNORED},
     # Nothing here erases (UP-03).
     _S.APPLICATION: _HEARING | {
-        _E.RESET: Move("confirm_reset", _S.RESTARTING),
-        _E.QUERY: Move("answer"),
-        _E.UPGRADE_IN_APPLICATION: Move("send_feedback"),
+        _E.RESET: BootloaderTransition("confirm_reset", _S.RESTARTING),
+        _E.QUERY: BootloaderTransition("answer"),
+        _E.UPGRADE_IN_APPLICATION: BootloaderTransition("send_feedback"),
     },
     # Deaf: a second reset does not restart it twice (RS-02).
     _S.RESTARTING: _POWERED | {_E.RESTART_DUE: _BOOTED},
@@ -107,47 +112,47 @@ TABLE: Final[Mapping[State, _Row]] = {
     _S.ANNOUNCING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
-        _E.ANNOUNCEMENT_DUE: Move("announce"),
-        _E.WINDOW_OVER: Move("start", _S.APPLICATION),
+        _E.ANNOUNCEMENT_DUE: BootloaderTransition("announce"),
+        _E.WINDOW_OVER: BootloaderTransition("start", _S.APPLICATION),
     },
     _S.ERASING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
-        _E.FLASH_DONE: Move("request", _S.TRANSFER),
+        _E.FLASH_DONE: BootloaderTransition("request", _S.TRANSFER),
     },
     _S.TRANSFER: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
-        _E.UPDATE_AGAIN: Move("request"),
-        _E.PACKET_NEXT: Move("store", _S.PROGRAMMING),
-        _E.PACKET_REPEATED: Move("answer_repeated"),
-        _E.PACKET_OLDER: Move("answer_older"),
-        _E.PACKET_BAD: Move("answer_bad"),
-        _E.END_EARLY: Move("refuse_end"),
-        _E.END_WHOLE: Move("record", _S.CHECKING),
-        _E.END_WRONG: Move("refuse_end", _S.REFUSED),
+        _E.UPDATE_AGAIN: BootloaderTransition("request"),
+        _E.PACKET_NEXT: BootloaderTransition("store", _S.PROGRAMMING),
+        _E.PACKET_REPEATED: BootloaderTransition("answer_repeated"),
+        _E.PACKET_OLDER: BootloaderTransition("answer_older"),
+        _E.PACKET_BAD: BootloaderTransition("answer_bad"),
+        _E.END_EARLY: BootloaderTransition("refuse_end"),
+        _E.END_WHOLE: BootloaderTransition("record", _S.CHECKING),
+        _E.END_WRONG: BootloaderTransition("refuse_end", _S.REFUSED),
         _E.PAUSE_OVER: _BOOTED,
     },
     _S.PROGRAMMING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
-        _E.FLASH_DONE: Move("acknowledge", _S.TRANSFER),
+        _E.FLASH_DONE: BootloaderTransition("acknowledge", _S.TRANSFER),
     },
     _S.CHECKING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
-        _E.FLASH_DONE: Move("complete", _S.STARTING),
+        _E.FLASH_DONE: BootloaderTransition("complete", _S.STARTING),
     },
     # On its way to the application: an update command would erase what was just completed.
     _S.STARTING: _IN_BOOTLOADER | {
-        _E.END_AGAIN: Move("complete_again"),
-        _E.START_DUE: Move("start", _S.APPLICATION),
+        _E.END_AGAIN: BootloaderTransition("complete_again"),
+        _E.START_DUE: BootloaderTransition("start", _S.APPLICATION),
         _E.START_BY_RESTART_DUE: _BOOTED,
     },
     # Repeats its answer for a host that asks once more (R6), then can be rescued (EN-04).
     _S.REFUSED: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
-        _E.END_AGAIN: Move("refuse_end_again"),
+        _E.END_AGAIN: BootloaderTransition("refuse_end_again"),
         _E.HOLD_OVER: _BOOTED,
     },
 }  # fmt: skip

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.mock.model import MockDevice
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC
 from flasher.station.messages import RunResult
@@ -40,7 +40,9 @@ SAVES_S: Final = (0.1, 0.4, 2.0)
 LOSSES: Final = (0.0, 0.0, 0.002, 0.01, 0.03)
 """The shares of frames that a line loses."""
 _IDENTIFIED: Final = ("step", "identify", "PASS", "")
-_RESTARTS: Final = frozenset({State.RESTARTING, State.ANNOUNCING, State.STARTING})
+_RESTARTS: Final = frozenset(
+    {BootloaderState.RESTARTING, BootloaderState.ANNOUNCING, BootloaderState.STARTING}
+)
 
 
 def profile_of(chance: random.Random) -> dict[str, object]:
@@ -98,7 +100,7 @@ def is_exchanged(folder: Path, seed: int) -> tuple[str, str]:
     world = Exchange(folder, numbers, gap_s=gap_s, first=first, second=second)
     after_s = chance.uniform(0, 3 + 2 * first.reset_delay_s)
     bench = world.bench
-    pulled_in: list[State] = []
+    pulled_in: list[BootloaderState] = []
     identified_at: list[float] = []
 
     def is_time() -> bool:
@@ -127,7 +129,7 @@ def is_exchanged(folder: Path, seed: int) -> tuple[str, str]:
     return f"exchanged, {kind}: {result.code}", _wrong(world, result, pulled_in[0], kind)
 
 
-def _wrong(world: Exchange, result: RunResult, state: State, kind: str) -> str:
+def _wrong(world: Exchange, result: RunResult, state: BootloaderState, kind: str) -> str:
     own = world.second.profile.serial_number
     is_numbered = world.kept("serial number") != own
     is_touched = is_numbered or world.second.erase_count > 0
@@ -135,7 +137,7 @@ def _wrong(world: Exchange, result: RunResult, state: State, kind: str) -> str:
         return f"passed for another one: {result}"
     if is_touched and state not in _RESTARTS and result.code != "OK":
         return f"written to, pulled while {state.value}: {result}"
-    if result.code == "OK" and state not in _RESTARTS | {State.APPLICATION}:
+    if result.code == "OK" and state not in _RESTARTS | {BootloaderState.APPLICATION}:
         return f"passed, pulled while {state.value}: {result}"
     return ""
 

@@ -25,7 +25,7 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.entering import LOOP_S, QueuesUpdates
 from flasher.mock.variants.framing import HeaderAtFrameStart, PaddingFatal, ShortFrameEnds
 from flasher.mock.variants.transfer import FillerChecked
@@ -37,7 +37,11 @@ from flasher.protocol.wire import Damage, DamageReason, Reassembler
 _HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
 )
-_BOOTLOADER: Final = frozenset(State) - {State.OFF, State.APPLICATION, State.RESTARTING}
+_BOOTLOADER: Final = frozenset(BootloaderState) - {
+    BootloaderState.OFF,
+    BootloaderState.APPLICATION,
+    BootloaderState.RESTARTING,
+}
 
 
 # -- what the device model has no choice for -------------------------------------------------------
@@ -74,11 +78,11 @@ class _RefusesByNak(MockDevice):
 class _ListensBehindBurst(MockDevice):
     """Takes the update command when the burst is over, not between its announcements (R2)."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        in_burst = self.state is State.ANNOUNCING and self._announced < self.burst
+        in_burst = self.state is BootloaderState.ANNOUNCING and self._announced < self.burst
         is_deaf = in_burst and self._has_whole_application
-        return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
+        return BootloaderEvent.NO_CONCERN if is_deaf and event is BootloaderEvent.UPDATE else event
 
 
 class _RequestsForEach(QueuesUpdates):

@@ -26,7 +26,7 @@ from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants import VARIANTS
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
@@ -86,13 +86,13 @@ class OtherDevice(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         super()._take_row(row, now)
-        if isinstance(row, messages.UpdateCommand) and self.state is State.ANNOUNCING:
+        if isinstance(row, messages.UpdateCommand) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Nak(1))
 
-    def _classify_packet(self, row: messages.Packet) -> Event:
+    def _classify_packet(self, row: messages.Packet) -> BootloaderEvent:
         rest = self._transfer.size_bytes - (row.number - 1) * len(row.payload)
         if row.number == self._transfer.total and row.payload[rest:].strip(b"\xff"):
-            return Event.PACKET_BAD
+            return BootloaderEvent.PACKET_BAD
         return super()._classify_packet(row)
 
 
@@ -116,7 +116,7 @@ class Confirming(MockDevice):
     acks = 0
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if self.state is not State.APPLICATION:
+        if self.state is not BootloaderState.APPLICATION:
             self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from flasher import events
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
-from flasher.host.table import Ending, State
+from flasher.host.table import Ending, UpgradeState
 from flasher.protocol.messages import (
     Ack,
     Complete,
@@ -52,7 +52,7 @@ def test_a_packet_that_is_refused_to_the_last_try_begins_another_attempt() -> No
     bench.to_packet(2)
     for _ in range(2):
         bench.say(Nak(2))
-        if bench.engine.state is State.RESETTING:
+        if bench.engine.state is UpgradeState.RESETTING:
             break
         bench.expect(Packet)
     bench.expect(ResetCommand)
@@ -136,7 +136,7 @@ def test_an_adapter_that_is_back_while_copies_are_waited_for_waits_for_quiet_aga
     bench.wait(0.51)
     bench.expect(Packet)
     bench.say(Ack(2))
-    assert bench.engine.state is State.SETTLING
+    assert bench.engine.state is UpgradeState.SETTLING
     bench.engine.link_back(bench.now)
     assert bench.expect(Packet).number == 3
 
@@ -211,7 +211,7 @@ def lose_request(bench: Bench) -> None:
     """Up to the silence after an attempt that got no request transfer."""
     bench.to_request()
     bench.wait(10.01)
-    while bench.engine.state is State.RESETTING:
+    while bench.engine.state is UpgradeState.RESETTING:
         bench.expect(ResetCommand)
         bench.wait(0.2)
 
@@ -221,7 +221,7 @@ def test_a_silent_device_gets_one_update_command_when_the_erase_limit_has_passed
     bench = Bench(options=options(9))
     lose_request(bench)
     bench.expect(UpdateCommand, within_s=5.1)
-    assert bench.engine.state is State.AWAITING_REQUEST
+    assert bench.engine.state is UpgradeState.AWAITING_REQUEST
     assert [each.attempt for each in bench.seen(events.AttemptStarted)] == [2, 3]  # type: ignore[attr-defined]
     bench.wait(120.0)
     assert bench.outcome.ending is Ending.NO_BOOT_VERSION

@@ -11,7 +11,7 @@ from flasher.errors import ExitCode
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft
-from flasher.host.table import Ending, State
+from flasher.host.table import Ending, UpgradeState
 from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.frame import Frame
@@ -88,7 +88,7 @@ def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
     assert len(resets) == 5
     gaps = [later - earlier for earlier, later in pairwise(resets)]
     assert gaps == pytest.approx([0.2] * 4, abs=0.003)
-    assert bench.engine.state is State.AWAITING_BOOT
+    assert bench.engine.state is UpgradeState.AWAITING_BOOT
 
 
 def test_reset_stops_at_general_feedback() -> None:

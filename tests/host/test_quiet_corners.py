@@ -10,7 +10,7 @@ from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Queries, Request
 from flasher.host.session import Session
-from flasher.host.table import State
+from flasher.host.table import UpgradeState
 from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, memory_check, version_check
 from flasher.image.image import Image
@@ -54,7 +54,7 @@ def test_a_deadline_in_the_middle_of_a_message_lets_it_end() -> None:
     bench = Bench(options=UpgradeOptions(timeout_s=2.0, frame_gap_s=0.08))
     bench.wait(60.0)
     assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
-    assert bench.engine.state is State.DONE
+    assert bench.engine.state is UpgradeState.DONE
     bench.engine.tick(bench.now)
     assert bench.engine.deadline() is None
 

@@ -13,7 +13,7 @@ from flasher.host.identity import Check, CheckVerdict, DeviceAnswers, Identity, 
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import before_the_start
 from flasher.host.session import Result, Session
-from flasher.host.table import Ending, State
+from flasher.host.table import Ending, UpgradeState
 from flasher.host.upgrade import Upgrade, UpgradeStage
 from flasher.image.image import Image
 from flasher.image.plan import plan
@@ -42,7 +42,7 @@ def test_an_adapter_that_comes_back_before_anything_began_changes_nothing() -> N
     engine = Upgrade(PLAN)
     engine.link_back(0.0)
     engine.tick(0.0)
-    assert engine.state is State.RESETTING
+    assert engine.state is UpgradeState.RESETTING
     assert not engine.take_events()[1:]
 
 

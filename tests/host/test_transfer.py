@@ -10,7 +10,7 @@ from flasher import events
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
-from flasher.host.table import Ending, State
+from flasher.host.table import Ending, UpgradeState
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
     Ack,
@@ -473,7 +473,7 @@ def test_no_message_is_ever_interleaved_with_another() -> None:
     bench.to_packet(1)
 
     def restart(frames: int) -> None:
-        if bench.engine.state is State.TRANSFERRING and frames % 18 == 9:
+        if bench.engine.state is UpgradeState.TRANSFERRING and frames % 18 == 9:
             for frame in answer_frames(BOOT):
                 bench.engine.receive(frame, bench.now)
 

@@ -14,7 +14,7 @@ from flasher.host.table import Ending
 from flasher.host.verify import Verdict
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
@@ -309,7 +309,11 @@ class Confirming(MockDevice):
     """Its bootloader sends general feedback to whatever it receives, the reset too (R15)."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if self.state not in (State.APPLICATION, State.OFF, State.RESTARTING):
+        if self.state not in (
+            BootloaderState.APPLICATION,
+            BootloaderState.OFF,
+            BootloaderState.RESTARTING,
+        ):
             self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 

@@ -30,7 +30,7 @@ from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING, Command
@@ -391,7 +391,7 @@ def _leave_open(unit: Slow, world: World, clock: VirtualClock) -> None:
     old: Image = image_of(max(world.packets, 4), seed=9)
 
     def is_halfway() -> bool:
-        return unit.device.state is State.TRANSFER and unit.device.program_count > 1
+        return unit.device.state is BootloaderState.TRANSFER and unit.device.program_count > 1
 
     with contextlib.suppress(FlasherError):
         connection.device(target).upgrade(

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple, TypeVar
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, FRAME_DATA_SIZE, PACKET_DATA_SIZE, WELLING, Target
@@ -112,7 +112,7 @@ class Bench:
                 break
         self.now = max(self.now, until_s)
 
-    def run_to(self, state: State) -> None:
+    def run_to(self, state: BootloaderState) -> None:
         """Let time pass until the device is in that state."""
         end = self.now + _ENOUGH_S
         while self.device.state is not state:
@@ -133,7 +133,7 @@ class Bench:
             self.device.frame_sent(self.now)
         self.events += self.device.take_events()
 
-    def is_in(self, state: State) -> bool:
+    def is_in(self, state: BootloaderState) -> bool:
         return self.device.state is state
 
     # -- to the device ----------------------------------------------------------------------------
@@ -191,35 +191,35 @@ class Bench:
     def enter_bootloader(self) -> None:
         """Reset the application; the first announcement has been sent afterwards."""
         self.send(messages.ResetCommand())
-        self.run_to(State.ANNOUNCING)
+        self.run_to(BootloaderState.ANNOUNCING)
         self.take_sent()
 
     def enter_transfer(self, size_bytes: int) -> None:
         """From the announcements to where packet 1 is awaited."""
         self.send(self.update_row(size_bytes))
-        self.run_to(State.TRANSFER)
+        self.run_to(BootloaderState.TRANSFER)
         assert messages.RequestTransfer() in self.take()
 
     def transfer(self, *packets: messages.Packet) -> None:
         """Send packets; each one is acknowledged."""
         for packet in packets:
             self.send(packet)
-            self.run_to(State.TRANSFER)
+            self.run_to(BootloaderState.TRANSFER)
             assert self.take() == [messages.Ack(packet.number)]
 
     def end(self) -> None:
         """End of transfer; it completes."""
         self.send(messages.EndOfTransfer())
-        self.run_to(State.STARTING)
+        self.run_to(BootloaderState.STARTING)
         assert self.take() == [messages.Complete()]
 
     def upgrade(self, image: bytes) -> None:
         """A whole upgrade of a device that announces itself or will do so."""
-        if self.device.state is State.APPLICATION:
+        if self.device.state is BootloaderState.APPLICATION:
             self.send(messages.ResetCommand())
-        self.run_to(State.ANNOUNCING)
+        self.run_to(BootloaderState.ANNOUNCING)
         self.take_sent()
         self.enter_transfer(len(image))
         self.transfer(*packets_of(image))
         self.end()
-        self.run_to(State.APPLICATION)
+        self.run_to(BootloaderState.APPLICATION)

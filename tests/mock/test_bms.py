@@ -11,7 +11,7 @@ from flasher.errors import UsageError
 from flasher.events import DeviceReported, DeviceWritten
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from tests.loops import each
 from tests.mock.talk import READ, REPORT, START_S, WRITE, Answer, Talk
@@ -367,4 +367,4 @@ def test_reset_still_restarts_into_the_bootloader_in_both_dialects() -> None:
         talk = battery(dialect=dialect)
         assert talk.ask(0x752, WRITE, 0x4205, b"RESET") == [FEEDBACK]
         assert isinstance(talk.engine, MockDevice)
-        assert talk.engine.state is State.RESTARTING
+        assert talk.engine.state is BootloaderState.RESTARTING

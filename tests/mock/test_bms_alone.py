@@ -12,7 +12,7 @@ from flasher.mock.battery import Battery
 from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.contents import BatteryFault
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
@@ -118,12 +118,12 @@ def test_shutdown_is_repeated_every_200_ms_until_1_s_when_nobody_answers_then_it
     talk = battery()
     device_of(talk).hold_key(talk.now)
     talk.run(0.99)
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
     heard = talk.take()
     assert [one.at_s - START_S for one in heard] == pytest.approx(FIVE)
     assert {one[1:] for one in heard} == {(0x720, REPORT, 0x1308, b"SHUTDOWN")}
     talk.run(0.02)
-    assert device_of(talk).state is State.OFF
+    assert device_of(talk).state is BootloaderState.OFF
     talk.run(60.0)
     assert talk.take() == []
     assert [event for event in talk.events if isinstance(event, ShutdownAnnounced)] == [
@@ -150,9 +150,9 @@ def test_shutdown_is_said_once_when_all_others_are_ready_at_once_and_off_still_c
         talk.put(*answer)
     talk.run(0.99)
     assert talk.times_of(*SHUTDOWN) == [0.0]
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
     talk.run(0.02)
-    assert device_of(talk).state is State.OFF
+    assert device_of(talk).state is BootloaderState.OFF
     (ended,) = [event for event in talk.events if isinstance(event, ShutdownEnded)]
     assert len(ended.ready) == len(answers)
     assert ended.silent == ()
@@ -169,7 +169,7 @@ def test_one_node_that_does_not_answer_keeps_it_repeating(missing: int) -> None:
         talk.put(*answer)
     talk.run(1.5)
     assert talk.times_of(*SHUTDOWN) == pytest.approx(FIVE)
-    assert device_of(talk).state is State.OFF
+    assert device_of(talk).state is BootloaderState.OFF
     (ended,) = [event for event in talk.events if isinstance(event, ShutdownEnded)]
     assert ended.silent == (names[missing],)
 
@@ -212,7 +212,7 @@ def test_ready_without_an_announcement_means_nothing() -> None:
     talk.put(*OBC_READY)
     talk.run(5.0)
     assert talk.take() == []
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
     device_of(talk).hold_key(talk.now)
     talk.run(1.5)
     assert len(talk.times_of(*SHUTDOWN)) == 5
@@ -224,7 +224,7 @@ def test_holding_the_key_again_does_not_begin_anew() -> None:
     talk.run(0.5)
     device_of(talk).hold_key(talk.now)
     talk.run(0.6)
-    assert device_of(talk).state is State.OFF
+    assert device_of(talk).state is BootloaderState.OFF
     assert len(talk.times_of(*SHUTDOWN)) == 5
 
 
@@ -239,7 +239,7 @@ def test_queries_are_answered_until_it_is_off_and_again_once_it_is_on() -> None:
     talk.run(1.0)
     assert len(talk.ask(0x752, READ, 0x3300)) == 1
     talk.run(5.0)
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
 
 
 def test_the_key_means_nothing_to_a_bootloader_and_to_others_than_the_bms() -> None:
@@ -252,7 +252,7 @@ def test_the_key_means_nothing_to_a_bootloader_and_to_others_than_the_bms() -> N
     device_of(other).hold_key(other.now)
     other.run(2.0)
     assert other.take() == []
-    assert device_of(other).state is State.APPLICATION
+    assert device_of(other).state is BootloaderState.APPLICATION
 
 
 # -- idle -----------------------------------------------------------------------------------------
@@ -267,7 +267,7 @@ def test_a_resting_battery_on_an_idle_bus_shuts_down_after_half_an_hour(dialect:
     assert not talk.times_of(*SHUTDOWN)
     talk.run(3.0)
     assert talk.times_of(*SHUTDOWN) == pytest.approx([1810.0 + at_s for at_s in FIVE])
-    assert device_of(talk).state is State.OFF
+    assert device_of(talk).state is BootloaderState.OFF
     assert ShutdownAnnounced("bus idle") in talk.events
 
 
@@ -276,13 +276,13 @@ def test_any_frame_keeps_it_on() -> None:
     for _ in range(10):
         talk.engine.receive(Frame(0x123, b"\x00"), talk.now)
         talk.run(1000.0)
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
 
 
 def test_a_battery_that_is_ridden_or_charged_stays_on() -> None:
     talk = battery(idle_shutdown="on", battery_use="riding")
     talk.run(6 * 3600.0)
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION
 
 
 def test_the_current_has_to_be_small_for_the_whole_half_hour() -> None:
@@ -310,4 +310,4 @@ def test_a_battery_that_tells_its_faults_keeps_the_bus_busy() -> None:
 def test_by_default_an_idle_bus_changes_nothing() -> None:
     talk = battery()
     talk.run(86_400.0)
-    assert device_of(talk).state is State.APPLICATION
+    assert device_of(talk).state is BootloaderState.APPLICATION

@@ -13,7 +13,7 @@ from flasher.errors import UsageError
 from flasher.events import BytesDamaged, DeviceReported, PacketStored
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -47,7 +47,7 @@ def finish(bench: Bench, packets: list[Packet], image: bytes) -> None:
     """Send what is left; the image must be whole and run."""
     bench.transfer(*packets)
     bench.end()
-    bench.run_to(State.APPLICATION)
+    bench.run_to(BootloaderState.APPLICATION)
     assert bench.device.stored_image == image
 
 
@@ -73,10 +73,10 @@ def test_half_a_message_from_before_the_restart_does_not_spoil_the_first_one_aft
     bench.put(Frame(0x752, reset[8:15]))
     bench.put(Frame(0x752, reset[15:] + bench.encoded(PACKETS[0])[:7]))
     bench.put_wire(bench.encoded(PACKETS[0])[7:64])
-    assert bench.device.state is State.RESTARTING
+    assert bench.device.state is BootloaderState.RESTARTING
     bench.run(0.051)
     bench.send(bench.update_row(600))
-    assert bench.is_in(State.TRANSFER)
+    assert bench.is_in(BootloaderState.TRANSFER)
 
 
 def test_a_reset_during_the_announcements_is_ignored_by_default() -> None:
@@ -97,7 +97,7 @@ def test_a_reset_during_the_announcements_may_restart_them_without_feedback() ->
     bench.run(0.06)
     bench.take()
     bench.send(messages.ResetCommand())
-    assert bench.device.state is State.RESTARTING
+    assert bench.device.state is BootloaderState.RESTARTING
     bench.run(1.0)
     assert [type(row) for row in bench.take()] == 4 * [messages.BootVersion]
 
@@ -109,7 +109,7 @@ def test_what_follows_a_reset_in_the_same_bytes_is_not_heard() -> None:
     bench.put_wire(bench.encoded(Packet(1, 1, inner.ljust(128, b"\xff")))[:-1] + b"\x00")
     bench.run(0.04)
     assert bench.take() == [messages.FeedbackMessage()]
-    assert bench.device.state is State.RESTARTING
+    assert bench.device.state is BootloaderState.RESTARTING
 
 
 @each(
@@ -130,7 +130,7 @@ def test_a_reset_that_is_none_is_ignored(can_id: int, mode: Mode, data: bytes) -
     # 2.2.1(2): an application confirms every write.
     is_write = (can_id, mode) == (0x752, Mode.WRITE)
     assert bench.take() == ([messages.FeedbackMessage()] if is_write else [])
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
 
 
 # -- UP: update command ---------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def test_an_impossible_size_is_refused_before_erasing_and_the_old_application_st
     (report,) = bench.events_of(DeviceReported)
     assert f"{size} bytes refused while announcing" in report.what
     bench.run(1.0)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.stored_image == before
     assert bench.device.erase_count == 0
 
@@ -212,7 +212,9 @@ def test_the_window_ends_when_the_profile_says(
     bench.take()
     bench.send(bench.update_row(600))
     assert bench.take() == ([RequestTransfer()] if taken else [])
-    assert bench.device.state is (State.TRANSFER if taken else State.APPLICATION)
+    assert bench.device.state is (
+        BootloaderState.TRANSFER if taken else BootloaderState.APPLICATION
+    )
 
 
 def test_messages_that_were_held_up_are_taken_before_the_window_closes() -> None:
@@ -221,7 +223,7 @@ def test_messages_that_were_held_up_are_taken_before_the_window_closes() -> None
     bench.run(0.16)
     bench.now += 10.0
     bench.send(READ_VERSION, bench.update_row(600))
-    assert bench.device.state is State.TRANSFER
+    assert bench.device.state is BootloaderState.TRANSFER
 
 
 def test_a_repeated_update_command_before_request_transfer_makes_one_transfer() -> None:
@@ -278,7 +280,7 @@ def test_an_update_command_for_another_target_or_of_another_shape_is_rejected(
     bench.put_wire(encode(Message(0x752, mode, command, text)))
     assert bench.take() == []
     bench.run(1.0)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.erase_count == 0
 
 
@@ -297,7 +299,7 @@ def test_an_update_command_while_a_packet_is_programmed_starts_over_cleanly(stor
     bench = bench_in_transfer(SMALL, stored=stored)
     bench.send(PACKETS[stored])
     bench.run(0.001)
-    assert bench.device.state is State.PROGRAMMING
+    assert bench.device.state is BootloaderState.PROGRAMMING
     bench.enter_transfer(600)
     finish(bench, PACKETS, IMAGE)
 
@@ -531,10 +533,10 @@ def test_a_long_pause_may_end_the_transfer_and_the_device_is_reachable_again() -
     bench.run(1.99)
     assert bench.take() == [Nak(4)] * 2
     bench.run(0.02)
-    assert bench.device.state is State.ANNOUNCING
+    assert bench.device.state is BootloaderState.ANNOUNCING
     assert isinstance(bench.take()[0], messages.BootVersion)
     bench.run(60.0)
-    assert bench.device.state is State.ANNOUNCING
+    assert bench.device.state is BootloaderState.ANNOUNCING
     bench.upgrade(IMAGE)
     assert bench.device.stored_image == IMAGE
 
@@ -551,25 +553,35 @@ def test_a_reset_during_the_transfer_is_ignored_by_default() -> None:
     finish(bench, PACKETS[3:], IMAGE)
 
 
-@each("state", [State.ERASING, State.TRANSFER, State.PROGRAMMING, State.CHECKING])
-def test_a_reset_during_the_upgrade_may_restart_and_the_device_is_rescuable(state: State) -> None:
+@each(
+    "state",
+    [
+        BootloaderState.ERASING,
+        BootloaderState.TRANSFER,
+        BootloaderState.PROGRAMMING,
+        BootloaderState.CHECKING,
+    ],
+)
+def test_a_reset_during_the_upgrade_may_restart_and_the_device_is_rescuable(
+    state: BootloaderState,
+) -> None:
     """TX-13."""
     bench = Bench(dataclasses.replace(SMALL, reset_in_transfer="restarts"))
     bench.enter_bootloader()
     bench.send(bench.update_row(600))
-    if state is not State.ERASING:
-        bench.run_to(State.TRANSFER)
+    if state is not BootloaderState.ERASING:
+        bench.run_to(BootloaderState.TRANSFER)
         bench.take()
         bench.transfer(*PACKETS[:-1])
-    if state is State.CHECKING:
+    if state is BootloaderState.CHECKING:
         bench.transfer(PACKETS[-1])
         bench.send(EndOfTransfer())
-    elif state is State.PROGRAMMING:
+    elif state is BootloaderState.PROGRAMMING:
         bench.send(PACKETS[-1])
     assert bench.device.state is state
     bench.run(0.001)
     bench.send(messages.ResetCommand())
-    assert bench.device.state is State.RESTARTING
+    assert bench.device.state is BootloaderState.RESTARTING
     bench.run(0.2)
     assert {type(row) for row in bench.take()} == {messages.BootVersion}
     assert bench.device.stored_image is None
@@ -592,7 +604,7 @@ def test_packets_and_end_without_an_update_command_are_rejected() -> None:
     bench.send(PACKETS[0], EndOfTransfer())
     assert bench.take() == []
     bench.run(1.0)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.program_count == 0
 
 
@@ -617,7 +629,7 @@ def test_a_second_end_is_answered_as_the_profile_says(choice: str, answer: list[
     bench.end()
     bench.send(EndOfTransfer())
     assert bench.take() == answer
-    bench.run_to(State.APPLICATION)
+    bench.run_to(BootloaderState.APPLICATION)
     bench.send(EndOfTransfer())
     assert bench.take() == [messages.FeedbackMessage()]
 
@@ -632,7 +644,7 @@ def test_an_update_command_or_a_reset_after_complete_does_not_touch_the_new_imag
     (report,) = bench.events_of(DeviceReported)
     assert "600 bytes refused while starting" in report.what
     bench.run(0.11)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.erase_count == erased
     assert bench.device.stored_image == IMAGE
 
@@ -643,7 +655,7 @@ def test_the_new_application_may_start_through_the_bootloader() -> None:
     bench.end()
     bench.run(1.0)
     assert [type(row) for row in bench.take()] == 4 * [messages.BootVersion]
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.stored_image == IMAGE
 
 
@@ -683,7 +695,7 @@ def test_an_image_with_a_wrong_checksum_is_refused_never_runs_and_the_device_is_
     bench.run(0.99)
     assert bench.take() == []
     bench.run(5.0)
-    assert bench.device.state is State.ANNOUNCING
+    assert bench.device.state is BootloaderState.ANNOUNCING
     assert len(bench.take()) > 4
     bench.upgrade(with_checksum(image_of(300)))
     assert bench.device.stored_image == with_checksum(image_of(300))
@@ -699,7 +711,7 @@ def test_after_a_refusal_the_second_end_may_meet_silence_and_an_update_command_s
     bench.send(EndOfTransfer(), EndOfTransfer(), messages.ResetCommand())
     assert bench.take() == [Nak(5)]
     bench.send(bench.update_row(0))
-    assert bench.device.state is State.REFUSED
+    assert bench.device.state is BootloaderState.REFUSED
     good = with_checksum(image_of(596))
     bench.enter_transfer(600)
     finish(bench, packets_of(good), good)
@@ -765,7 +777,7 @@ def test_random_traffic_leaves_the_device_reachable_and_an_application_old_or_no
         # Packet 5 of 5 never comes, and packet 1 of 1 does not exist.
         assert bench.device.stored_image in {factory, None}
     bench.run(5.0)
-    if bench.device.state not in {State.APPLICATION, State.ANNOUNCING}:
+    if bench.device.state not in {BootloaderState.APPLICATION, BootloaderState.ANNOUNCING}:
         bench.send(messages.ResetCommand())
     bench.upgrade(IMAGE)
     assert bench.device.stored_image == IMAGE

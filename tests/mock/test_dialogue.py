@@ -10,7 +10,7 @@ import pytest
 from flasher.events import DeviceReported, DeviceStateEntered, ImageStored, PacketStored
 from flasher.mock.model import NO_VERSION
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC, Command, Mode, Target
@@ -79,7 +79,7 @@ def test_a_whole_upgrade_is_answered_byte_by_byte_as_in_the_document(target: Tar
     assert [(item.wire.hex(), item.can_id) for item in sent] == [(complete, ANSWER_IDS[target])]
     bench.run(0.1)
 
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.stored_image == image
 
 
@@ -156,7 +156,7 @@ def test_events_tell_the_story_of_an_upgrade() -> None:
 
 def test_at_construction_a_whole_application_has_been_running_for_a_while() -> None:
     bench = Bench()
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.deadline() is None
     assert bench.device.stored_image is not None
     assert (bench.device.erase_count, bench.device.program_count) == (0, 0)
@@ -218,7 +218,7 @@ def test_the_application_answers_upgrade_messages_with_feedback_or_not_and_erase
         bench.send(row)
         bench.run(5.0)
         assert bench.take() == ([messages.FeedbackMessage()] if answers else [])
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.stored_image == before
     assert (bench.device.erase_count, bench.device.program_count) == (0, 0)
 
@@ -227,7 +227,7 @@ def test_the_update_text_of_another_target_is_a_write_like_others_to_the_applica
     bench = Bench()
     bench.send(messages.UpdateCommand("OBC_UPD", 300))
     assert bench.take() == [messages.FeedbackMessage()]
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
 
 
 # -- what is not for the device -------------------------------------------------------------------
@@ -275,7 +275,7 @@ def test_unknown_and_malformed_messages_are_rejected_and_the_malformed_ones_repo
     (report,) = bench.events_of(DeviceReported)
     assert report.what == "malformed message 4205: mode is 11, not 16"
     assert bench.take() == []
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
 
 
 # -- announcements --------------------------------------------------------------------------------
@@ -295,9 +295,9 @@ def test_after_reset_the_version_is_announced_four_times_50_ms_apart_then_the_ol
     expected_s = [START_S + 0.05 + 0.05 * index for index in range(4)]
     assert [sent.at_s for sent in versions] == pytest.approx(expected_s)
     # The window of 0.2 s after the last one, 0.2 s after the reset, is over at 0.4 s.
-    assert bench.is_in(State.ANNOUNCING)
+    assert bench.is_in(BootloaderState.ANNOUNCING)
     bench.run(0.02)
-    assert bench.is_in(State.APPLICATION)
+    assert bench.is_in(BootloaderState.APPLICATION)
     assert bench.device.stored_image == before
     assert bench.device.deadline() is None
 
@@ -313,7 +313,7 @@ def test_power_up_passes_through_the_same_announcements() -> None:
     sent = bench.take_sent()
     expected_s = [began_s + 0.05 + 0.05 * index for index in range(4)]
     assert [item.at_s for item in sent] == pytest.approx(expected_s)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
 
 
 def test_without_an_application_the_announcements_go_on_at_the_same_pace() -> None:
@@ -331,7 +331,7 @@ def test_without_an_application_a_profile_may_listen_silently_after_the_burst() 
     bench = Bench(dataclasses.replace(QUICK, without_application="listens"), has_application=False)
     bench.run(60.0)
     assert len(bench.take_sent()) == 4
-    assert bench.device.state is State.ANNOUNCING
+    assert bench.device.state is BootloaderState.ANNOUNCING
     assert bench.device.deadline() is None
     bench.upgrade(image_of(300))
     assert bench.device.stored_image == image_of(300)
@@ -365,7 +365,7 @@ def test_an_announcement_that_the_bus_did_not_take_is_not_sent_after_the_update_
     bench.take()
     bench.accepts_frames = False
     bench.run(0.06)
-    assert bench.is_in(State.ANNOUNCING)
+    assert bench.is_in(BootloaderState.ANNOUNCING)
     bench.send(bench.update_row(128))
     bench.accepts_frames = True
     assert bench.take() == [messages.RequestTransfer()]

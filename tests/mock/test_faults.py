@@ -12,7 +12,7 @@ from flasher.host.outcome import Outcome
 from flasher.mock.faults import AtTime, FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
@@ -109,7 +109,7 @@ def test_the_cut_comes_when_that_share_of_the_operation_is_done() -> None:
     # The third packet: two are whole, of the third half is there.
     injector.set(PowerCut(off_s=None), InOperation(ERASES + 2, 0.5))
     world.upgrade(injector, image=IMAGE, linger_s=0.0)
-    assert device.state is State.OFF
+    assert device.state is BootloaderState.OFF
     assert device.operations_done == ERASES + 2
     assert device.readback(256) == IMAGE[:256]
     torn = device.readback(384)[256:]
@@ -198,7 +198,7 @@ def test_off_the_bus_nothing_is_heard_and_nothing_is_said() -> None:
     talk.run(0.02)
     seen.append(device.is_off_bus)
     assert seen == [True, False]
-    assert device.state is State.APPLICATION
+    assert device.state is BootloaderState.APPLICATION
     assert talk.ask(0x752, READ, 0x3300) != []
 
 
@@ -214,7 +214,7 @@ def test_what_was_half_said_is_lost_and_what_the_device_does_meanwhile_goes_on()
     tool.run(0.1)
     assert tool.heard("request") == []
     # It erased and waits for packet 1; its request is said again to an update command again.
-    assert device.state is State.TRANSFER
+    assert device.state is BootloaderState.TRANSFER
     tool.update(600)
     tool.run(0.001)
     assert tool.heard() == ["request"]

@@ -9,7 +9,7 @@ import pytest
 
 from flasher.events import DeviceStateEntered
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import split
@@ -20,7 +20,7 @@ OLD = image_of(700, "V1r5r0_20250101", seed=3)
 NEW = image_of(600)
 # The record's page and three of the application, five packets, the record.
 ERASES = 1 + 3
-BUSY = {State.ERASING, State.PROGRAMMING, State.CHECKING}
+BUSY = {BootloaderState.ERASING, BootloaderState.PROGRAMMING, BootloaderState.CHECKING}
 OPERATIONS = ERASES + 5 + 1
 MOMENTS = {"before": 0.0, "just begun": 0.01, "in": 0.5, "nearly done": 0.99}
 PROFILES = {
@@ -33,7 +33,7 @@ PROFILES = {
 
 def cycle_power(bench: Bench, off_s: float = 1.0) -> None:
     bench.device.power_cut(bench.now)
-    assert bench.device.state is State.OFF
+    assert bench.device.state is BootloaderState.OFF
     bench.run(off_s)
     bench.device.power_on(bench.now)
     bench.take_sent()
@@ -47,10 +47,10 @@ def boots_only_what_is_whole(bench: Bench) -> bytes | None:
     stored = bench.device.stored_image
     assert stored in {OLD, NEW, None}
     if stored is None:
-        assert bench.device.state is State.ANNOUNCING
+        assert bench.device.state is BootloaderState.ANNOUNCING
         assert len(versions) > 4
     else:
-        assert bench.device.state is State.APPLICATION
+        assert bench.device.state is BootloaderState.APPLICATION
         assert len(versions) == 4
     return stored
 
@@ -84,7 +84,7 @@ def bench_with_old(profile: DeviceProfile = SMALL) -> Bench:
     bench = Bench(profile)
     bench.upgrade(OLD)
     bench.send(messages.ResetCommand())
-    bench.run_to(State.ANNOUNCING)
+    bench.run_to(BootloaderState.ANNOUNCING)
     bench.take_sent()
     return bench
 
@@ -135,7 +135,7 @@ def test_a_second_power_cut_during_the_rescue_is_no_worse(
     """PW-02."""
     bench = bench_with_old()
     cut_at(bench, first, share)
-    bench.run_to(State.ANNOUNCING)
+    bench.run_to(BootloaderState.ANNOUNCING)
     cut_at(bench, second, share)
     boots_only_what_is_whole(bench)
     bench.upgrade(NEW)
@@ -160,9 +160,9 @@ def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(he
     bench = bench_with_old()
     for frame in upgrade_frames(bench)[:heard]:
         if bench.device.state in BUSY:
-            bench.run_to(State.TRANSFER)
+            bench.run_to(BootloaderState.TRANSFER)
         bench.put(frame)
-    assert heard < ALL_FRAMES or bench.device.state is State.CHECKING
+    assert heard < ALL_FRAMES or bench.device.state is BootloaderState.CHECKING
     bench.run(0.001)
     cycle_power(bench)
     assert boots_only_what_is_whole(bench) == (OLD if heard < UPDATE_FRAMES else None)
@@ -209,14 +209,14 @@ def test_without_power_nothing_is_heard_and_nothing_is_said() -> None:
     bench.send(messages.ResetCommand(), READ_VERSION)
     bench.run(10.0)
     assert bench.take() == []
-    assert bench.device.state is State.OFF
+    assert bench.device.state is BootloaderState.OFF
     assert [event.state for event in bench.events_of(DeviceStateEntered)] == ["application", "off"]
 
 
 def test_power_that_is_on_already_changes_nothing() -> None:
     bench = Bench(SMALL)
     bench.device.power_on(bench.now)
-    assert bench.device.state is State.APPLICATION
+    assert bench.device.state is BootloaderState.APPLICATION
 
 
 @each("flipped_byte", [0, 300, 599])

@@ -8,7 +8,7 @@ import dataclasses
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Target
 from flasher.settings.device_model import describe_options, set_option
 from tests.loops import each
@@ -36,7 +36,7 @@ def upgrade(
 def assert_upgraded(host: ScriptedHost, device: MockDevice) -> None:
     assert host.outcome == "complete"
     assert device.stored_image == IMAGE
-    assert device.state is State.APPLICATION
+    assert device.state is BootloaderState.APPLICATION
 
 
 @each("target", TARGETS.values())
@@ -121,14 +121,14 @@ def test_what_is_said_out_of_turn_is_answered_as_the_profile_says(
 def test_an_update_command_that_does_not_fit_leaves_the_old_application(script: HostScript) -> None:
     host, device = upgrade(script)
     assert host.outcome == "no request transfer"
-    assert device.state is State.APPLICATION
+    assert device.state is BootloaderState.APPLICATION
     assert device.erase_count == 0
 
 
 def test_a_host_that_stops_before_the_end_leaves_no_application_that_could_boot() -> None:
     host, device = upgrade(HostScript(stop_before_end=True))
     assert host.outcome == "stopped before the end"
-    assert device.state is State.TRANSFER
+    assert device.state is BootloaderState.TRANSFER
     assert device.stored_image is None
 
 

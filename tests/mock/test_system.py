@@ -16,7 +16,7 @@ from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, TARGETS, WELLING, WMC, Dialect, Node, Target
 from tests.loops import each
@@ -168,7 +168,7 @@ def test_a_bms_that_is_being_upgraded_answers_nobody_and_afterwards_all() -> Non
     street.listen(0.15)
     street.say(0xA10B, b"BMS_UPD" + (128).to_bytes(4, "little"))
     street.listen(0.5)
-    assert street.system.device.state is State.TRANSFER
+    assert street.system.device.state is BootloaderState.TRANSFER
     street.ear.counts.clear()
     street.listen(10.0)
     assert street.ear.counts[0x720, 0x1010] == 0

@@ -14,7 +14,7 @@ import pytest
 from flasher.errors import UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.mock.variants import VARIANTS, HangingDevice, Variant, find, make
 from flasher.mock.variants.base import variant
 from flasher.protocol.frame import Frame
@@ -790,7 +790,7 @@ def test_apart_from_its_fault_a_variant_can_be_upgraded(name: str) -> None:
     image = body + zlib.crc32(body).to_bytes(4, "little")
     device = make_wrong(name)
     outcome = world.upgrade(device, image=image)
-    runs = device.state is State.APPLICATION and device.stored_image == image
+    runs = device.state is BootloaderState.APPLICATION and device.stored_image == image
     assert (outcome.ok and runs) == VARIANTS[name].upgrade_works
 
 
@@ -816,7 +816,10 @@ def test_a_variant_is_described_in_one_line_and_names_cases_that_exist(name: str
 def test_a_variant_is_made_for_every_target_with_or_without_an_application(
     name: str, target: Target
 ) -> None:
-    for has_application, state in ((True, State.APPLICATION), (False, State.ANNOUNCING)):
+    for has_application, state in (
+        (True, BootloaderState.APPLICATION),
+        (False, BootloaderState.ANNOUNCING),
+    ):
         device = make(
             name,
             target,

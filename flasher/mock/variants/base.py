@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final, TypeVar
 from flasher.mock.memory import Flash, FlashNotErasedError, FlashRangeError
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import ApplicationStore
-from flasher.mock.table import Event
+from flasher.mock.table import BootloaderEvent
 from flasher.protocol.messages import Malformed
 from flasher.protocol.spec import Command, Mode
 from flasher.protocol.wire import Message
@@ -92,7 +92,7 @@ class HangingDevice(MockDevice):
     hangs = False
     in_ram: ClassVar[tuple[str, ...]] = ("hangs",)
 
-    def _handle(self, event: Event, now: float) -> None:
+    def _handle(self, event: BootloaderEvent, now: float) -> None:
         super()._handle(event, now)
         if self.hangs:
             self._is_deaf, self._runs_application = True, False

@@ -8,7 +8,7 @@ from typing import Final
 from flasher.mock.memory import ERASED, Operation
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import AREA_START, ApplicationStore
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import Command
@@ -28,9 +28,9 @@ class AnnouncesAfterComplete(MockDevice):
         self._holds_back = True
         return super()._complete(now)
 
-    def _elapsed(self) -> Event:
-        if self.state is State.STARTING:
-            return Event.START_BY_RESTART_DUE
+    def _elapsed(self) -> BootloaderEvent:
+        if self.state is BootloaderState.STARTING:
+            return BootloaderEvent.START_BY_RESTART_DUE
         return super()._elapsed()
 
     def _boot(self, now: float) -> str:
@@ -43,11 +43,11 @@ class AnnouncesAfterComplete(MockDevice):
 class AcceptsEarlyEnd(MockDevice):
     """Completes when packets are missing."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        if event is not Event.END_EARLY:
+        if event is not BootloaderEvent.END_EARLY:
             return event
-        return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
+        return BootloaderEvent.END_WHOLE if self._accepts_image() else BootloaderEvent.END_WRONG
 
 
 @variant("ignores-image-checksum", "EN-04", profile={"image_checksum": "crc32"})
@@ -225,12 +225,12 @@ class CompletesSecondEnd(MockDevice):
         self._refused = False
         return super()._erase(now)
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        if event is not Event.END_EARLY:
+        if event is not BootloaderEvent.END_EARLY:
             return event
         if self._refused and self._accepts_image():
-            return Event.END_WHOLE
+            return BootloaderEvent.END_WHOLE
         self._refused = True
         return event
 
@@ -241,14 +241,14 @@ class RefusalHangs(HangingDevice):
 
     def _refuse_end(self, now: float) -> str:
         detail = super()._refuse_end(now)
-        if self.state is State.REFUSED:
+        if self.state is BootloaderState.REFUSED:
             self._due_at = inf
         return detail
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        stuck = self.state is State.REFUSED and event is not Event.END_AGAIN
-        return Event.NO_CONCERN if stuck else event
+        stuck = self.state is BootloaderState.REFUSED and event is not BootloaderEvent.END_AGAIN
+        return BootloaderEvent.NO_CONCERN if stuck else event
 
 
 @variant("any-end-byte", "EN-02")
@@ -270,9 +270,13 @@ class SinglePacketImageFails(MockDevice):
     stored, not where one comes first.
     """
 
-    def _classify_end(self) -> Event:
+    def _classify_end(self) -> BootloaderEvent:
         event = super()._classify_end()
-        return Event.END_EARLY if event is Event.END_WHOLE and self._transfer.total == 1 else event
+        return (
+            BootloaderEvent.END_EARLY
+            if event is BootloaderEvent.END_WHOLE and self._transfer.total == 1
+            else event
+        )
 
 
 @variant("record-erased-last", "PW-01")

@@ -7,7 +7,7 @@ from math import inf
 from typing import Final
 
 from flasher.mock.model import AnyRow, MockDevice, Transfer
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
@@ -72,17 +72,17 @@ class TwoRestarts(MockDevice):
         self._meanwhile = Reassembler(self.target.request_id, self.timings.inter_frame_timeout_s)
 
     def receive(self, frame: Frame, now: float) -> None:
-        if self.state is State.RESTARTING and frame.can_id == self.target.request_id:
+        if self.state is BootloaderState.RESTARTING and frame.can_id == self.target.request_id:
             for found in self._meanwhile.feed(frame.data, now):
                 if isinstance(found, Message) and messages.decode(found) == messages.ResetCommand():
                     self._waiting_reset = True
         super().receive(frame, now)
 
-    def _elapsed(self) -> Event:
-        burst_over = self.state is State.ANNOUNCING and self._announced >= self.burst
+    def _elapsed(self) -> BootloaderEvent:
+        burst_over = self.state is BootloaderState.ANNOUNCING and self._announced >= self.burst
         if burst_over and self._waiting_reset:
             self._waiting_reset = False
-            return Event.RESET
+            return BootloaderEvent.RESET
         return super()._elapsed()
 
 
@@ -167,7 +167,7 @@ class ErasesBeforeCheck(MockDevice):
 
     def _refuse_update(self, now: float) -> str:
         size_bytes, limit_bytes = self._offered_bytes, self.profile.image_limit_bytes
-        if self.state is State.ANNOUNCING and not 0 < size_bytes <= limit_bytes:
+        if self.state is BootloaderState.ANNOUNCING and not 0 < size_bytes <= limit_bytes:
             _erase_at_once(self)
             self._has_whole_application = False
         return super()._refuse_update(now)
@@ -195,11 +195,11 @@ class StopsListening(MockDevice):
     announcements only, when it has an application to start.
     """
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        is_late = self.state is State.ANNOUNCING and self._announced >= _LISTENS_UNTIL
+        is_late = self.state is BootloaderState.ANNOUNCING and self._announced >= _LISTENS_UNTIL
         is_deaf = is_late and self._has_whole_application
-        return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
+        return BootloaderEvent.NO_CONCERN if is_deaf and event is BootloaderEvent.UPDATE else event
 
 
 @variant("queues-updates", "UP-05")
@@ -210,8 +210,8 @@ class QueuesUpdates(MockDevice):
 
     _waiting_update = False
 
-    def _handle(self, event: Event, now: float) -> None:
-        if event is Event.UPDATE_AGAIN and self.state is State.ERASING:
+    def _handle(self, event: BootloaderEvent, now: float) -> None:
+        if event is BootloaderEvent.UPDATE_AGAIN and self.state is BootloaderState.ERASING:
             self._waiting_update = True
         super()._handle(event, now)
 
@@ -221,10 +221,10 @@ class QueuesUpdates(MockDevice):
             self._due_at = now + LOOP_S
         return detail
 
-    def _elapsed(self) -> Event:
-        if self.state is State.TRANSFER and self._waiting_update:
+    def _elapsed(self) -> BootloaderEvent:
+        if self.state is BootloaderState.TRANSFER and self._waiting_update:
             self._waiting_update = False
-            return Event.UPDATE
+            return BootloaderEvent.UPDATE
         return super()._elapsed()
 
 
@@ -244,11 +244,15 @@ class MixesTransfers(MockDevice):
 
     store_type = PlainStore
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        if event is Event.UPDATE and self.state is State.TRANSFER and self._transfer.stored:
+        if (
+            event is BootloaderEvent.UPDATE
+            and self.state is BootloaderState.TRANSFER
+            and self._transfer.stored
+        ):
             self._transfer.size_bytes = self._offered_bytes
-            return Event.UPDATE_AGAIN
+            return BootloaderEvent.UPDATE_AGAIN
         return event
 
 
@@ -373,7 +377,7 @@ class ResetWhileErasingHangs(HangingDevice):
     """Hangs at a reset while it erases until power is cut."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.ResetCommand) and self.state is State.ERASING:
+        if isinstance(row, messages.ResetCommand) and self.state is BootloaderState.ERASING:
             self._hang()
         else:
             super()._take_row(row, now)
@@ -386,7 +390,7 @@ class CompletesWithoutTransfer(MockDevice):
     """
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.EndOfTransfer) and self.state is State.ANNOUNCING:
+        if isinstance(row, messages.EndOfTransfer) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Complete())
         super()._take_row(row, now)
 
@@ -396,6 +400,6 @@ class AcksWithoutTransfer(MockDevice):
     """Acknowledges packets while it announces itself, and stores nothing."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Packet) and self.state is State.ANNOUNCING:
+        if isinstance(row, messages.Packet) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Ack(row.number))
         super()._take_row(row, now)

@@ -7,7 +7,7 @@ from math import inf
 from typing import Final
 
 from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
@@ -150,12 +150,12 @@ class EveryFrameIsPayload(MockDevice):
 class UnknownRestarts(MockDevice):
     """Its bootloader restarts on an unknown command or mode."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         if isinstance(row, messages.Unknown | messages.Malformed):
             message = row.message
             is_known = message.command in _KNOWN_COMMANDS and message.mode in _KNOWN_MODES
-            if not is_known and self.state is not State.APPLICATION:
-                return Event.RESET
+            if not is_known and self.state is not BootloaderState.APPLICATION:
+                return BootloaderEvent.RESET
         return super()._classify(row)
 
 

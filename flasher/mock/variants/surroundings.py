@@ -12,7 +12,7 @@ from typing import Final
 from flasher.mock.machine import BUS_OFF_S
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import AREA_START
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
@@ -33,7 +33,9 @@ _LOAD_FRAMES: Final = 140
 """Frames of others in that time that are too many: 250 kbit/s carries about 200 full ones."""
 _WRONG_MESSAGE: Final = frozenset((DamageReason.BAD_CRC, DamageReason.BAD_TAIL))
 _APPLICATION_COMMANDS: Final = frozenset(item.command for item in ITEMS)
-_USELESS: Final = frozenset((Event.NO_CONCERN, Event.OUT_OF_TURN, Event.RESET_IGNORED))
+_USELESS: Final = frozenset(
+    (BootloaderEvent.NO_CONCERN, BootloaderEvent.OUT_OF_TURN, BootloaderEvent.RESET_IGNORED)
+)
 
 
 @variant("drops-after-20-ms-gap", "TM-02", also="BU-01", timings={"inter_frame_timeout_s": 0.02})
@@ -93,12 +95,12 @@ class LogsUseless(HangingDevice):
 
     _log_bytes = 0
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event, message = super()._classify(row), self._message
         is_useless = event in _USELESS
-        if event is Event.QUERY and message is not None:
+        if event is BootloaderEvent.QUERY and message is not None:
             is_known = message.command in _APPLICATION_COMMANDS
-            is_useless = self.state is not State.APPLICATION or not is_known
+            is_useless = self.state is not BootloaderState.APPLICATION or not is_known
         if message is None or not is_useless:
             self._log_bytes = 0
             return event
@@ -106,7 +108,7 @@ class LogsUseless(HangingDevice):
         if self._log_bytes > _LOG_BYTES:
             self._log_bytes = 0
             self._hang()
-            return Event.NO_CONCERN
+            return BootloaderEvent.NO_CONCERN
         return event
 
 
@@ -116,7 +118,7 @@ class NoiseHangs(HangingDevice):
 
     def _take_message(self, message: Message, now: float) -> None:
         is_own = message.can_id == self.target.request_id
-        if is_own and message.mode == Mode.REPORT and self.state is not State.APPLICATION:
+        if is_own and message.mode == Mode.REPORT and self.state is not BootloaderState.APPLICATION:
             self._hang()
         else:
             super()._take_message(message, now)
@@ -137,10 +139,10 @@ class WritesAnywhere(MockDevice):
     store_type = PlainStore
     _is_beyond = False
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
         self._is_beyond = (
-            event is Event.PACKET_BAD
+            event is BootloaderEvent.PACKET_BAD
             and isinstance(row, messages.Packet)
             and row.total == self._transfer.total < row.number
         )
@@ -182,9 +184,9 @@ class AnyMessageIsLife(MockDevice):
         super()._take_message(message, now)
         if self.state is not before or self._due_at != due:
             return
-        if self.state is State.TRANSFER:
+        if self.state is BootloaderState.TRANSFER:
             self._await_host(now)
-        elif self.state is State.ANNOUNCING and self._announced >= self.burst:
+        elif self.state is BootloaderState.ANNOUNCING and self._announced >= self.burst:
             self._due_at = now + self.profile.window_s
 
 
@@ -224,7 +226,7 @@ class HearsOtherTargets(MockDevice):
     def receive(self, frame: Frame, now: float) -> None:
         super().receive(frame, now)
         other = self._others.get(frame.can_id)
-        if other is None or not frame.is_payload or self.state is not State.TRANSFER:
+        if other is None or not frame.is_payload or self.state is not BootloaderState.TRANSFER:
             return
         for one in other.feed(frame.data, now):
             if not isinstance(one, Message):
@@ -239,7 +241,7 @@ class AnswersInBootloader(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         command = row.message.command if isinstance(row, messages.Unknown) else None
-        if self.state is not State.APPLICATION and command in _APPLICATION_COMMANDS:
+        if self.state is not BootloaderState.APPLICATION and command in _APPLICATION_COMMANDS:
             self._send(messages.FeedbackMessage())
         super()._take_row(row, now)
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from flasher.mock.memory import Operation
 from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
 from flasher.mock.store import AREA_START
-from flasher.mock.table import Event, State
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import (
@@ -23,7 +23,9 @@ from flasher.protocol.wire import Damage, Message
 
 _BYTE: Final = 0xFF
 _HANGS_AFTER: Final = 256
-_UPGRADING: Final = frozenset((State.ERASING, State.TRANSFER, State.PROGRAMMING))
+_UPGRADING: Final = frozenset(
+    (BootloaderState.ERASING, BootloaderState.TRANSFER, BootloaderState.PROGRAMMING)
+)
 _BANK_BYTES: Final = 0x10000
 _WRAP_S: Final = 65.536
 
@@ -45,7 +47,7 @@ class SwallowsAfterBad(MockDevice):
     def _take_damage(self, damage: Damage, now: float) -> None:
         super()._take_damage(damage, now)
         if is_damaged_packet(damage):
-            self._swallows = self.state is State.TRANSFER
+            self._swallows = self.state is BootloaderState.TRANSFER
 
     def _take_message(self, message: Message, now: float) -> None:
         if self._swallows and message.can_id == self.target.request_id:
@@ -88,15 +90,15 @@ class WritesRepeated(MockDevice):
 class AcceptsSkipped(MockDevice):
     """Takes a packet after a gap, and leaves the gap."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
         transfer = self._transfer
-        if event is not Event.PACKET_BAD or not isinstance(row, messages.Packet):
+        if event is not BootloaderEvent.PACKET_BAD or not isinstance(row, messages.Packet):
             return event
         if row.total != transfer.total or not transfer.stored < row.number <= row.total:
             return event
         transfer.stored = row.number - 1
-        return Event.PACKET_NEXT
+        return BootloaderEvent.PACKET_NEXT
 
 
 @variant("ignores-total", "TX-04")
@@ -138,10 +140,14 @@ class IgnoresStartByte(MockDevice):
 class ByteNumbers(MockDevice):
     """Expects packet 0 after packet 255. Counts them in a byte."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
         wraps = isinstance(row, messages.Packet) and row.number > _BYTE
-        return Event.PACKET_BAD if wraps and self.state is State.TRANSFER else event
+        return (
+            BootloaderEvent.PACKET_BAD
+            if wraps and self.state is BootloaderState.TRANSFER
+            else event
+        )
 
     def _answer_bad(self, now: float) -> str:
         return self._reply(messages.Nak(self._transfer.wanted & _BYTE), now)
@@ -161,13 +167,13 @@ class HangsAfter256(HangingDevice):
 class FillerChecked(MockDevice):
     """Refuses a last packet whose bytes behind the image are not FF."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        if event is Event.PACKET_NEXT and isinstance(row, messages.Packet):
+        if event is BootloaderEvent.PACKET_NEXT and isinstance(row, messages.Packet):
             start = (row.number - 1) * PACKET_DATA_SIZE
             filler = row.payload[self._transfer.size_bytes - start :]
             if row.number == row.total and set(filler) - {PACKET_FILLER}:
-                return Event.PACKET_BAD
+                return BootloaderEvent.PACKET_BAD
         return event
 
 
@@ -183,17 +189,21 @@ class NeverTimesOut(MockDevice):
         self._due_at = now + self.profile.transfer_timeout_s
 
     def _expire(self, now: float) -> None:
-        if self.state is State.TRANSFER:
+        if self.state is BootloaderState.TRANSFER:
             self._waits_on = True
             self._due_at = inf
         else:
             super()._expire(now)
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        is_way_out = event in {Event.UPDATE, Event.UPDATE_AGAIN, Event.RESET}
-        stuck = self._waits_on and self.state is State.TRANSFER
-        return Event.NO_CONCERN if stuck and is_way_out else event
+        is_way_out = event in {
+            BootloaderEvent.UPDATE,
+            BootloaderEvent.UPDATE_AGAIN,
+            BootloaderEvent.RESET,
+        }
+        stuck = self._waits_on and self.state is BootloaderState.TRANSFER
+        return BootloaderEvent.NO_CONCERN if stuck and is_way_out else event
 
 
 @variant("reset-in-transfer-hangs", "TX-13", also="SE-03")
@@ -236,10 +246,10 @@ class DamageEndsTransfer(MockDevice):
     """Announces itself again when a packet was damaged."""
 
     def _take_damage(self, damage: Damage, now: float) -> None:
-        in_transfer = self.state is State.TRANSFER
+        in_transfer = self.state is BootloaderState.TRANSFER
         super()._take_damage(damage, now)
         if in_transfer and len(damage.data) > PACKET_DATA_SIZE:
-            self._handle(Event.PAUSE_OVER, now)
+            self._handle(BootloaderEvent.PAUSE_OVER, now)
 
 
 @variant("repeat-unanswered", "TX-02", also="FR-08 TX-05 BU-01 BU-02")
@@ -268,11 +278,11 @@ class OlderOverwrites(MockDevice):
 class TotalLookedAtOnce(MockDevice):
     """Looks at the total of packet 1 only."""
 
-    def _classify(self, row: AnyRow) -> Event:
+    def _classify(self, row: AnyRow) -> BootloaderEvent:
         event = super()._classify(row)
-        if event is Event.PACKET_BAD and isinstance(row, messages.Packet):
+        if event is BootloaderEvent.PACKET_BAD and isinstance(row, messages.Packet):
             is_next = row.number == self._transfer.stored + 1 <= self._transfer.total
-            return Event.PACKET_NEXT if is_next and self._transfer.stored else event
+            return BootloaderEvent.PACKET_NEXT if is_next and self._transfer.stored else event
         return event
 
 
@@ -292,7 +302,7 @@ class NumbersModulo256(MockDevice):
     """Looks at the low byte of a packet's number only."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Packet) and self.state is State.TRANSFER:
+        if isinstance(row, messages.Packet) and self.state is BootloaderState.TRANSFER:
             transfer = self._transfer
             for number in (transfer.stored, transfer.wanted):
                 if number and (row.number - number) & _BYTE == 0:
