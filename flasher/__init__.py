@@ -55,7 +55,7 @@ from flasher.api import (
     Result,
     UpgradeOptions,
     Verification,
-    Written,
+    WriteResult,
     aconnect,
     connect,
     connect_mock,
@@ -91,7 +91,7 @@ __all__ = [
     "Result",
     "UpgradeOptions",
     "Verification",
-    "Written",
+    "WriteResult",
     "contents",
     "events",
 ]

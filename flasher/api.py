@@ -25,15 +25,15 @@ from typing import (
 
 from flasher.errors import FlasherError, InterruptedByUserError, UsageError
 from flasher.host import waivers
-from flasher.host.identity import WAIVABLE, Check, CheckResult, Identity, judge_image
+from flasher.host.identity import WAIVABLE, CheckResult, Identity, IdentityCheck, judge_image
 from flasher.host.options import UpgradeOptions
-from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
+from flasher.host.outcome import DeviceLeft, Outcome, ended_before_start
 from flasher.host.query import Request
 from flasher.host.session import Result
 from flasher.host.survey import Survey
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verification, as_level, check_level, default_level
-from flasher.host.write import WritePlan, Written
+from flasher.host.write import WritePlan, WriteResult
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
@@ -68,7 +68,7 @@ __all__ = [
     "check_level",
     "default_level",
     "AsyncDevice",
-    "Check",
+    "IdentityCheck",
     "Connection",
     "Device",
     "DeviceInfo",
@@ -87,7 +87,7 @@ __all__ = [
     "UpgradeOptions",
     "Verification",
     "Watch",
-    "Written",
+    "WriteResult",
 ]
 
 T = TypeVar("T")
@@ -363,7 +363,7 @@ class Device:
         *values: object,
         manufacturer: bool = False,
         **watch: Unpack[Watch],
-    ) -> Written:
+    ) -> WriteResult:
         """Write an item by name and read it back; old and new value are in the result.
 
         `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
@@ -378,7 +378,9 @@ class Device:
         with self._turn(watch) as steps:
             return steps.content_before(plan)
 
-    def carry_out(self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]) -> Written:
+    def carry_out(
+        self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]
+    ) -> WriteResult:
         """The second half: write and read back. What went wrong stands in the result."""
         with self._turn(watch) as steps:
             return steps.carry_out(plan, before)
@@ -783,7 +785,7 @@ def refusal(plan: Plan, found: CheckResult) -> FlasherError | None:
     """The error for a finding that speaks against an upgrade; None for any other."""
     if found.ending is None:
         return None
-    refused = before_the_start(
+    refused = ended_before_start(
         plan, found.ending, found.detail, duration_s=0.0, waiver=found.waiver
     ).error()
     if refused is not None:

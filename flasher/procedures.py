@@ -24,7 +24,7 @@ from flasher.errors import (
 )
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Identity
-from flasher.host.items import Readable, find, readable
+from flasher.host.items import Readable, find_item, readable
 from flasher.host.options import BRIEF_ADAPTER_RETURN_S, UpgradeOptions
 from flasher.host.outcome import AGAIN, TWO_DEVICES_CAUSE
 from flasher.host.query import (
@@ -33,11 +33,11 @@ from flasher.host.query import (
     Query,
     Request,
     check_range,
+    memory_bytes,
     memory_requests,
-    piece_of,
 )
 from flasher.host.runner import Runner
-from flasher.host.session import Result, Session
+from flasher.host.session import Result, UpgradeSession
 from flasher.host.survey import Survey
 from flasher.host.verify import (
     NOT_ASKED,
@@ -49,7 +49,7 @@ from flasher.host.verify import (
     memory_check,
     version_check,
 )
-from flasher.host.write import WritePlan, Written, plan_write
+from flasher.host.write import WritePlan, WriteResult, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
 from flasher.image.sample import is_sample, sample_error
@@ -247,7 +247,7 @@ class Procedures:
     def _readable(self, what: str | type[Content]) -> Readable:
         items = readable(self.target, self.profile.dialect)
         if isinstance(what, str):
-            return find(what, items, self.target, "read")
+            return find_item(what, items, self.target, "read")
         matching = [each for each in items.values() if each.content is what and not each.field]
         if len(matching) == 1:
             return matching[0]
@@ -277,7 +277,7 @@ class Procedures:
         self.listen_first()
         reading = self._queries(memory_requests(start, end))
         self.run(reading)
-        data = b"".join(piece_of(each) for each in reading.answers if isinstance(each, Memory))
+        data = b"".join(memory_bytes(each) for each in reading.answers if isinstance(each, Memory))
         if len(data) == end - start:
             return data
         if reading.is_cancelled:
@@ -310,7 +310,7 @@ class Procedures:
             error.remedy = f"Nothing was written. {error.remedy}"
             raise
 
-    def carry_out(self, plan: WritePlan, before: Content | None) -> Written:
+    def carry_out(self, plan: WritePlan, before: Content | None) -> WriteResult:
         """Write, wait for general feedback, read back. What went wrong stands in the result.
 
         A write that was begun is looked after: it takes seconds, and is not ended by the user.
@@ -319,7 +319,7 @@ class Procedures:
         request = Request(plan.writable.item, plan.content)
         both = "Each of them may hold the new value."
         query = self._asked(request, may_cancel=False, for_write=both)
-        written = Written(plan, before, query.answer is not None, None)
+        written = WriteResult(plan, before, query.answer is not None, None)
         for _ in range(2):
             # An answer on a broadcast id may be one to somebody who asked before the write.
             request = Request(plan.writable.read_back.item)
@@ -329,7 +329,7 @@ class Procedures:
                 break
         return written
 
-    def write(self, name: str, values: Sequence[object], *, manufacturer: bool) -> Written:
+    def write(self, name: str, values: Sequence[object], *, manufacturer: bool) -> WriteResult:
         """Write an item by name and read it back."""
         dialect = self.profile.dialect
         plan = plan_write(name, values, self.target, dialect=dialect, manufacturer=manufacturer)
@@ -465,9 +465,9 @@ class Procedures:
                 f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
                 remedy="Make the plan with bitrate_bps of the connection.",
             )
-        return self._session(Session(plan, chosen, level, identity or Identity()), chosen)
+        return self._session(UpgradeSession(plan, chosen, level, identity or Identity()), chosen)
 
-    def _session(self, session: Session, options: UpgradeOptions) -> Result:
+    def _session(self, session: UpgradeSession, options: UpgradeOptions) -> Result:
         stalls_s: list[float] = []
         has_sent = False
 
@@ -524,7 +524,7 @@ class Procedures:
         if frame[4] and self.link.is_off:
             raise bus_off_error(str(self.link))
 
-    def _check_bus(self, where: str, session: Session, before: LinkHealth) -> None:
+    def _check_bus(self, where: str, session: UpgradeSession, before: LinkHealth) -> None:
         """Raise BusError when it is the bus that is silent, not the device, or when the adapter was
         off the bus since `before` and came back by itself: what was said meanwhile is lost.
         """
@@ -538,7 +538,7 @@ class Procedures:
             raise error
 
     def _await_contact(
-        self, session: Session, blocked: TransmitBlockedError, told_at: int | None
+        self, session: UpgradeSession, blocked: TransmitBlockedError, told_at: int | None
     ) -> int:
         """Let a session go on whose frames do not leave: a device without power acknowledges none.
         Reported unless nothing has arrived since it was, at `told_at` frames; returns how many
@@ -554,7 +554,7 @@ class Procedures:
         self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
         return received
 
-    def _await_adapter(self, session: Session, lost: BusError, wait_s: float) -> None:
+    def _await_adapter(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:
         """Wait for a lost adapter, where an attempt is left for it; raises BusError without."""
         if not session.may_begin_again or not wait_s:
             raise lost
@@ -562,7 +562,7 @@ class Procedures:
         self._reopen(session, lost, wait_s)
         self._tell(events.AdapterBack())
 
-    def _reopen(self, session: Session, lost: BusError, wait_s: float) -> None:
+    def _reopen(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:
         """Open a lost adapter again, as soon as it is back. Raises BusError when it is not within
         the time given and the overall deadline, InterruptedByUserError when the user has enough.
         """
@@ -625,12 +625,12 @@ def check_sample(image: Image, link: Link) -> None:
         raise sample_error(image, str(link))
 
 
-def _may_end(session: Session) -> Callable[[], bool]:
+def _may_end(session: UpgradeSession) -> Callable[[], bool]:
     """Whether a terminal that hangs up may end a session: as long as the device has its program."""
     return lambda: not session.has_begun_to_erase
 
 
-def _say_what_is_left(error: FlasherError, session: Session) -> None:
+def _say_what_is_left(error: FlasherError, session: UpgradeSession) -> None:
     left = session.device_left
     error.remedy = f"{error.remedy} State of the device: {wording(left)}.".lstrip()
     error.needs_rescue = left.needs_rescue

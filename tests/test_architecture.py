@@ -18,7 +18,7 @@ from flasher import events
 from flasher.bus.adapter import open_adapter
 from flasher.bus.link import MonotonicClock
 from flasher.driver import drive
-from flasher.host.session import Session
+from flasher.host.session import UpgradeSession
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
@@ -85,7 +85,7 @@ def calls_of_a_packet() -> Counter[tuple[str, str]]:
         kwargs={"cancelled": finished.is_set},
     )
     serving.start()
-    session = Session(plan(Image.from_bytes(bytes(128 * 30)), BMS, WELLING.bitrate_bps))
+    session = UpgradeSession(plan(Image.from_bytes(bytes(128 * 30)), BMS, WELLING.bitrate_bps))
     before = sys.getprofile()
     sys.setprofile(calls.profile)
     try:

@@ -27,7 +27,7 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, Reassembler
 
 
-class Foreign(NamedTuple):
+class ForeignFrame(NamedTuple):
     """A frame of a second tool: what was seen; whether a transfer may go on beside it; the command
     that it asks for, None where it is not the beginning of a query.
 
@@ -60,7 +60,7 @@ class Guard:
         self.shutdown_heard = False
         """The battery has announced that it switches off."""
 
-    def see(self, frame: Frame, now: float) -> Foreign | None:
+    def see(self, frame: Frame, now: float) -> ForeignFrame | None:
         """A frame was received; returns what it is when a second tool has sent it."""
         frame_id = frame[0]
         if frame_id == self._own_id:
@@ -76,7 +76,7 @@ class Guard:
         taken, self._events = self._events, []
         return taken
 
-    def _judge_own(self, frame: Frame, now: float) -> Foreign | None:
+    def _judge_own(self, frame: Frame, now: float) -> ForeignFrame | None:
         if frame.is_echo or not frame.is_payload:
             return None
         data = frame.data
@@ -85,12 +85,12 @@ class Guard:
             if now - self._rest_at > self._gap_s:
                 self._rest_frames = 0
             self._rest_frames, self._rest_at = self._rest_frames + 1, now
-            return Foreign(seen, is_harmless=self._rest_frames <= _QUERY_REST_FRAMES)
+            return ForeignFrame(seen, is_harmless=self._rest_frames <= _QUERY_REST_FRAMES)
         self._rest_frames = 0
         if data[len(HEADER)] != Mode.READ:
-            return Foreign(seen, is_harmless=False)
+            return ForeignFrame(seen, is_harmless=False)
         command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
-        return Foreign(seen, is_harmless=True, query=command)
+        return ForeignFrame(seen, is_harmless=True, query=command)
 
     def _note(self, message: Message) -> None:
         decoded = catalogue.decode(message)

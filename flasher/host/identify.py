@@ -16,7 +16,7 @@ from flasher.events import Phase, PhaseEntered
 from flasher.host.identity import DeviceAnswers
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Query, Request, ask_all, count_answers
-from flasher.host.runner import Came, Runner, Signal, Stage, watched
+from flasher.host.runner import Runner, Signal, Stage, StageInput, filtered
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
 from flasher.protocol.contents import RunningInformation
@@ -29,7 +29,7 @@ LISTEN_FIRST_S: Final = 0.1
 unless it waits for the device."""
 
 
-class Identify:
+class IdentifyStage:
     """Listens, then asks until it knows what can be known. With `asks` False it listens only."""
 
     def __init__(self, plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> None:
@@ -61,7 +61,7 @@ class Identify:
         )
         return DeviceAnswers(version, running)
 
-    def stage(self, run: Runner[Any]) -> Stage[Identify]:
+    def stage(self, run: Runner[Any]) -> Stage[IdentifyStage]:
         """Listen and ask; what came is in this object."""
         item = self._version_item
         run.listen_always(self._answer_id, *(() if item is None else (item.can_id,)))
@@ -73,9 +73,9 @@ class Identify:
         if self._requests and self.heard is None:
             run.tell(PhaseEntered(Phase.IDENTIFY, 1))
             asking = ask_all(run, self._while_silent(), self._queries, stop_at_silence=True)
-            yield from watched(asking, self._look)
+            yield from filtered(asking, self._look)
             if not self.cancelled and self.heard is None:
-                yield from watched(count_answers(run, self._queries), self._look)
+                yield from filtered(count_answers(run, self._queries), self._look)
         self.two_devices = run.twins.evidence
         return self
 
@@ -88,7 +88,7 @@ class Identify:
         while run.now < until and not self.cancelled:
             self._look((yield until))
 
-    def _look(self, came: Came) -> Came:
+    def _look(self, came: StageInput) -> StageInput:
         """Take what came; an announcement ends a question that is being asked."""
         self.cancelled = self.cancelled or came is Signal.CANCEL
         if not isinstance(came, Message):
@@ -99,9 +99,9 @@ class Identify:
         return came
 
 
-def identify(plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> Runner[Identify]:
-    """`Identify` as an engine."""
-    asked = Identify(plan, options, asks=asks)
+def identify(plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> Runner[IdentifyStage]:
+    """`IdentifyStage` as an engine."""
+    asked = IdentifyStage(plan, options, asks=asks)
     return Runner(asked.stage, bitrate_bps=plan.bitrate_bps, timings=options.timings)
 
 

@@ -30,7 +30,7 @@ DEFAULT_IN_USE_MA: Final = 1000
 """More than lights and displays take, less than the motor."""
 
 
-class Check(Enum):
+class IdentityCheck(Enum):
     """What is checked; the value names it, and the option that waives it."""
 
     PLAUSIBLE = "implausible"
@@ -49,18 +49,18 @@ class Check(Enum):
 
 
 WAIVABLE: Final = (
-    Check.PLAUSIBLE,
-    Check.TARGET,
-    Check.HARDWARE,
-    Check.DOWNGRADE,
-    Check.PREVIOUS,
-    Check.IN_USE,
+    IdentityCheck.PLAUSIBLE,
+    IdentityCheck.TARGET,
+    IdentityCheck.HARDWARE,
+    IdentityCheck.DOWNGRADE,
+    IdentityCheck.PREVIOUS,
+    IdentityCheck.IN_USE,
 )
 """Checks that refuse; the others report."""
-_ENDINGS: Final[Mapping[Check, Ending]] = {
-    Check.PLAUSIBLE: Ending.IMPLAUSIBLE,
-    Check.IN_USE: Ending.IN_USE,
-    Check.SAME_VERSION: Ending.UP_TO_DATE,
+_ENDINGS: Final[Mapping[IdentityCheck, Ending]] = {
+    IdentityCheck.PLAUSIBLE: Ending.IMPLAUSIBLE,
+    IdentityCheck.IN_USE: Ending.IN_USE,
+    IdentityCheck.SAME_VERSION: Ending.UP_TO_DATE,
 }
 """How a refused check ends the session, where it is not that the image does not belong there."""
 
@@ -81,7 +81,7 @@ class CheckVerdict(Enum):
 class CheckResult(NamedTuple):
     """One check and what it found, in one sentence."""
 
-    check: Check
+    check: IdentityCheck
     verdict: CheckVerdict
     text: str
     other_ways: str = ""
@@ -122,7 +122,7 @@ class Identity:
 
     release: Release | None = None
     """The image's manifest; None where there is none."""
-    waived: frozenset[Check] = frozenset()
+    waived: frozenset[IdentityCheck] = frozenset()
     skip_same_version: bool = False
     low_charge_percent: int = DEFAULT_LOW_CHARGE_PERCENT
     """Below this state of charge there is a warning."""
@@ -138,20 +138,22 @@ class Identity:
         """True when there is a manifest of these very bytes."""
         return self.release is not None and self.release.sha256 == image.sha256
 
-    def refusal(self, check: Check, text: str, other_ways: str = "") -> CheckResult:
+    def refusal(self, check: IdentityCheck, text: str, other_ways: str = "") -> CheckResult:
         """A finding against the upgrade, or that it is waived."""
         verdict = CheckVerdict.WAIVED if check in self.waived else CheckVerdict.REFUSED
         return CheckResult(check, verdict, text, other_ways)
 
-    def uncheckable(self, check: Check, text: str) -> CheckResult:
+    def uncheckable(self, check: IdentityCheck, text: str) -> CheckResult:
         """A rule of the manifest that the device does not let be checked: as one that fails, but
         that --allow-hardware waives it.
         """
         if self.goes_on_unchecked:
-            return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, f"{text}: goes on unchecked")
+            return CheckResult(
+                IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, f"{text}: goes on unchecked"
+            )
         if check in self.waived:
             return CheckResult(check, CheckVerdict.WAIVED, text)
-        return self.refusal(Check.HARDWARE, text)._replace(is_unchecked=True)
+        return self.refusal(IdentityCheck.HARDWARE, text)._replace(is_unchecked=True)
 
 
 @dataclass(frozen=True)
@@ -187,12 +189,12 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
     if problem is not None:
-        yield identity.refusal(Check.TARGET, problem)
+        yield identity.refusal(IdentityCheck.TARGET, problem)
     elif identity.release is not None or image.named_targets:
         has_release = identity.release is not None
         source = text("the manifest") if has_release else text("a name inside the image")
         yield CheckResult(
-            Check.TARGET,
+            IdentityCheck.TARGET,
             CheckVerdict.PASSED,
             text("by {source} the image is for the {wanted}", source=source, wanted=wanted),
         )
@@ -202,7 +204,7 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
             "{wanted}",
             wanted=wanted,
         )
-        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, sentence)
+        yield CheckResult(IdentityCheck.TARGET, CheckVerdict.UNKNOWN, sentence)
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
@@ -213,12 +215,12 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
     text = f"the image {found.text}"
     if not found.is_certain and identity.cpu is not Cpu.CORTEX_M:
         text += ": the profile says that the processor is another"
-        yield CheckResult(Check.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
+        yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     elif not found.is_certain and identity.vouches_for(image):
         text += ": the manifest was made for these very bytes"
-        yield CheckResult(Check.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
+        yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     else:
-        yield identity.refusal(Check.PLAUSIBLE, text, found.ways)
+        yield identity.refusal(IdentityCheck.PLAUSIBLE, text, found.ways)
 
 
 # -- the device -------------------------------------------------------------------------------
@@ -248,7 +250,7 @@ def _untold(identity: Identity, target: Target) -> CheckResult:
             "can be checked",
             node=target.node.name,
         )
-        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, sentence)
+        return CheckResult(IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
     sentence = text(
         "the {node}'s application does not tell its versions: the manifest's rule on {rules} "
@@ -256,23 +258,25 @@ def _untold(identity: Identity, target: Target) -> CheckResult:
         node=target.node.name,
         rules=rules,
     )
-    return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, sentence)
+    return identity.uncheckable(
+        IdentityCheck.HARDWARE if hardware else IdentityCheck.PREVIOUS, sentence
+    )
 
 
 def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
     release = identity.release
     if release is None or not release.hardware_versions:
         sentence = text("no manifest says which hardware the image fits")
-        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, sentence)
+        return CheckResult(IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
         sentence = text(
             "the device does not tell its hardware; the manifest lists {fits}", fits=fits
         )
-        return identity.uncheckable(Check.HARDWARE, sentence)
+        return identity.uncheckable(IdentityCheck.HARDWARE, sentence)
     if release.fits_hardware(hardware):
         return CheckResult(
-            Check.HARDWARE,
+            IdentityCheck.HARDWARE,
             CheckVerdict.PASSED,
             text("the manifest lists hardware {hardware}", hardware=hardware),
         )
@@ -281,7 +285,7 @@ def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
         hardware=hardware,
         fits=fits,
     )
-    return identity.refusal(Check.HARDWARE, sentence)
+    return identity.refusal(IdentityCheck.HARDWARE, sentence)
 
 
 def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckResult]:
@@ -294,12 +298,12 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
         sentence = text(
             "the image names no version to compare with the running {running}", running=running
         )
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
+        yield CheckResult(IdentityCheck.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
         return
     if new == running:
         skipped = CheckVerdict.SKIPPED if identity.skip_same_version else CheckVerdict.WARNED
         sentence = text("the device already runs {running}", running=running)
-        yield CheckResult(Check.SAME_VERSION, skipped, sentence)
+        yield CheckResult(IdentityCheck.SAME_VERSION, skipped, sentence)
         return
     before, after = FirmwareVersion.parse(running), FirmwareVersion.parse(new)
     if before is None or after is None:
@@ -308,13 +312,13 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
             running=running,
             new=new,
         )
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
+        yield CheckResult(IdentityCheck.DOWNGRADE, CheckVerdict.UNKNOWN, sentence)
     elif after < before:
         sentence = text("{new} is older than {running}, which runs now", new=new, running=running)
-        yield identity.refusal(Check.DOWNGRADE, sentence)
+        yield identity.refusal(IdentityCheck.DOWNGRADE, sentence)
     else:
         sentence = text("{new} is newer than {running}, which runs now", new=new, running=running)
-        yield CheckResult(Check.DOWNGRADE, CheckVerdict.PASSED, sentence)
+        yield CheckResult(IdentityCheck.DOWNGRADE, CheckVerdict.PASSED, sentence)
 
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:
@@ -323,7 +327,7 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
         return
     if release.fits_previous(running):
         sentence = text("the manifest lets {running} be replaced", running=running)
-        yield CheckResult(Check.PREVIOUS, CheckVerdict.PASSED, sentence)
+        yield CheckResult(IdentityCheck.PREVIOUS, CheckVerdict.PASSED, sentence)
     else:
         excluded = running in release.previous_except or release.previous_from is None
         sentence = text("the device runs {running}: the manifest excludes it", running=running)
@@ -333,7 +337,7 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
                 running=running,
                 oldest=release.previous_from,
             )
-        yield identity.refusal(Check.PREVIOUS, sentence)
+        yield identity.refusal(IdentityCheck.PREVIOUS, sentence)
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
@@ -344,10 +348,10 @@ def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckRes
             current_ma=-running.mean_current_ma,
             limit_ma=identity.in_use_ma,
         )
-        yield identity.refusal(Check.IN_USE, sentence)
+        yield identity.refusal(IdentityCheck.IN_USE, sentence)
     if running.state_of_charge_percent < identity.low_charge_percent:
         sentence = text(
             "the battery is at {charge} %: charge it first, if it can wait",
             charge=running.state_of_charge_percent,
         )
-        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, sentence)
+        yield CheckResult(IdentityCheck.CHARGE, CheckVerdict.WARNED, sentence)

@@ -112,10 +112,10 @@ def _holder(item: Item, queries: Mapping[str, Readable]) -> Readable | None:
     return None
 
 
-Found = TypeVar("Found", Readable, Writable)
+NamedItem = TypeVar("Found", Readable, Writable)
 
 
-def find(name: str, among: Mapping[str, Found], target: Target, verb: str) -> Found:
+def find_item(name: str, among: Mapping[str, NamedItem], target: Target, verb: str) -> NamedItem:
     """The item with this name. Raises UsageError, with the closest name, when there is none."""
     wanted = name.lower().replace("_", "-").replace(" ", "-")
     if wanted in among:

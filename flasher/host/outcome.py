@@ -169,7 +169,7 @@ _WAIVERS: Final = {
 }
 
 
-def before_the_start(
+def ended_before_start(
     plan: Plan,
     ending: Ending,
     detail: str,

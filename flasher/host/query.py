@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from flasher import events
 from flasher.errors import UsageError
-from flasher.host.runner import Came, Runner, Signal, Stage
+from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import Reason
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY, Item
@@ -131,7 +131,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     run.also_listen_on(query.answer_item.can_id, *_others_ask(query))
     query.repeat_at = run.now
     query.ends_at = run.now + run.timings.command_timeout_s
-    came: Came = Signal.TIME
+    came: StageInput = Signal.TIME
     while not query.is_settled:
         match came:
             case Signal.CANCEL:
@@ -232,7 +232,7 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
                 return
 
 
-def tell_two_devices(run: Runner[Any]) -> None:
+def report_two_devices(run: Runner[Any]) -> None:
     """Report a second device, if one has shown itself."""
     if run.twins.evidence:
         run.tell(events.TwoDevicesSeen(run.twins.evidence))
@@ -264,7 +264,7 @@ class Queries(Runner[None]):
         yield from ask_all(run, self._requests, self.queries, stop_at_silence=stops)
         if self._counts:
             yield from count_answers(run, self.queries)
-            tell_two_devices(run)
+            report_two_devices(run)
 
     @property
     def answers(self) -> list[Content | None]:
@@ -283,7 +283,7 @@ def memory_requests(start: int, end: int) -> Iterator[Request]:
         yield Request(READ_MEMORY, ReadMemory(at, min(at + MEMORY_PIECE_SIZE, end)))
 
 
-def piece_of(answer: Memory) -> bytes:
+def memory_bytes(answer: Memory) -> bytes:
     """The bytes that an answer gives, without the filler behind them (R5)."""
     return answer.content[: answer.end - answer.start]
 

@@ -36,8 +36,8 @@ class Signal(Enum):
 
 
 T = TypeVar("T")
-Came = Message | Damage | Signal
-Stage = Generator[float | None, Came, T]
+StageInput = Message | Damage | Signal
+Stage = Generator[float | None, StageInput, T]
 
 
 class Runner(Generic[T]):
@@ -128,7 +128,7 @@ class Runner(Generic[T]):
     def listen_on(self) -> Stage[bool]:
         """Hear what a second device sends later; returns True when that was cancelled."""
         until = self.now + LISTENS_ON_S
-        came: Came = Signal.TIME
+        came: StageInput = Signal.TIME
         while self.now < until and came is not Signal.CANCEL:
             came = yield until
         return came is Signal.CANCEL
@@ -216,7 +216,7 @@ class Runner(Generic[T]):
         except StopIteration as end:
             self._end(end.value)
 
-    def _resume(self, came: Came) -> None:
+    def _resume(self, came: StageInput) -> None:
         if self.done or self._stage is None:
             return
         try:
@@ -236,7 +236,7 @@ class Runner(Generic[T]):
         self.tx.abandon(self.now)
 
 
-def watched(stage: Stage[T], look: Callable[[Came], Came]) -> Stage[T]:
+def filtered(stage: Stage[T], look: Callable[[StageInput], StageInput]) -> Stage[T]:
     """A stage whose signals are looked at first; what `look` returns is what it is sent."""
     try:
         until = next(stage)

@@ -23,7 +23,7 @@ from flasher.errors import (
 )
 from flasher.events import Phase
 from flasher.host.guard import Guard
-from flasher.host.identify import Identify
+from flasher.host.identify import IdentifyStage
 from flasher.host.identity import (
     CheckResult,
     CheckVerdict,
@@ -33,10 +33,10 @@ from flasher.host.identity import (
     judge_image,
 )
 from flasher.host.options import UpgradeOptions, overall_timeout_s
-from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
+from flasher.host.outcome import DeviceLeft, Outcome, ended_before_start
 from flasher.host.runner import Runner, Stage
 from flasher.host.table import Ending
-from flasher.host.upgrade import LinkBack, SecondTool, UpgradeStage
+from flasher.host.upgrade import LinkRestored, SecondToolSeen, UpgradeStage
 from flasher.host.verify import (
     NOT_ASKED,
     Level,
@@ -100,7 +100,7 @@ class Result:
         return error
 
 
-class Session(Runner[Result]):
+class UpgradeSession(Runner[Result]):
     """One session; an engine. Begins with the first `tick`.
 
     It listens for a second tool before it sends anything. With `identity` the device is then asked
@@ -188,7 +188,7 @@ class Session(Runner[Result]):
         self.now = now
         self._losses += 1
         if self._checking is None:
-            self.interrupt(LinkBack())
+            self.interrupt(LinkRestored())
 
     # -- from stage to stage ---------------------------------------------------------------------
 
@@ -207,7 +207,7 @@ class Session(Runner[Result]):
             self.limit_at = self.deadline_at
             try:
                 asked = yield from self._identified(self._identify)
-            except SecondTool as heard:
+            except SecondToolSeen as heard:
                 return self._end_early(Ending.SECOND_TOOL, heard.seen)
             refused = self._refused(asked)
             if refused is not None:
@@ -223,19 +223,19 @@ class Session(Runner[Result]):
             verification = yield from self._verified()
         return Result(outcome, verification, self._guard.shutdown_heard, previous)
 
-    def _new_identify(self) -> Identify:
-        return Identify(self._plan, self._options, asks=self._identity is not None)
+    def _new_identify(self) -> IdentifyStage:
+        return IdentifyStage(self._plan, self._options, asks=self._identity is not None)
 
-    def _identified(self, identify: Identify) -> Stage[Identify]:
+    def _identified(self, identify: IdentifyStage) -> Stage[IdentifyStage]:
         while True:
             try:
                 return (yield from identify.stage(self))
-            except LinkBack:
+            except LinkRestored:
                 # Queries are short and harmless: they are begun anew.
                 self.tx.abandon(self.now)
                 self._identify = identify = self._new_identify()
 
-    def _refused(self, asked: Identify) -> Result | None:
+    def _refused(self, asked: IdentifyStage) -> Result | None:
         """The end of the session where what was heard ends it."""
         if asked.cancelled:
             is_late = self.deadline_at is not None and self.now >= self.deadline_at
@@ -278,7 +278,7 @@ class Session(Runner[Result]):
     def _end_early(self, ending: Ending, detail: str, waiver: str = "") -> Result:
         phase = Phase.IDENTIFY if self._identify is None else self._identify.phase
         duration_s = self.now - self._began_at
-        outcome = before_the_start(
+        outcome = ended_before_start(
             self._plan, ending, detail, phase, duration_s=duration_s, waiver=waiver
         )
         return Result(outcome, shutdown_heard=self._guard.shutdown_heard)
@@ -288,7 +288,7 @@ class Session(Runner[Result]):
     def _verified(self) -> Stage[Verification]:
         level, self._checking = self._level, Level.NONE
         self.listen_always(self._plan.target.answer_id)
-        with contextlib.suppress(SecondTool):  # the device has the image all the same
+        with contextlib.suppress(SecondToolSeen):  # the device has the image all the same
             yield from self.listen_on()
         if self.twins.evidence:
             return Verification(level, Verdict.TWO_DEVICES, None, self.twins.evidence)
@@ -307,7 +307,7 @@ class Session(Runner[Result]):
                 found = yield from check_version(self, self._plan, self._options)
             else:
                 found = yield from check_memory(self, self._plan, running_version)
-        except SecondTool as heard:
+        except SecondToolSeen as heard:
             # The device has the image; what it answers may be meant for the other tool.
             return Verification(level, Verdict.SECOND_TOOL, None, heard.seen)
         if found.verdict is Verdict.INTERRUPTED and self.now >= (self.deadline_at or inf):
@@ -330,7 +330,7 @@ class Session(Runner[Result]):
         has_its_program = self._is_upgrading and not self._upgrade.has_begun_to_erase
         ends = self._identify is not None or has_its_program or not foreign.is_harmless
         if ends or self._upgrade.is_yielding:
-            self.interrupt(SecondTool(foreign.seen))
+            self.interrupt(SecondToolSeen(foreign.seen))
         elif foreign.query is not None and foreign.query not in self._foreign_queries:
             # It writes nothing, CRC and repetition protect the data: to end here would leave a
             # device without an application.

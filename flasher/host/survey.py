@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from flasher.host.query import Query, Request, ask_all, count_answers, tell_two_devices
-from flasher.host.runner import Came, Runner, Signal, Stage, watched
+from flasher.host.query import Query, Request, ask_all, count_answers, report_two_devices
+from flasher.host.runner import Runner, Signal, Stage, StageInput, filtered
 from flasher.protocol import catalogue, messages
 from flasher.protocol.contents import BatteryFault, Faults
 from flasher.protocol.fields import Content
@@ -117,10 +117,10 @@ class Survey(Runner[None]):
         self.other_tool_heard = Node.CDL in self.heard
         if not self.other_tool_heard:
             asking = ask_all(run, self._while_worth_it(requests), self.queries)
-            yield from watched(asking, self._take)
-            yield from watched(count_answers(run, self.queries), self._take)
+            yield from filtered(asking, self._take)
+            yield from filtered(count_answers(run, self.queries), self._take)
             self.cancelled = any(query.cancelled for query in self.queries)
-        tell_two_devices(run)
+        report_two_devices(run)
 
     def _while_worth_it(self, requests: Iterable[Request]) -> Iterable[Request]:
         """The questions, until a device is silent to so many that it seems not to be there."""
@@ -145,7 +145,7 @@ class Survey(Runner[None]):
             self.also_listen_on(frame.can_id)
         return False
 
-    def _take(self, came: Came) -> Came:
+    def _take(self, came: StageInput) -> StageInput:
         if not isinstance(came, Signal) and came.can_id in self._ids:
             self._note(self.heard[_SENDERS[came.can_id]], came)
         return came

@@ -23,7 +23,7 @@ from flasher.host.options import (
     overall_timeout_s,
 )
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
-from flasher.host.runner import Came, Runner, Signal, Stage
+from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
 from flasher.host.twins import Twins
 from flasher.image.plan import Plan
@@ -48,7 +48,7 @@ from flasher.protocol.spec import BOOT_VERSION_BURST, Command, Mode
 from flasher.protocol.text import boot_version_number, printable
 from flasher.protocol.wire import Damage, Message, encode, split
 
-Received = UpgradeMessage | Malformed | Unknown | Content | None
+ReceivedContent = UpgradeMessage | Malformed | Unknown | Content | None
 """The message behind an event; None for a timer or the user's word."""
 
 _EVENTS: Final[dict[type, UpgradeEvent]] = {
@@ -83,11 +83,11 @@ _LEFT_SO: Final = {
 """Endings that by themselves say what the device has."""
 
 
-class LinkBack(Exception):  # noqa: N818  it is good news
+class LinkRestored(Exception):  # noqa: N818  it is good news
     """The adapter was lost and works again."""
 
 
-class SecondTool(Exception):  # noqa: N818  the name says what it is about
+class SecondToolSeen(Exception):  # noqa: N818  the name says what it is about
     """Somebody else sends what only the tool may send; `seen` says what was seen."""
 
     def __init__(self, seen: str) -> None:
@@ -182,7 +182,7 @@ class UpgradeStage:
         self._erasures = self._whole_transfers = 0
         """How often request transfer came (the old application is gone then), and in how many of
         the attempts end of transfer left."""
-        self._failure: tuple[Ending, Received] | None = None
+        self._failure: tuple[Ending, ReceivedContent] | None = None
         """How an attempt before would have ended the upgrade, had it been the last."""
         self._failed_packet: int | None = None
         """The packet that ended an earlier attempt."""
@@ -316,11 +316,11 @@ class UpgradeStage:
             is_stopping = self._ending is not None
             try:
                 came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
-            except LinkBack:
+            except LinkRestored:
                 self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * WELL_BEYOND)
                 self._heard_at = self._run.now  # nobody knows what it said meanwhile
                 self._dispatch(UpgradeEvent.LINK_BACK)
-            except SecondTool as heard:
+            except SecondToolSeen as heard:
                 # Not one frame more is sent, not even the rest of a message.
                 self._tx.abandon(self._run.now)
                 self._second_tool = heard.seen
@@ -329,7 +329,7 @@ class UpgradeStage:
                 self._take(came)
         return self._outcome
 
-    def _take(self, came: Came) -> None:
+    def _take(self, came: StageInput) -> None:
         if self._ending is not None:
             if came is Signal.LEFT:
                 self._message_left()
@@ -367,7 +367,7 @@ class UpgradeStage:
             self._naks += 1
         self._dispatch(event, row)
 
-    def _dispatch(self, event: UpgradeEvent, row: Received = None) -> None:
+    def _dispatch(self, event: UpgradeEvent, row: ReceivedContent = None) -> None:
         if self._ending is not None:
             self._finish()
             return
@@ -474,10 +474,10 @@ class UpgradeStage:
 
     # -- actions: anywhere -----------------------------------------------------------------------
 
-    def _ignore(self, row: Received) -> None:
+    def _ignore(self, row: ReceivedContent) -> None:
         pass
 
-    def _report(self, row: Received, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
+    def _report(self, row: ReceivedContent, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
         """Tell of something that came where it has no place."""
         match row:
             case Malformed(message, problem):
@@ -490,7 +490,7 @@ class UpgradeStage:
                 what += f": {type(row).__name__.upper()} {number}"
         self._run.tell(events.Reported(what))
 
-    def _fail(self, ending: Ending, row: Received, reason: Reason) -> None:
+    def _fail(self, ending: Ending, row: ReceivedContent, reason: Reason) -> None:
         """Begin another attempt, or end where none is left."""
         if self._is_last_attempt:
             self._end(ending, row)
@@ -502,7 +502,7 @@ class UpgradeStage:
         else:
             self._begin_again(row, reason)
 
-    def _begin_again(self, row: Received, reason: Reason = Reason.LINK_BACK) -> None:
+    def _begin_again(self, row: ReceivedContent, reason: Reason = Reason.LINK_BACK) -> None:
         """Another attempt, from the reset on."""
         if self.state is UpgradeState.RESETTING and self.goes_on:
             self._send_reset()  # nothing was begun in this attempt
@@ -511,7 +511,7 @@ class UpgradeStage:
         self._go(UpgradeState.RESETTING)
         self._send_reset()
 
-    def _start_over(self, row: Received, reason: Reason) -> None:
+    def _start_over(self, row: ReceivedContent, reason: Reason) -> None:
         """Another attempt, with a bootloader that is there: from the update command on."""
         self._next_attempt(reason)
         if isinstance(row, BootVersion):
@@ -540,13 +540,13 @@ class UpgradeStage:
 
     # -- actions: up to the update command --------------------------------------------------------
 
-    def _repeat_reset(self, row: Received) -> None:
+    def _repeat_reset(self, row: ReceivedContent) -> None:
         if self._run.now - self._state_since >= self._timings.command_timeout_s:
             self._await_boot(row)
         else:
             self._send_reset()
 
-    def _await_boot(self, row: Received) -> None:
+    def _await_boot(self, row: ReceivedContent) -> None:
         self._go(UpgradeState.AWAITING_BOOT)
         self._wait_for_boot()
 
@@ -560,7 +560,7 @@ class UpgradeStage:
         elif self._asks_for_power and self.heard is None:
             self._run.tell(events.PowerCycleAwaited(wait_s))
 
-    def _wait_or_begin_again(self, row: Received) -> None:
+    def _wait_or_begin_again(self, row: ReceivedContent) -> None:
         """Nothing is sent to a device that has not announced itself at power-up."""
         if self._asks_for_power and not self._has_begun:
             self._wait_for_boot()
@@ -617,7 +617,7 @@ class UpgradeStage:
         """Silence that ends the announcements of a bootloader."""
         return BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
 
-    def _answer_boot(self, row: Received) -> None:
+    def _answer_boot(self, row: ReceivedContent) -> None:
         """Nothing speaks for a second device."""
         at = self._at
         has_ended = self._run.now < at.watched_until
@@ -646,7 +646,7 @@ class UpgradeStage:
             text = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
             self._run.tell(events.CheckMade("boot-version", "passed", text))
 
-    def _miss_boot(self, row: Received) -> None:
+    def _miss_boot(self, row: ReceivedContent) -> None:
         """No boot version came; a device that may sit in a session is not left alone (R26)."""
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
@@ -698,7 +698,7 @@ class UpgradeStage:
         else:
             self._end(Ending.UNHEARING, boot)
 
-    def _miss_request(self, row: Received) -> None:
+    def _miss_request(self, row: ReceivedContent) -> None:
         if not self._has_begun and self._asks_for_power:
             self._attempts += 1
             self._next_attempt(Reason.REQUEST_GIVEN_UP)
@@ -710,14 +710,14 @@ class UpgradeStage:
             ending = Ending.PACKET_FAILED if is_silent else Ending.NO_REQUEST
             self._fail(ending, row, Reason.REQUEST_GIVEN_UP)
 
-    def _await_request_or_begin_again(self, row: Received) -> None:
+    def _await_request_or_begin_again(self, row: ReceivedContent) -> None:
         if self._is_updating:
             timeout_s = self._timings.request_transfer_timeout_s
             self._timer_at = self._update_left_at + timeout_s
         else:
             self._begin_again(row)
 
-    def _send_first_packet(self, row: Received) -> None:
+    def _send_first_packet(self, row: ReceivedContent) -> None:
         if self._at.first_update_left_at is None:
             self._report(row)  # it answers another update command: a late copy
             return
@@ -768,7 +768,7 @@ class UpgradeStage:
         else:
             self._settle(answer)
 
-    def _settle(self, row: Received) -> None:
+    def _settle(self, row: ReceivedContent) -> None:
         """Every copy of the packet is answered, or will not be any more."""
         at, total = self._at, self._plan.total_packets
         if not at.accepted:
@@ -786,11 +786,11 @@ class UpgradeStage:
         at.end_tries += 1
         self._send(EndOfTransfer(), self._after_packet_gap())
 
-    def _miss_answer(self, row: Received) -> None:
+    def _miss_answer(self, row: ReceivedContent) -> None:
         self._timeouts += 1
         self._repeat_packet(row, Reason.PACKET_UNANSWERED)
 
-    def _repeat_packet(self, row: Received, reason: Reason) -> None:
+    def _repeat_packet(self, row: ReceivedContent, reason: Reason) -> None:
         """Send it once more, as long as it has a try left."""
         if self._is_last_try:
             self._packet_lost(row)
@@ -799,14 +799,14 @@ class UpgradeStage:
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
 
-    def _packet_lost(self, row: Received) -> None:
+    def _packet_lost(self, row: ReceivedContent) -> None:
         self._fail(Ending.PACKET_FAILED, row, Reason.PACKET_GIVEN_UP)
 
-    def _resend_packet(self, row: Received) -> None:
+    def _resend_packet(self, row: ReceivedContent) -> None:
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", Reason.LINK_BACK, self._at.tries)
 
-    def _await_quiet(self, row: Received) -> None:
+    def _await_quiet(self, row: ReceivedContent) -> None:
         self._go(UpgradeState.SETTLING)
         # While a copy is still leaving, the time starts when it has (see _message_left).
         if self._tx.idle:
@@ -855,10 +855,10 @@ class UpgradeStage:
         self._repeated("end of transfer", reason, self._at.end_tries)
         self._send(EndOfTransfer())
 
-    def _resend_end(self, row: Received) -> None:
+    def _resend_end(self, row: ReceivedContent) -> None:
         self._repeat_end(Reason.LINK_BACK)
 
-    def _miss_end(self, row: Received) -> None:
+    def _miss_end(self, row: ReceivedContent) -> None:
         is_announcing = self._at.announced_at is not None
         self._timeouts += not is_announcing
         if not is_announcing and self._at.end_tries < self._timings.end_tries:
@@ -870,7 +870,7 @@ class UpgradeStage:
             self._run.listen(self._version_item.can_id)
             self._query_version(row)
 
-    def _complete(self, row: Received) -> None:
+    def _complete(self, row: ReceivedContent) -> None:
         was_told = self._at.end_copies_left > 0
         self._end(Ending.COMPLETED if was_told else Ending.BROKEN_PROTOCOL, row)
 
@@ -895,7 +895,7 @@ class UpgradeStage:
             self._timer_at = now + self._burst_s
             self._report(boot, "boot version after end of transfer")
 
-    def _query_version(self, row: Received) -> None:
+    def _query_version(self, row: ReceivedContent) -> None:
         request = self._options.version_request_for(self._plan.target)
         if request is None:
             raise RuntimeError("the table asks for a version that nobody can be asked for")
@@ -903,7 +903,7 @@ class UpgradeStage:
         self._timer_at = inf
         self._run.send(split(query.can_id, encode(query)), tag=Command.READ_VERSION)
 
-    def _miss_version(self, row: Received) -> None:
+    def _miss_version(self, row: ReceivedContent) -> None:
         asked_s = self._run.now - self._state_since
         if asked_s >= self._timings.application_start_timeout_s:
             self._end(Ending.UNCONFIRMED, row)
@@ -922,7 +922,7 @@ class UpgradeStage:
 
     # -- actions: beside another tool -------------------------------------------------------------
 
-    def _yield_or_end(self, row: Received) -> None:
+    def _yield_or_end(self, row: ReceivedContent) -> None:
         """Another tool writes. A device that has no application is upgraded again when that tool is
         silent; one that may be complete, or untouched, is left to who looks at it.
         """
@@ -937,22 +937,22 @@ class UpgradeStage:
         self._go(UpgradeState.YIELDING)
         self._yield_on(row)
 
-    def _yield_on(self, row: Received) -> None:
+    def _yield_on(self, row: ReceivedContent) -> None:
         self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
 
-    def _take_turn(self, row: Received) -> None:
+    def _take_turn(self, row: ReceivedContent) -> None:
         self._run.twins = Twins(self._timings)  # what came answered the other tool
         self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
 
     # -- the end ---------------------------------------------------------------------------------
 
-    def _end_broken(self, row: Received) -> None:
+    def _end_broken(self, row: ReceivedContent) -> None:
         self._end(Ending.BROKEN_PROTOCOL, row)
 
-    def _end_for_two_devices(self, row: Received) -> None:
+    def _end_for_two_devices(self, row: ReceivedContent) -> None:
         self._end(Ending.TWO_DEVICES, row, self._twins.evidence)
 
-    def _end_out_of_time(self, row: Received) -> None:
+    def _end_out_of_time(self, row: ReceivedContent) -> None:
         """End as an attempt before would have, where it went on only for nothing to lose."""
         ending = Ending.OUT_OF_TIME
         if self.is_yielding:
@@ -964,10 +964,10 @@ class UpgradeStage:
         else:
             self._end(ending, row)
 
-    def _end_cancelled(self, row: Received) -> None:
+    def _end_cancelled(self, row: ReceivedContent) -> None:
         self._end(Ending.CANCELLED, row)
 
-    def _end(self, ending: Ending, row: Received, detail: str = "") -> None:
+    def _end(self, ending: Ending, row: ReceivedContent, detail: str = "") -> None:
         """End as soon as a message that is half sent has left; device text is escaped."""
         if isinstance(row, BootVersion):
             detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
@@ -1041,9 +1041,9 @@ class Upgrade(Runner[Outcome]):
     def link_back(self, now: float) -> None:
         """The adapter was lost and works again."""
         self.now = now
-        self.interrupt(LinkBack())
+        self.interrupt(LinkRestored())
 
     def second_tool(self, seen: str, now: float) -> None:
         """Somebody else sends what only the tool may send; `seen` says what was seen."""
         self.now = now
-        self.interrupt(SecondTool(seen))
+        self.interrupt(SecondToolSeen(seen))

@@ -22,7 +22,7 @@ from flasher.errors import (
 )
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLeft
-from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_requests, piece_of
+from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
 from flasher.host.runner import Runner, Stage
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
@@ -227,7 +227,7 @@ def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> S
         start, end = request.content.start, request.content.end
         if not isinstance(query.answer, Memory):
             return found(Verdict.NO_ANSWER, f"to a memory read at 0x{start:08X}")
-        expected, got = data[start - base : end - base], piece_of(query.answer)
+        expected, got = data[start - base : end - base], memory_bytes(query.answer)
         if got != expected:
             at = next(index for index, byte in enumerate(expected) if got[index] != byte)
             detail = f"first at 0x{start + at:08X}: {got[at]:02X} instead of {expected[at]:02X}"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flasher.errors import ErrorCode, FlasherError, UsageError, VerificationError
-from flasher.host.items import Writable, find, make_content, meaningful_fields, writable
+from flasher.host.items import Writable, find_item, make_content, meaningful_fields, writable
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
@@ -43,7 +43,7 @@ class WritePlan:
 
 
 @dataclass(frozen=True)
-class Written:
+class WriteResult:
     """How a write ended. Contents are None where nothing was answered."""
 
     plan: WritePlan
@@ -100,7 +100,7 @@ def plan_write(
     Raises UsageError for an unknown name, values that do not fit, and items that the document
     reserves for the manufacturer when `manufacturer` is not given.
     """
-    chosen = find(name, writable(target, dialect), target, "write")
+    chosen = find_item(name, writable(target, dialect), target, "write")
     if chosen.item.manufacturer_only and not manufacturer:
         raise UsageError(
             f"The document reserves writing the {chosen.name} for the manufacturer.",

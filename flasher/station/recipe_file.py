@@ -19,7 +19,7 @@ from typing import Final
 from flasher.errors import Fault, FlasherError, UsageError
 from flasher.files import TOML_MAX_SIZE, opened, read
 from flasher.host.identity import judge_bytes
-from flasher.host.items import Readable, find, meaningful_fields, readable
+from flasher.host.items import Readable, find_item, meaningful_fields, readable
 from flasher.host.query import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
@@ -327,7 +327,9 @@ def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
 def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
     """What a table of the recipe wants to read. Raises UsageError for what cannot be."""
     target = next(each for each in loaded.targets if each.name == part.target)
-    return find(part.item, readable(target.target, target.profile.dialect), target.target, "read")
+    return find_item(
+        part.item, readable(target.target, target.profile.dialect), target.target, "read"
+    )
 
 
 def codec_of(loaded: LoadedRecipe, limit: Limit) -> Codec:

@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from flasher.errors import NoAnswerError
-from flasher.host.identity import Check
+from flasher.host.identity import IdentityCheck
 from flasher.host.items import Readable
 from flasher.host.write import WritePlan, field_changes
 from flasher.station import codes
@@ -24,10 +24,10 @@ NOT_IDENTIFIED: Final = "not identified before flashing"
 BEFORE: Final = "before "
 """Begins the names of measurements of what must not change."""
 OF_CHECK: Final = {
-    Check.HARDWARE: codes.WRONG_HARDWARE,
-    Check.DOWNGRADE: codes.OLD_VERSION,
-    Check.PREVIOUS: codes.OLD_VERSION,
-    Check.IN_USE: codes.IN_USE,
+    IdentityCheck.HARDWARE: codes.WRONG_HARDWARE,
+    IdentityCheck.DOWNGRADE: codes.OLD_VERSION,
+    IdentityCheck.PREVIOUS: codes.OLD_VERSION,
+    IdentityCheck.IN_USE: codes.IN_USE,
 }
 """The code of a check that speaks against the unit, where it is not NOT_FOR_DEVICE."""
 

@@ -21,9 +21,9 @@ from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
 from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
 from flasher.host.event_text import progress_line, warning_text
-from flasher.host.identity import Check, DeviceAnswers, judge_device, new_version
+from flasher.host.identity import DeviceAnswers, IdentityCheck, judge_device, new_version
 from flasher.host.outcome import AGAIN
-from flasher.host.query import piece_of
+from flasher.host.query import memory_bytes
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
@@ -365,7 +365,7 @@ class Bench:
         def happened(event: object) -> None:
             match event:
                 case events.QueryAnswered(content=Memory() as piece):
-                    self._set(saved_bytes=self.state.saved_bytes + len(piece_of(piece)))
+                    self._set(saved_bytes=self.state.saved_bytes + len(memory_bytes(piece)))
 
         self._set(doing=Doing.SAVING, saved=None, saved_bytes=0)
         self._set(
@@ -425,7 +425,7 @@ class Bench:
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         seen = DeviceAnswers(bike.version, running)
         for found in judge_device(job.plan.image, job.plan.target, job.identity, seen):
-            error = None if found.check is Check.IN_USE else refusal(job.plan, found)
+            error = None if found.check is IdentityCheck.IN_USE else refusal(job.plan, found)
             if error is not None:
                 raise error
 

@@ -11,7 +11,7 @@ import pytest
 import flasher
 from flasher import api, procedures
 from flasher.errors import ErrorCode, FlasherError, ImageError, UsageError, WrongDeviceError
-from flasher.host.identity import WAIVABLE, Check
+from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.waivers import BOOT_VERSION, OF_DEVICE, OUTSIDE_VECTOR, WAIVERS
 from flasher.image.load import load
 from flasher.image.release import Release
@@ -36,7 +36,9 @@ def refused(job: api.Job) -> FlasherError:
 def test_what_speaks_against_an_image_is_in_the_job_and_raised_by_its_check() -> None:
     for_wmc = flasher.Image.from_bytes(VECTORS + b"WMC_UPD" + bytes(100))
     job = api.prepare(for_wmc, PROFILE)
-    assert [found.check for found in job.checks if found.ending is not None] == [Check.TARGET]
+    assert [found.check for found in job.checks if found.ending is not None] == [
+        IdentityCheck.TARGET
+    ]
     assert isinstance(refused(job), WrongDeviceError)
     assert refused(job).where == "before anything was sent"
     text = flasher.Image.from_bytes(b"some text\n" * 40)

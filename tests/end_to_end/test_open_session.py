@@ -11,7 +11,7 @@ import pytest
 
 from flasher import events
 from flasher.errors import ExitCode
-from flasher.host.identity import Check, Identity
+from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
@@ -174,11 +174,11 @@ def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
 def test_an_application_that_tells_no_hardware_is_refused_as_without_the_option() -> None:
     """A motor controller has no question for it, and answers the reset: no open session."""
     stage = Stage("wmc")
-    identity = Identity(with_hardware("V1r2r0_*"), waived=frozenset({Check.TARGET}))
+    identity = Identity(with_hardware("V1r2r0_*"), waived=frozenset({IdentityCheck.TARGET}))
     result = stage.flash(options=OPEN, identity=identity)
     assert result.outcome.ending is Ending.UNCHECKED
     assert result.outcome.device_left is DeviceLeft.UNTOUCHED
-    assert result.outcome.waiver == Check.HARDWARE.value
+    assert result.outcome.waiver == IdentityCheck.HARDWARE.value
     assert updates(stage) == 0
     assert stage.device.erase_count == 0
 

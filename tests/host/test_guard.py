@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flasher import events
 from flasher.bus.echoes import Echoes
-from flasher.host.guard import Foreign, Guard
+from flasher.host.guard import ForeignFrame, Guard
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -22,7 +22,7 @@ class MarkedGuard(Guard):
         super().__init__(target, DEFAULT_TIMINGS)
         self.link = Echoes()
 
-    def see(self, frame: Frame, now: float) -> Foreign | None:
+    def see(self, frame: Frame, now: float) -> ForeignFrame | None:
         return super().see(self.link.mark(frame, now, is_rx=True), now)
 
 
@@ -68,7 +68,7 @@ TAILS = [
 
 
 def test_a_foreign_query_is_harmless_and_named() -> None:
-    assert guard().see(READ_MEMORY[0], 1.0) == Foreign(
+    assert guard().see(READ_MEMORY[0], 1.0) == ForeignFrame(
         SEEN % "55 aa 11 0a 43 08 00 00", True, 0x4308
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flasher.host.identify import LISTEN_FIRST_S, Identify
+from flasher.host.identify import LISTEN_FIRST_S, IdentifyStage
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.host.runner import Runner
@@ -35,7 +35,7 @@ class Asked:
     def __init__(self, target: Target = BMS, options: UpgradeOptions | None = None) -> None:
         planned = plan(image_of(300), target, WELLING.bitrate_bps)
         chosen = options or UpgradeOptions()
-        self.told = Identify(planned, chosen)
+        self.told = IdentifyStage(planned, chosen)
         self.engine = Runner(self.told.stage, bitrate_bps=planned.bitrate_bps)
         self.now = 10.0 - LISTEN_FIRST_S
         self.commands: list[int] = []

@@ -8,11 +8,11 @@ from dataclasses import replace
 from flasher.events import CheckMade
 from flasher.host.identity import (
     WAIVABLE,
-    Check,
     CheckResult,
     CheckVerdict,
     DeviceAnswers,
     Identity,
+    IdentityCheck,
     judge_device,
     judge_image,
     new_version,
@@ -44,7 +44,7 @@ def seen(firmware: str = OLD, hardware: str = "V1r2r0_20220512") -> DeviceAnswer
     return DeviceAnswers(VersionInformation(*(WireText(encode_text(text, 16)) for text in texts)))
 
 
-def verdicts(findings: Iterable[CheckResult]) -> list[tuple[Check, CheckVerdict]]:
+def verdicts(findings: Iterable[CheckResult]) -> list[tuple[IdentityCheck, CheckVerdict]]:
     return [(found.check, found.verdict) for found in findings]
 
 
@@ -64,11 +64,11 @@ def test_the_target_of_an_image(
     image: Image, stated: dict[str, object] | None, verdict: CheckVerdict
 ) -> None:
     identity = Identity(None if stated is None else release(**stated))
-    assert verdicts(judge_image(image, BMS, identity)) == [(Check.TARGET, verdict)]
+    assert verdicts(judge_image(image, BMS, identity)) == [(IdentityCheck.TARGET, verdict)]
 
 
 HARDWARE, DOWNGRADE, SAME, PREVIOUS = (
-    Check.HARDWARE, Check.DOWNGRADE, Check.SAME_VERSION, Check.PREVIOUS,
+    IdentityCheck.HARDWARE, IdentityCheck.DOWNGRADE, IdentityCheck.SAME_VERSION, IdentityCheck.PREVIOUS,
 )  # fmt: skip
 PASSED, UNKNOWN, REFUSED, WARNED = (
     CheckVerdict.PASSED, CheckVerdict.UNKNOWN, CheckVerdict.REFUSED, CheckVerdict.WARNED,
@@ -99,7 +99,9 @@ PASSED, UNKNOWN, REFUSED, WARNED = (
     ],
 )  # fmt: skip
 def test_what_the_device_says_of_the_image(
-    stated: dict[str, object] | None, device: DeviceAnswers, expected: dict[Check, CheckVerdict]
+    stated: dict[str, object] | None,
+    device: DeviceAnswers,
+    expected: dict[IdentityCheck, CheckVerdict],
 ) -> None:
     identity = Identity(None if stated is None else release(**stated))
     assert dict(verdicts(judge_device(IMAGE, BMS, identity, device))) == expected
@@ -116,27 +118,31 @@ def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() ->
     [
         ({}, {}),
         ({"mean_current_ma": -1000}, {}),
-        ({"mean_current_ma": -1001}, {Check.IN_USE: REFUSED}),
+        ({"mean_current_ma": -1001}, {IdentityCheck.IN_USE: REFUSED}),
         ({"mean_current_ma": 3000}, {}),  # it is charged
         ({"state_of_charge_percent": 20}, {}),
-        ({"state_of_charge_percent": 19}, {Check.CHARGE: WARNED}),
+        ({"state_of_charge_percent": 19}, {IdentityCheck.CHARGE: WARNED}),
         ({"mean_current_ma": -5000, "state_of_charge_percent": 5},
-         {Check.IN_USE: REFUSED, Check.CHARGE: WARNED}),
+         {IdentityCheck.IN_USE: REFUSED, IdentityCheck.CHARGE: WARNED}),
     ],
 )  # fmt: skip
 def test_the_state_of_the_battery(
-    change: dict[str, int], expected: dict[Check, CheckVerdict]
+    change: dict[str, int], expected: dict[IdentityCheck, CheckVerdict]
 ) -> None:
     device = replace(seen(), running=replace(BATTERY, **change))  # type: ignore[arg-type]
     found = dict(verdicts(judge_device(IMAGE, BMS, Identity(), device)))
-    assert {check: found[check] for check in (Check.IN_USE, Check.CHARGE) if check in found} == (
-        expected
-    )
+    assert {
+        check: found[check]
+        for check in (IdentityCheck.IN_USE, IdentityCheck.CHARGE)
+        if check in found
+    } == (expected)
 
 
 def test_a_waived_check_is_told_and_ends_nothing() -> None:
-    refused = Identity().refusal(Check.DOWNGRADE, "older")
-    waived = Identity(waived=frozenset({Check.DOWNGRADE})).refusal(Check.DOWNGRADE, "older")
+    refused = Identity().refusal(IdentityCheck.DOWNGRADE, "older")
+    waived = Identity(waived=frozenset({IdentityCheck.DOWNGRADE})).refusal(
+        IdentityCheck.DOWNGRADE, "older"
+    )
     assert refused.ending is Ending.NOT_FOR_DEVICE
     assert "--allow-downgrade waives this" in refused.detail
     assert waived.ending is None
@@ -144,13 +150,13 @@ def test_a_waived_check_is_told_and_ends_nothing() -> None:
 
 
 def test_each_check_that_refuses_can_be_waived_and_no_other() -> None:
-    assert {Check.SAME_VERSION, Check.CHARGE}.isdisjoint(WAIVABLE)
-    assert set(WAIVABLE) == set(Check) - {Check.SAME_VERSION, Check.CHARGE}
+    assert {IdentityCheck.SAME_VERSION, IdentityCheck.CHARGE}.isdisjoint(WAIVABLE)
+    assert set(WAIVABLE) == set(IdentityCheck) - {IdentityCheck.SAME_VERSION, IdentityCheck.CHARGE}
 
 
 def test_the_same_version_is_skipped_on_request_only() -> None:
     found = dict(verdicts(judge_device(IMAGE, BMS, Identity(skip_same_version=True), seen(NEW))))
-    assert found[Check.SAME_VERSION] is CheckVerdict.SKIPPED
+    assert found[IdentityCheck.SAME_VERSION] is CheckVerdict.SKIPPED
 
 
 def test_what_a_device_tells_is_shown_escaped() -> None:
@@ -174,7 +180,7 @@ def test_what_a_device_tells_is_shown_escaped() -> None:
 
 def judged(
     image: Image = IMAGE, identity: Identity | None = None, device: DeviceAnswers | None = None
-) -> dict[Check, CheckResult]:
+) -> dict[IdentityCheck, CheckResult]:
     identity = identity or Identity()
     found = list(judge_image(image, BMS, identity))
     found += judge_device(image, BMS, identity, device or DeviceAnswers())
@@ -192,19 +198,19 @@ def judged(
         (Image.from_bytes(bytes(4) + VECTORS), Identity(cpu=Cpu.OTHER), UNKNOWN,
          "the profile says that the processor is another", ""),
         (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(cpu=Cpu.OTHER), REFUSED, "zip", ""),
-        (Image.from_bytes(bytes(4) + VECTORS), Identity(waived=frozenset({Check.PLAUSIBLE})),
+        (Image.from_bytes(bytes(4) + VECTORS), Identity(waived=frozenset({IdentityCheck.PLAUSIBLE})),
          CheckVerdict.WAIVED, "no Cortex-M vector table", ""),
     ],
 )  # fmt: skip
 def test_an_image_that_is_no_program_is_refused_and_why(
     image: Image, identity: Identity, verdict: CheckVerdict, text: str, detail: str
 ) -> None:
-    found = judged(image, identity)[Check.PLAUSIBLE]
+    found = judged(image, identity)[IdentityCheck.PLAUSIBLE]
     assert found.verdict is verdict
     assert text in found.text
     assert detail in found.detail
     assert (found.ending is Ending.IMPLAUSIBLE) is (verdict is REFUSED)
-    assert Check.TARGET in judged(image, identity), "the other checks are made all the same"
+    assert IdentityCheck.TARGET in judged(image, identity), "the other checks are made all the same"
 
 
 def test_a_manifest_vouches_for_its_very_bytes_only() -> None:
@@ -212,20 +218,28 @@ def test_a_manifest_vouches_for_its_very_bytes_only() -> None:
     assert Identity(release_of(odd, BMS)).vouches_for(odd)
     assert not Identity().vouches_for(odd)
     assert not Identity(release()).vouches_for(odd)
-    found = judged(odd, Identity(release_of(odd, BMS)))[Check.PLAUSIBLE]
+    found = judged(odd, Identity(release_of(odd, BMS)))[IdentityCheck.PLAUSIBLE]
     assert found.verdict is UNKNOWN
     assert found.text.endswith("the manifest was made for these very bytes")
     archive = Image.from_bytes(b"PK\3\4" + bytes(60))
-    assert judged(archive, Identity(release_of(archive, BMS)))[Check.PLAUSIBLE].verdict is REFUSED
+    assert (
+        judged(archive, Identity(release_of(archive, BMS)))[IdentityCheck.PLAUSIBLE].verdict
+        is REFUSED
+    )
 
 
 def test_what_says_that_the_image_is_for_the_target() -> None:
-    assert judged()[Check.TARGET].text.startswith("no manifest, and the image names no device")
-    by_manifest = judged(IMAGE, Identity(release()))[Check.TARGET]
+    assert judged()[IdentityCheck.TARGET].text.startswith(
+        "no manifest, and the image names no device"
+    )
+    by_manifest = judged(IMAGE, Identity(release()))[IdentityCheck.TARGET]
     assert by_manifest.text == "by the manifest the image is for the BMS"
     named = Image.from_bytes(VECTORS + b"\0BMS_UPD\0")
-    assert judged(named)[Check.TARGET].text == "by a name inside the image the image is for the BMS"
-    other = judged(IMAGE, Identity(release(target=WMC)))[Check.TARGET]
+    assert (
+        judged(named)[IdentityCheck.TARGET].text
+        == "by a name inside the image the image is for the BMS"
+    )
+    other = judged(IMAGE, Identity(release(target=WMC)))[IdentityCheck.TARGET]
     assert "is for the WMC, not the BMS" in other.detail
     assert other.ending is Ending.NOT_FOR_DEVICE
     assert other.waiver == "other-target"
@@ -243,7 +257,7 @@ def test_what_says_that_the_image_is_for_the_target() -> None:
 def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
     stated: dict[str, object], rules: str
 ) -> None:
-    found = judged(IMAGE, Identity(release(**stated)))[Check.HARDWARE]
+    found = judged(IMAGE, Identity(release(**stated)))[IdentityCheck.HARDWARE]
     assert found.text == (
         "the BMS's application does not tell its versions: "
         f"the manifest's rule on {rules} cannot be checked"
@@ -252,34 +266,38 @@ def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
     assert found.is_unchecked
     assert found.ending is Ending.UNCHECKED
     assert found.detail == f"{found.text}; --allow-hardware waives this"
-    rescued = judged(IMAGE, Identity(release(**stated), goes_on_unchecked=True))[Check.HARDWARE]
+    rescued = judged(IMAGE, Identity(release(**stated), goes_on_unchecked=True))[
+        IdentityCheck.HARDWARE
+    ]
     assert rescued.verdict is UNKNOWN
     assert rescued.text == f"{found.text}: goes on unchecked"
     assert rescued.ending is None
 
 
-@each("waived", [Check.HARDWARE, Check.PREVIOUS])
-def test_a_rule_is_waived_by_its_own_option_and_by_that_for_hardware(waived: Check) -> None:
+@each("waived", [IdentityCheck.HARDWARE, IdentityCheck.PREVIOUS])
+def test_a_rule_is_waived_by_its_own_option_and_by_that_for_hardware(waived: IdentityCheck) -> None:
     both = release(hardware_versions=("V1*",), previous_from=OLD)
     for ruled in (replace(both, hardware_versions=()), replace(both, previous_from=None)):
         found = list(
             judge_device(IMAGE, BMS, Identity(ruled, frozenset({waived})), DeviceAnswers())
         )
-        other_rule = waived is Check.PREVIOUS and bool(ruled.hardware_versions)
+        other_rule = waived is IdentityCheck.PREVIOUS and bool(ruled.hardware_versions)
         assert found[0].verdict is (REFUSED if other_rule else CheckVerdict.WAIVED)
 
 
 def test_hardware_that_is_not_listed_is_named_with_the_list() -> None:
     fits = ("V1r3*", "V2*")
-    found = judged(IMAGE, Identity(release(hardware_versions=fits)), seen())[Check.HARDWARE]
+    found = judged(IMAGE, Identity(release(hardware_versions=fits)), seen())[IdentityCheck.HARDWARE]
     assert found.text == (
         "the device's hardware V1r2r0_20220512 is not in the manifest, which lists V1r3*, V2*"
     )
     assert found.ending is Ending.NOT_FOR_DEVICE
     assert not found.is_unchecked
-    good = judged(IMAGE, Identity(release(hardware_versions=("V1*",))), seen())[Check.HARDWARE]
+    good = judged(IMAGE, Identity(release(hardware_versions=("V1*",))), seen())[
+        IdentityCheck.HARDWARE
+    ]
     assert good.text == "the manifest lists hardware V1r2r0_20220512"
-    assert judged(device=seen())[Check.HARDWARE].text == (
+    assert judged(device=seen())[IdentityCheck.HARDWARE].text == (
         "no manifest says which hardware the image fits"
     )
 
@@ -295,7 +313,7 @@ def test_hardware_that_is_not_listed_is_named_with_the_list() -> None:
     ],
 )  # fmt: skip
 def test_the_running_version_is_compared_with_the_new_one(
-    firmware: str, check: Check, verdict: CheckVerdict, text: str
+    firmware: str, check: IdentityCheck, verdict: CheckVerdict, text: str
 ) -> None:
     found = judged(device=seen(firmware))[check]
     assert found.verdict is verdict
@@ -338,14 +356,18 @@ def test_a_battery_in_use_or_low_is_named_with_its_figures() -> None:
         seen(), running=replace(BATTERY, mean_current_ma=-1500, state_of_charge_percent=7)
     )
     found = judged(device=device)
-    assert found[Check.IN_USE].text == "the battery gives 1500 mA, more than 1000 mA"
-    assert found[Check.IN_USE].ending is Ending.IN_USE
-    assert found[Check.CHARGE].text == "the battery is at 7 %: charge it first, if it can wait"
-    assert found[Check.CHARGE].ending is None
-    assert found[Check.CHARGE].waiver == ""
-    assert found[Check.CHARGE].detail == found[Check.CHARGE].text
+    assert found[IdentityCheck.IN_USE].text == "the battery gives 1500 mA, more than 1000 mA"
+    assert found[IdentityCheck.IN_USE].ending is Ending.IN_USE
+    assert (
+        found[IdentityCheck.CHARGE].text == "the battery is at 7 %: charge it first, if it can wait"
+    )
+    assert found[IdentityCheck.CHARGE].ending is None
+    assert found[IdentityCheck.CHARGE].waiver == ""
+    assert found[IdentityCheck.CHARGE].detail == found[IdentityCheck.CHARGE].text
     limits = Identity(in_use_ma=1500, low_charge_percent=7)
-    assert {Check.IN_USE, Check.CHARGE}.isdisjoint(judged(identity=limits, device=device))
+    assert {IdentityCheck.IN_USE, IdentityCheck.CHARGE}.isdisjoint(
+        judged(identity=limits, device=device)
+    )
 
 
 def test_the_same_version_ends_the_session_where_it_is_skipped() -> None:
@@ -356,6 +378,6 @@ def test_the_same_version_ends_the_session_where_it_is_skipped() -> None:
 
 def test_only_the_battery_tells_its_state_even_without_a_version() -> None:
     device = DeviceAnswers(running=replace(BATTERY, mean_current_ma=-1500))
-    assert judged(device=device)[Check.IN_USE].verdict is REFUSED
+    assert judged(device=device)[IdentityCheck.IN_USE].verdict is REFUSED
     assert device.hardware_version is None
     assert device.firmware_version is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher.errors import UsageError
-from flasher.host.items import Readable, find, make_content, readable, writable
+from flasher.host.items import Readable, find_item, make_content, readable, writable
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import ProductionInformation, VersionInformation
 from flasher.protocol.spec import BMS, OBC, WELLING
@@ -28,17 +28,17 @@ def test_what_is_not_answered_has_no_content() -> None:
 
 @each("name", ["user-string-1", "User_String_1", "USER STRING 1"])
 def test_a_name_is_found_however_it_is_written(name: str) -> None:
-    assert find(name, WRITES, BMS, "write") is WRITES["user-string-1"]
+    assert find_item(name, WRITES, BMS, "write") is WRITES["user-string-1"]
 
 
 def test_a_name_that_is_not_there_is_answered_with_the_closest_and_all() -> None:
     with pytest.raises(UsageError) as refused:
-        find("serial-nunber", READS, BMS, "read")
+        find_item("serial-nunber", READS, BMS, "read")
     assert refused.value.what == "There is nothing called 'serial-nunber' to read in the BMS."
     assert "serial-number?" in refused.value.remedy
     assert "There are: physical-id, check-code" in refused.value.remedy
     with pytest.raises(UsageError) as refused:
-        find("serial-number", readable(OBC, WELLING), OBC, "read")
+        find_item("serial-number", readable(OBC, WELLING), OBC, "read")
     assert refused.value.what == "The documents give the tool nothing to read in the OBC."
     assert "-t bms" in refused.value.remedy
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from flasher import events
-from flasher.host.identity import Check, CheckResult, CheckVerdict
+from flasher.host.identity import CheckResult, CheckVerdict, IdentityCheck
 from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending, Reason
@@ -254,7 +254,7 @@ def test_the_default_deadline_leaves_room_for_the_silence() -> None:
 # -- what could not be checked ---------------------------------------------------------------------
 
 UNCHECKED = CheckResult(
-    Check.HARDWARE, CheckVerdict.REFUSED, "nobody told its hardware", is_unchecked=True
+    IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "nobody told its hardware", is_unchecked=True
 )
 
 
@@ -281,7 +281,7 @@ def test_a_device_that_announces_itself_after_all_is_refused_by_that_rule(after_
     bench.say(BOOT)
     bench.wait(1.0)
     assert bench.outcome.ending is Ending.UNCHECKED
-    assert bench.outcome.waiver == Check.HARDWARE.value
+    assert bench.outcome.waiver == IdentityCheck.HARDWARE.value
     assert "nobody told its hardware" in bench.outcome.detail
     assert bench.unread == []
 

@@ -9,7 +9,7 @@ import pytest
 
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.events import Phase
-from flasher.host.outcome import DeviceLeft, Outcome, Statistics, before_the_start, standing
+from flasher.host.outcome import DeviceLeft, Outcome, Statistics, ended_before_start, standing
 from flasher.host.table import Ending
 from flasher.host.verify import (
     Level,
@@ -29,7 +29,7 @@ PLAN = plan(image_of(300), BMS, WELLING.bitrate_bps)
 
 
 def outcome(ending: Ending, phase: Phase = Phase.TRANSFER, **changes: object) -> Outcome:
-    early = before_the_start(PLAN, ending, "", phase, duration_s=1.5)
+    early = ended_before_start(PLAN, ending, "", phase, duration_s=1.5)
     return replace(early, **changes)  # type: ignore[arg-type]
 
 
@@ -161,7 +161,7 @@ def test_where_it_was(packet: int | None, attempt: int, text: str) -> None:
 
 
 def test_what_ends_before_the_start_has_no_figures_but_its_time() -> None:
-    early = before_the_start(PLAN, Ending.IN_USE, "", duration_s=1.5)
+    early = ended_before_start(PLAN, Ending.IN_USE, "", duration_s=1.5)
     assert early.statistics == Statistics(0, 0, 0, 0, 0, 1.5, None)
     assert early.phase is Phase.IDENTIFY
     assert (early.total_packets, early.packet, early.boot_version) == (3, None, None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flasher.host.options import UpgradeOptions
-from flasher.host.session import Session
+from flasher.host.session import UpgradeSession
 from flasher.host.table import Ending
 from flasher.host.verify import Level, possible_levels
 from flasher.image.image import Image
@@ -46,5 +46,5 @@ def test_with_a_version_query_of_its_own_any_target_can_be_verified() -> None:
     assert possible_levels(WMC) == (Level.NONE,)
     assert possible_levels(WMC, options) == (Level.NONE, Level.VERSION)
     image = Image.from_bytes(bytes(10))
-    session = Session(plan(image, WMC, 250_000), options, Level.VERSION)
+    session = UpgradeSession(plan(image, WMC, 250_000), options, Level.VERSION)
     assert not session.done

@@ -9,7 +9,7 @@ from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Queries, Request
-from flasher.host.session import Session
+from flasher.host.session import UpgradeSession
 from flasher.host.table import UpgradeState
 from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, memory_check, version_check
@@ -96,7 +96,7 @@ def test_a_check_that_is_done_does_nothing_more() -> None:
 
 def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> None:
     bench = Bench(100)
-    session = Session(plan(bench.image, BMS, WELLING.bitrate_bps), level=Level.VERSION)
+    session = UpgradeSession(plan(bench.image, BMS, WELLING.bitrate_bps), level=Level.VERSION)
     bench.engine = session  # type: ignore[assignment]
     bench.sent.clear()
     bench._step()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from flasher.host.runner import Came, Runner, Signal, Stage
+from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import Damage, Message
 from tests.peers.wording import build, payloads
@@ -18,11 +18,13 @@ def parts(can_id: int) -> list[bytes]:
 PARTS = parts(0x720)
 
 
-def runner(*can_ids: int, until: float | None = None) -> tuple[Runner[list[Came]], list[Came]]:
+def runner(
+    *can_ids: int, until: float | None = None
+) -> tuple[Runner[list[StageInput]], list[StageInput]]:
     """A stage that keeps what comes, until it is cancelled."""
-    came: list[Came] = []
+    came: list[StageInput] = []
 
-    def stage(run: Runner[Any]) -> Stage[list[Came]]:
+    def stage(run: Runner[Any]) -> Stage[list[StageInput]]:
         run.listen(*can_ids)
         while Signal.CANCEL not in came:
             came.append((yield until))

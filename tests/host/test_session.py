@@ -14,7 +14,7 @@ from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
 from flasher.host.options import UpgradeOptions
 from flasher.host.runner import Runner
-from flasher.host.session import Result, Session
+from flasher.host.session import Result, UpgradeSession
 from flasher.host.verify import (
     Level,
     Verdict,
@@ -56,7 +56,7 @@ def run(
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock, disturbance)
     bus.attach(MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps))
-    session = Session(plan(image, TARGETS[target], WELLING.bitrate_bps), level=level)
+    session = UpgradeSession(plan(image, TARGETS[target], WELLING.bitrate_bps), level=level)
     seen: list[object] = []
     drive(session, bus.link(), clock, on_event=seen.append)
     return session.result, seen
@@ -135,7 +135,7 @@ def test_only_the_bms_has_queries_to_verify_with() -> None:
 
 def test_the_result_cannot_be_read_before_there_is_one() -> None:
     with pytest.raises(RuntimeError, match="not ended"):
-        _ = Session(planned()).result
+        _ = UpgradeSession(planned()).result
 
 
 # -- the checks, with the test in the place of the application -------------------------------------

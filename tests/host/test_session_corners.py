@@ -9,10 +9,10 @@ import pytest
 from flasher.errors import ExitCode
 from flasher.host.guard import Guard
 from flasher.host.identify import LISTEN_FIRST_S
-from flasher.host.identity import Check, CheckVerdict, DeviceAnswers, Identity, judge_device
+from flasher.host.identity import CheckVerdict, DeviceAnswers, Identity, IdentityCheck, judge_device
 from flasher.host.options import UpgradeOptions
-from flasher.host.outcome import before_the_start
-from flasher.host.session import Result, Session
+from flasher.host.outcome import ended_before_start
+from flasher.host.session import Result, UpgradeSession
 from flasher.host.table import Ending, UpgradeState
 from flasher.host.upgrade import Upgrade, UpgradeStage
 from flasher.image.image import Image
@@ -66,7 +66,7 @@ def test_a_second_tool_after_the_users_word_stops_the_rest_of_the_message() -> N
 
 
 def test_a_session_that_has_ended_hears_and_sends_nothing_any_more() -> None:
-    session = Session(PLAN)
+    session = UpgradeSession(PLAN)
     session.tick(0.0)
     session.cancel(0.0)
     while (frame := session.next_frame(0.0)) is not None:
@@ -84,7 +84,7 @@ def test_a_session_that_has_ended_hears_and_sends_nothing_any_more() -> None:
 
 
 def test_a_session_without_identity_asks_nobody_and_checks_nothing() -> None:
-    session = Session(PLAN)
+    session = UpgradeSession(PLAN)
     session.tick(0.0)
     assert session.next_frame(0.0) is None
     session.tick(LISTEN_FIRST_S)
@@ -118,14 +118,14 @@ def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_no
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
     told = DeviceAnswers(OnlyFirmware(WireText(encode_text("V1r0r0_20220512", 16))))
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))
-    hardware = next(found for found in findings if found.check is Check.HARDWARE)
+    hardware = next(found for found in findings if found.check is IdentityCheck.HARDWARE)
     assert hardware.verdict is CheckVerdict.REFUSED
     assert "does not tell its hardware" in hardware.text
     assert hardware.ending is Ending.UNCHECKED
 
 
 def test_an_up_to_date_device_is_no_error_and_has_an_exit_code_of_its_own() -> None:
-    result = Result(before_the_start(PLAN, Ending.UP_TO_DATE, "it runs it", duration_s=0.1))
+    result = Result(ended_before_start(PLAN, Ending.UP_TO_DATE, "it runs it", duration_s=0.1))
     assert result.error() is None
     assert not result.ok
     assert result.exit_code == ExitCode.NOTHING_TO_DO

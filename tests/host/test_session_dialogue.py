@@ -11,10 +11,10 @@ from flasher import events
 from flasher.errors import ErrorCode, ExitCode
 from flasher.events import Phase
 from flasher.host.identify import LISTEN_FIRST_S
-from flasher.host.identity import Check, Identity
+from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.options import UpgradeOptions
-from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
-from flasher.host.session import Result, Session
+from flasher.host.outcome import DeviceLeft, Outcome, ended_before_start
+from flasher.host.session import Result, UpgradeSession
 from flasher.host.table import Ending
 from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, Verdict
@@ -75,7 +75,7 @@ class Dialogue(Bench):
         level: Level = Level.NONE,
     ) -> None:
         super().__init__(image=IMAGE)
-        self.session = Session(PLAN, options, level, identity)
+        self.session = UpgradeSession(PLAN, options, level, identity)
         self.engine = self.session  # type: ignore[assignment]
         self.sent.clear()
         self.events.clear()
@@ -162,7 +162,7 @@ def test_the_first_check_that_refuses_ends_it_and_all_are_told() -> None:
 def test_an_image_that_is_refused_by_itself_ends_it_before_anybody_is_asked() -> None:
     dialogue = Dialogue(identity=Identity(replace(release_of(IMAGE, BMS), target=OBC)))
     assert dialogue.ended.ending is Ending.NOT_FOR_DEVICE
-    assert dialogue.ended.waiver == Check.TARGET.value
+    assert dialogue.ended.waiver == IdentityCheck.TARGET.value
     assert dialogue.sent == []
 
 
@@ -503,7 +503,7 @@ def test_attempts_that_were_limited_limit_lost_adapters_in_the_transfer_too() ->
 
 
 def test_a_question_that_was_cut_short_is_not_gone_on_with() -> None:
-    session = Session(PLAN, identity=Identity())
+    session = UpgradeSession(PLAN, identity=Identity())
     session.tick(0.0)
     session.tick(LISTEN_FIRST_S)
     first = session.next_frame(LISTEN_FIRST_S)
@@ -534,14 +534,14 @@ def test_a_question_that_was_cut_short_is_not_gone_on_with() -> None:
 def test_a_pause_or_a_shutdown_is_a_cause_only_where_nobody_answered(
     ending: Ending, stalled_s: float, begins: str, *, shutdown: bool
 ) -> None:
-    outcome = before_the_start(PLAN, ending, "", duration_s=1.0)
+    outcome = ended_before_start(PLAN, ending, "", duration_s=1.0)
     error = Result(outcome, shutdown_heard=shutdown, stalled_s=stalled_s).error()
     assert error is not None
     assert error.cause.startswith(begins)
 
 
 def test_the_error_of_another_tool_has_its_code() -> None:
-    error = Result(before_the_start(PLAN, Ending.SECOND_TOOL, "", duration_s=1.0)).error()
+    error = Result(ended_before_start(PLAN, Ending.SECOND_TOOL, "", duration_s=1.0)).error()
     assert error is not None
     assert error.code is ErrorCode.SECOND_TOOL
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from flasher import events
-from flasher.host.identity import Check, CheckResult, CheckVerdict
+from flasher.host.identity import CheckResult, CheckVerdict, IdentityCheck
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending, Reason
@@ -343,7 +343,7 @@ def test_at_the_deadline_it_ends_as_the_attempt_before_would_have(
 
 
 def test_a_session_that_was_not_to_be_checked_names_the_check_that_refused() -> None:
-    rule = CheckResult(Check.HARDWARE, CheckVerdict.REFUSED, "no hardware told")
+    rule = CheckResult(IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "no hardware told")
     bench = Bench(options=replace(ONCE, in_session=True))
     stage(bench).unchecked = rule
     bench.expect(ResetCommand)

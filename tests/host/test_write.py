@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher.errors import ErrorCode, UsageError
-from flasher.host.write import Written, plan_write
+from flasher.host.write import WriteResult, plan_write
 from flasher.protocol.contents import CheckCode, ProductionInformation
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.spec import BMS
@@ -17,7 +17,7 @@ PLAN = plan_write("production-information", [MADE], manufacturer=True)
 
 
 def test_what_is_confirmed_and_reads_back_as_it_was_written_is_good() -> None:
-    written = Written(PLAN, ELSEWHERE, is_confirmed=True, read_back=MADE)
+    written = WriteResult(PLAN, ELSEWHERE, is_confirmed=True, read_back=MADE)
     assert written.error() is None
     assert written.differences == ()
     changes = {each.name: (each.old, each.new, each.read_back) for each in written.changes}
@@ -44,14 +44,14 @@ DIFFERS = "but reads back place 'WUXI' instead of 'SUZHOU'."
 def test_the_error_says_what_is_missing_or_the_first_field_that_differs(
     *, is_confirmed: bool, read_back: Content | None, what: str
 ) -> None:
-    error = Written(PLAN, None, is_confirmed=is_confirmed, read_back=read_back).error()
+    error = WriteResult(PLAN, None, is_confirmed=is_confirmed, read_back=read_back).error()
     assert error is not None
     assert error.what.endswith(what)
     assert error.code is ErrorCode.WRITE_DIFFERS
 
 
 def test_what_is_not_known_of_a_field_is_none() -> None:
-    (change,) = Written(
+    (change,) = WriteResult(
         plan_write("user-string-1", ["RACK 7"]), None, is_confirmed=False, read_back=None
     ).changes
     assert (change.name, change.unit) == ("text", "")

@@ -10,7 +10,7 @@ from flasher.cli.output import Output
 from flasher.cli.recording import Recording
 from flasher.errors import NoAnswerError
 from flasher.events import QueryAnswered
-from flasher.host.query import piece_of
+from flasher.host.query import memory_bytes
 from flasher.protocol.contents import Memory
 
 MEMORY = "memory"
@@ -25,7 +25,7 @@ def read_shown(device: Device, start: int, end: int, output: Output, record: Rec
         output.event(event)
         record.warn(output, event)
         if isinstance(event, QueryAnswered) and isinstance(event.content, Memory):
-            done += len(piece_of(event.content))
+            done += len(memory_bytes(event.content))
             bar.move_to(done, end - start)
 
     with Bar(output, unit="B", unit_scale=True, desc=MEMORY) as bar:

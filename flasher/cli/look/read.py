@@ -19,7 +19,7 @@ from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ExitCode, UsageError
-from flasher.host.items import find, meaningful_fields, readable
+from flasher.host.items import find_item, meaningful_fields, readable
 from flasher.host.query import check_range
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
@@ -153,7 +153,7 @@ def read(
 def _read_item(
     item: str, target: Target, bus: Bus, recorded: RecordingOptions, output: Output
 ) -> int:
-    entry = find(item, readable(target, bus.dialect), target, "read")
+    entry = find_item(item, readable(target, bus.dialect), target, "read")
     with recorded_device(recorded, bus, output, target) as (device, record):
         answer = device.read(entry.name)
     document = content_document(answer)

@@ -18,7 +18,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.cli.terminal import agrees, can_ask
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.items import writable
-from flasher.host.write import Written, field_changes, plan_write
+from flasher.host.write import WriteResult, field_changes, plan_write
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
@@ -172,7 +172,7 @@ def write(
     return output.document(_document(written))
 
 
-def _document(written: Written) -> WrittenDocument:
+def _document(written: WriteResult) -> WrittenDocument:
     return WrittenDocument(
         target=written.plan.target.name,
         item=written.plan.writable.name,

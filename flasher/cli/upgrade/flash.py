@@ -32,7 +32,7 @@ from flasher.cli.upgrade.carried import Carried
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
 from flasher.errors import ExitCode, FlasherError
-from flasher.host.identity import WAIVABLE, Check
+from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import (
     DEFAULT_ATTEMPTS,
     DEFAULT_POWER_UP_TIMEOUT_S,
@@ -116,7 +116,7 @@ class UpgradeChoices:
         """True when --allow-NAME or --force was given."""
         return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
 
-    def waived_checks(self) -> frozenset[Check]:
+    def waived_checks(self) -> frozenset[IdentityCheck]:
         """The checks of image and device that are waived."""
         return frozenset(check for check in WAIVABLE if self.allows(check.value))
 

@@ -22,7 +22,7 @@ from flasher.cli.output import Output
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
 from flasher.errors import ExitCode, FlasherError
-from flasher.host.identity import Check, judge_bytes
+from flasher.host.identity import IdentityCheck, judge_bytes
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import BMS, Target
 from flasher.settings.profile import load_profile
@@ -88,7 +88,7 @@ def image_info(
     release = None
     with contextlib.suppress(FlasherError):  # told in `beside`
         release = api.find_release(image.image)
-    waived = frozenset({Check.PLAUSIBLE} if allow_implausible else ())
+    waived = frozenset({IdentityCheck.PLAUSIBLE} if allow_implausible else ())
     identity = settings.identity(release=release, waived=waived)
     for found in judge_bytes(loaded, identity):
         error = api.refusal(plan, found)
