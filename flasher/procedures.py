@@ -394,8 +394,8 @@ class Procedures:
         """
         queries = self._queries([request])
         self.run(queries, may_cancel=may_cancel)
-        if for_write and queries.twins.evidence:
-            raise two_devices(self.target, queries.twins.evidence, for_write)
+        if for_write and queries.duplicates.evidence:
+            raise two_devices(self.target, queries.duplicates.evidence, for_write)
         return queries.queries[0]
 
     def _queries(self, requests: Iterable[Request]) -> Queries:

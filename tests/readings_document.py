@@ -125,11 +125,11 @@ HOLDERS: Final = {
             "test_two_devices_that_tell_different_versions_are_refused_before_the_reset"
         ),
         (
-            "tests/host/test_twins.py::"
+            "tests/host/test_duplicates.py::"
             "test_a_packet_that_was_sent_once_and_acknowledged_twice_is_two_devices"
         ),
         (
-            "tests/host/test_twins.py::"
+            "tests/host/test_duplicates.py::"
             "test_two_bursts_that_overlap_are_two_devices_although_one_feedback_was_lost"
         ),
     ),

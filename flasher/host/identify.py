@@ -4,7 +4,7 @@ Asked are the version information (where the target has a query for it) and, of 
 running information. A device that sits in its bootloader announces itself instead of answering:
 that is heard, and ends the asking at once, so that the announcement can be answered in its window.
 Before the first question it listens for a moment, for another tool may be at work (`guard` hears
-it); after the last one it listens for the answers of a second device (`twins`).
+it); after the last one it listens for the answers of a second device (`duplicates`).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class IdentifyStage:
             yield from filtered(asking, self._look)
             if not self.cancelled and self.heard is None:
                 yield from filtered(count_answers(run, self._queries), self._look)
-        self.two_devices = run.twins.evidence
+        self.two_devices = run.duplicates.evidence
         return self
 
     def _while_silent(self) -> Iterator[Request]:

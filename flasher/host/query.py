@@ -171,7 +171,7 @@ def _others_ask(query: Query) -> set[int]:
 
 def _copy_left(run: Runner[Any], query: Query) -> None:
     timings, left_at = run.timings, run.tx.left_at
-    run.twins.asked(query.answer_item.key, run.now, query.answer_item)
+    run.duplicates.asked(query.answer_item.key, run.now, query.answer_item)
     query.copies_left += 1
     if query.answer is not None:
         query.ends_at = left_at + timings.quiet_after_repeat_s
@@ -226,7 +226,7 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
     if (yield from run.listen_on()):
         return
     for query in queries:
-        if query.answer_item in run.twins.doubts:
+        if query.answer_item in run.duplicates.doubts:
             yield from ask(run, Query(query.request, quiet=True))
             if (yield from run.listen_on()):
                 return
@@ -234,8 +234,8 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
 
 def report_two_devices(run: Runner[Any]) -> None:
     """Report a second device, if one has shown itself."""
-    if run.twins.evidence:
-        run.tell(events.TwoDevicesSeen(run.twins.evidence))
+    if run.duplicates.evidence:
+        run.tell(events.TwoDevicesSeen(run.duplicates.evidence))
 
 
 class Queries(Runner[None]):

@@ -20,7 +20,7 @@ from math import inf
 from typing import Any, Generic, TypeVar
 
 from flasher.events import BytesDamaged
-from flasher.host.twins import LISTENS_ON_S, Twins
+from flasher.host.duplicates import SECOND_DEVICE_WAIT_S, DuplicateDetector
 from flasher.protocol.engine import Transmitter
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -67,7 +67,7 @@ class Runner(Generic[T]):
         """When it is cancelled if it has not ended."""
         self.watch: Callable[[Frame], bool] | None = None
         """Sees every frame; what it returns True for is not heard by the stage."""
-        self.twins = Twins(timings)
+        self.duplicates = DuplicateDetector(timings)
         """What speaks for a second device; the stage says what it has asked."""
         self._make_stage = stage
         self._stage: Stage[T] | None = None
@@ -127,7 +127,7 @@ class Runner(Generic[T]):
 
     def listen_on(self) -> Stage[bool]:
         """Hear what a second device sends later; returns True when that was cancelled."""
-        until = self.now + LISTENS_ON_S
+        until = self.now + SECOND_DEVICE_WAIT_S
         came: StageInput = Signal.TIME
         while self.now < until and came is not Signal.CANCEL:
             came = yield until
@@ -148,14 +148,14 @@ class Runner(Generic[T]):
         if self.done:
             return
         self.now = now
-        self.twins.see(frame, now)
+        self.duplicates.see(frame, now)
         if self.watch is not None and self.watch(frame):
             return
         reassembler = self._listening.get(frame[0])
         if reassembler is None or not frame.is_payload:
             return
         for found in reassembler.feed(frame[1], now):
-            self.twins.heard(found, now)
+            self.duplicates.heard(found, now)
             self._resume(found)
 
     def tick(self, now: float) -> None:
@@ -168,7 +168,7 @@ class Runner(Generic[T]):
         for reassembler in tuple(self._listening.values()):
             if now >= reassembler.due_at:
                 for found in reassembler.tick(now):
-                    self.twins.heard(found, now)
+                    self.duplicates.heard(found, now)
                     self._resume(found)
         if now >= self.limit_at:
             self.cancel(now)

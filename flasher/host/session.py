@@ -290,8 +290,8 @@ class UpgradeSession(Runner[Result]):
         self.listen_always(self._plan.target.answer_id)
         with contextlib.suppress(SecondToolSeen):  # the device has the image all the same
             yield from self.listen_on()
-        if self.twins.evidence:
-            return Verification(level, Verdict.TWO_DEVICES, None, self.twins.evidence)
+        if self.duplicates.evidence:
+            return Verification(level, Verdict.TWO_DEVICES, None, self.duplicates.evidence)
         found = NOT_ASKED
         if level is not Level.NONE:
             found = yield from self._checked(Level.VERSION)

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from flasher import events
 from flasher.events import Phase
+from flasher.host.duplicates import DuplicateDetector
 from flasher.host.identity import CheckResult
 from flasher.host.options import (
     ERASURES_MAX,
@@ -25,7 +26,6 @@ from flasher.host.options import (
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
 from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
-from flasher.host.twins import Twins
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
 from flasher.protocol.engine import WELL_BEYOND
@@ -202,8 +202,8 @@ class UpgradeStage:
         return standing(self._phase, self._packet, self._plan.total_packets, self._attempt)
 
     @property
-    def _twins(self) -> Twins:
-        return self._run.twins
+    def _duplicates(self) -> DuplicateDetector:
+        return self._run.duplicates
 
     @property
     def _packet(self) -> int | None:
@@ -352,7 +352,7 @@ class UpgradeStage:
 
     def _message(self, message: Message) -> None:
         self._heard_at = self._run.now
-        if self._twins.evidence and not self.is_yielding:
+        if self._duplicates.evidence and not self.is_yielding:
             self._dispatch(UpgradeEvent.TWO_DEVICES)
             return
         item = self._version_item
@@ -433,9 +433,9 @@ class UpgradeStage:
     def _message_left(self) -> None:
         at, tag, left_at = self._at, self._tx.left_tag, self._tx.left_at
         if tag is Command.READ_VERSION and self._version_item is not None:
-            self._twins.asked(self._version_item.key, self._run.now, self._version_item)
+            self._duplicates.asked(self._version_item.key, self._run.now, self._version_item)
         elif isinstance(tag, Command):
-            self._twins.left(tag, self._run.now, at.packet)
+            self._duplicates.left(tag, self._run.now, at.packet)
         match tag:
             case Command.PACKET:
                 at.copies_unanswered += 1
@@ -588,7 +588,9 @@ class UpgradeStage:
         now, timings, at = self._run.now, self._timings, self._at
         self._go(UpgradeState.WATCHING)
         self._tx.drop_unstarted()
-        wait_s = timings.boot_version_timeout_s if self._twins.is_beside else timings.boot_watch_s
+        wait_s = (
+            timings.boot_version_timeout_s if self._duplicates.is_beside else timings.boot_watch_s
+        )
         at.watched_since, at.watched_until = now, now + wait_s
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + self._burst_s)
@@ -599,14 +601,14 @@ class UpgradeStage:
             self._end(Ending.WRONG_DEVICE, row)
             return
         answer_id = self._plan.target.answer_id
-        if not self._twins.is_beside and not self._twins.has_announced(answer_id):
+        if not self._duplicates.is_beside and not self._duplicates.has_announced(answer_id):
             # What was heard before the reset has ended: an application is there, and restarts.
             self._await_boot(row)
             return
-        if self._twins.is_beside:
+        if self._duplicates.is_beside:
             wait_s = timings.boot_version_timeout_s
             at.watched_until = max(at.watched_until, at.watched_since + wait_s)
-        elif self._twins.overlap(answer_id):
+        elif self._duplicates.overlap(answer_id):
             two_rounds_s = 2 * timings.boot_version_spacing_s
             at.watched_until = max(at.watched_until, at.watched_since + two_rounds_s)
         if self._tx.idle:
@@ -621,7 +623,7 @@ class UpgradeStage:
         """Nothing speaks for a second device."""
         at = self._at
         has_ended = self._run.now < at.watched_until
-        if self._twins.is_beside and has_ended and not at.was_reset_again:
+        if self._duplicates.is_beside and has_ended and not at.was_reset_again:
             # The announcements have ended, and an application is there: it is reset.
             at.was_reset_again = True
             self._go(UpgradeState.RESETTING)
@@ -941,7 +943,7 @@ class UpgradeStage:
         self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
 
     def _take_turn(self, row: ReceivedContent) -> None:
-        self._run.twins = Twins(self._timings)  # what came answered the other tool
+        self._run.duplicates = DuplicateDetector(self._timings)  # what came answered the other tool
         self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
 
     # -- the end ---------------------------------------------------------------------------------
@@ -950,7 +952,7 @@ class UpgradeStage:
         self._end(Ending.BROKEN_PROTOCOL, row)
 
     def _end_for_two_devices(self, row: ReceivedContent) -> None:
-        self._end(Ending.TWO_DEVICES, row, self._twins.evidence)
+        self._end(Ending.TWO_DEVICES, row, self._duplicates.evidence)
 
     def _end_out_of_time(self, row: ReceivedContent) -> None:
         """End as an attempt before would have, where it went on only for nothing to lose."""

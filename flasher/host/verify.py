@@ -201,8 +201,8 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     again = yield from ask(run, Query(request, quiet=True))
     yield from count_answers(run, [again])
     version = firmware_version(query.answer)
-    if run.twins.evidence:
-        return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.twins.evidence)
+    if run.duplicates.evidence:
+        return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
     expected = plan.image.version
     if expected is None:
         return Verification(Level.VERSION, Verdict.VERSION_UNJUDGED, version)

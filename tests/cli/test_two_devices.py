@@ -16,7 +16,7 @@ from flasher.protocol.spec import WELLING
 from flasher.protocol.wire import Message, encode, split
 from tests.cli.conftest import Flasher
 from tests.end_to_end.stage import SMALL, Speaker, Stage
-from tests.host.twins import Slow
+from tests.host.duplicates import Slow
 from tests.loops import each
 
 MOCK = ("-t", "bms", "--mock", "--mock-speed", "0")
@@ -99,7 +99,7 @@ def test_who_only_listens_counts_the_answers_to_others(stage: Stage) -> None:
     survey = Survey(listen_s=1.0, bitrate_bps=WELLING.bitrate_bps, dialect=WELLING)
     link = stage.bus.link()
     drive(survey, link, stage.clock)
-    assert SEEN in survey.twins.evidence
+    assert SEEN in survey.duplicates.evidence
 
 
 def test_who_only_listens_detects_two_bootloaders() -> None:
@@ -111,7 +111,7 @@ def test_who_only_listens_detects_two_bootloaders() -> None:
     stage.bus.attach(other)
     survey = Survey(listen_s=1.0, bitrate_bps=WELLING.bitrate_bps, dialect=WELLING)
     drive(survey, stage.bus.link(), stage.clock)
-    assert "alternately" in survey.twins.evidence
+    assert "alternately" in survey.duplicates.evidence
 
 
 def test_doctor_calls_it_a_problem(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from flasher.host.duplicates import SECOND_DEVICE_WAIT_S
 from flasher.host.identify import LISTEN_FIRST_S, IdentifyStage
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.host.runner import Runner
-from flasher.host.twins import LISTENS_ON_S
 from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.bittime import frame_bits
@@ -83,7 +83,7 @@ def asked_both() -> Asked:
 
 def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
     asked = asked_both()
-    asked.run(asked.now + LISTENS_ON_S)
+    asked.run(asked.now + SECOND_DEVICE_WAIT_S)
     assert asked.engine.done
     assert asked.commands == [0x3300, 0x3400]
     assert asked.told.seen.version == version()

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from flasher import events
+from flasher.host.duplicates import SECOND_DEVICE_WAIT_S
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Queries, Request
 from flasher.host.session import UpgradeSession
 from flasher.host.table import UpgradeState
-from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, memory_check, version_check
 from flasher.image.image import Image
 from flasher.image.plan import plan
@@ -107,7 +107,7 @@ def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> Non
     stands.append((session.standing, session.device_left))
     bench.say(Complete())
     stands.append((session.standing, session.device_left))
-    bench.wait(LISTENS_ON_S)
+    bench.wait(SECOND_DEVICE_WAIT_S)
     stands.append((session.standing, session.device_left))
     assert stands == [
         ("listening for another tool", DeviceLeft.UNTOUCHED),

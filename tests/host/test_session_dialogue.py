@@ -10,13 +10,13 @@ import pytest
 from flasher import events
 from flasher.errors import ErrorCode, ExitCode
 from flasher.events import Phase
+from flasher.host.duplicates import SECOND_DEVICE_WAIT_S
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome, ended_before_start
 from flasher.host.session import Result, UpgradeSession
 from flasher.host.table import Ending
-from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, Verdict
 from flasher.image.image import Image
 from flasher.image.plan import plan
@@ -121,7 +121,7 @@ def test_a_battery_is_asked_before_the_reset_and_what_it_answered_is_kept() -> N
     dialogue.say(Ack(1))
     dialogue.expect(EndOfTransfer)
     dialogue.say(Complete())
-    dialogue.wait(LISTENS_ON_S)
+    dialogue.wait(SECOND_DEVICE_WAIT_S)
     assert dialogue.result.ok
     assert dialogue.result.previous_version == OLD
     assert dialogue.result.shutdown_heard is False
@@ -144,7 +144,7 @@ def test_the_first_check_that_refuses_ends_it_and_all_are_told() -> None:
     rules = release_of(IMAGE, BMS, hardware_versions=["V9*"])
     dialogue = Dialogue(identity=Identity(rules))
     dialogue.identified("V3r0r0_20260301")
-    dialogue.wait(LISTENS_ON_S)
+    dialogue.wait(SECOND_DEVICE_WAIT_S)
     outcome = dialogue.ended
     assert outcome.ending is Ending.NOT_FOR_DEVICE
     assert outcome.waiver == "hardware"
@@ -338,7 +338,7 @@ def to_verification(options: UpgradeOptions | None = None) -> Dialogue:
     assert dialogue.session.has_begun_to_erase
     dialogue.say(Complete())
     assert dialogue.session.standing == "listening for a second device"
-    dialogue.wait(LISTENS_ON_S)
+    dialogue.wait(SECOND_DEVICE_WAIT_S)
     assert dialogue.session.standing == "verifying by version"
     assert dialogue.session.device_left is DeviceLeft.NEW
     assert dialogue.asked() == 0x3300
@@ -404,7 +404,7 @@ def test_a_battery_that_switches_off_is_told_and_kept(end: Ending) -> None:
         dialogue.say(Ack(1))
         dialogue.expect(EndOfTransfer)
         dialogue.say(Complete())
-        dialogue.wait(LISTENS_ON_S)
+        dialogue.wait(SECOND_DEVICE_WAIT_S)
     assert dialogue.ended.ending is end
     assert dialogue.result.shutdown_heard is True
 
@@ -487,7 +487,7 @@ def test_a_device_that_was_not_asked_has_no_version_before_the_upgrade() -> None
     dialogue.say(Ack(1))
     dialogue.expect(EndOfTransfer)
     dialogue.say(Complete())
-    dialogue.wait(LISTENS_ON_S)
+    dialogue.wait(SECOND_DEVICE_WAIT_S)
     assert dialogue.result.ok
     assert dialogue.result.previous_version is None
 

@@ -29,7 +29,7 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, encode, split
 from flasher.wording import wording
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
-from tests.host.twins import Slow
+from tests.host.duplicates import Slow
 from tests.loops import each
 
 OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA16123A105A5A"))

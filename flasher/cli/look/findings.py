@@ -402,8 +402,8 @@ def _nodes(heard: Listened) -> Iterator[Finding]:
             "another tool speaks as CDL on this bus: two at once spoil an upgrade",
             ("wait if it upgrades a device; else close the other tool, or disconnect it",),
         )
-    if survey.twins.evidence:
-        what = f"two devices of one kind are on the bus: {survey.twins.evidence}"
+    if survey.duplicates.evidence:
+        what = f"two devices of one kind are on the bus: {survey.duplicates.evidence}"
         yield _problem("traffic", what, ("disconnect one of them",))
     for node, said in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
         if any(isinstance(content, contents.Shutdown) for content in said.last.values()):

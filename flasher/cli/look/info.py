@@ -131,5 +131,5 @@ def info_document(found: DeviceInfo) -> InfoDocument:
         },
         faults=content_document(faults)["faults"] if faults else [],
         heard=heard_document(heard) if heard else None,
-        two_devices=found.survey.twins.evidence or None,
+        two_devices=found.survey.duplicates.evidence or None,
     )

@@ -82,7 +82,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
         dialect_because=why,
         nodes={node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
         foreign_frames=survey.foreign_frames,
-        two_devices=survey.twins.evidence or None,
+        two_devices=survey.duplicates.evidence or None,
     )
     if error is not None:
         return output.failure(error, document)

@@ -47,7 +47,7 @@ def verdicts(
     seeds: Sequence[int], chosen: argparse.Namespace, options: str = ""
 ) -> Iterator[tuple[int, Verdict]]:
     with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
-        work = partial(played, options=options, twin_share=chosen.twins)
+        work = partial(played, options=options, twin_share=chosen.duplicates)
         yield from zip(seeds, pool.map(work, seeds, chunksize=_AT_ONCE), strict=True)
 
 
@@ -151,7 +151,7 @@ def main() -> int:
     parser.add_argument("-v", "--verbose", action="store_true", help="with every frame")
     chosen = parser.parse_args()
     if chosen.show is not None:
-        for clause in drawn(chosen.show, chosen.twins).clauses:
+        for clause in drawn(chosen.show, chosen.duplicates).clauses:
             say(str(clause))
         return 0
     if chosen.replay is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from flasher.host.twins import Twins
+from flasher.host.duplicates import DuplicateDetector
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import (
@@ -59,10 +59,10 @@ def version(serial: str = "W1", firmware: str = "V1r0r0_20220512") -> VersionInf
 
 
 class Watch:
-    """A `Twins` with the time; times are in ticks."""
+    """A `DuplicateDetector` with the time; times are in ticks."""
 
     def __init__(self, timings: Timings = TIMINGS) -> None:
-        self.twins = Twins(timings)
+        self.duplicates = DuplicateDetector(timings)
         self.now = 512.0
 
     def wait(self, ticks: float) -> Watch:
@@ -70,36 +70,36 @@ class Watch:
         return self
 
     def asks(self, item: Item = VERSION) -> Watch:
-        self.twins.asked(item.key, self.now, item)
+        self.duplicates.asked(item.key, self.now, item)
         return self
 
     def answers(self, content: Content | None = None, item: Item = VERSION) -> Watch:
         """A tick later."""
         self.now += TICK_S
-        self.twins.heard(catalogue.encode(item, content or version()), self.now)
+        self.duplicates.heard(catalogue.encode(item, content or version()), self.now)
         return self
 
     def sends(self, command: Command, packet: int = 0) -> Watch:
         self.now += TICK_S
-        self.twins.left(command, self.now, packet)
+        self.duplicates.left(command, self.now, packet)
         return self
 
     def hears(self, *rows: UpgradeMessage, can_id: int = 0x725) -> Watch:
         """Each a tick after the one before."""
         for row in rows:
             self.now += TICK_S
-            self.twins.heard(row.to_message(can_id), self.now)
+            self.duplicates.heard(row.to_message(can_id), self.now)
         return self
 
     def announces(self, *ticks: float, boot: BootVersion = BOOT, can_id: int = 0x725) -> Watch:
         """Announcements, each so much later than what was before."""
         for each_ticks in ticks:
             self.wait(each_ticks)
-            self.twins.heard(boot.to_message(can_id), self.now)
+            self.duplicates.heard(boot.to_message(can_id), self.now)
         return self
 
     def sees(self, can_id: int, *, remote: bool = False) -> Watch:
-        self.twins.see(Frame(can_id, b"" if remote else b"\x05", is_remote=remote), self.now)
+        self.duplicates.see(Frame(can_id, b"" if remote else b"\x05", is_remote=remote), self.now)
         return self
 
     def transfers(self, count: int = 0) -> Watch:
@@ -111,11 +111,11 @@ class Watch:
 
     @property
     def evidence(self) -> str:
-        return self.twins.evidence
+        return self.duplicates.evidence
 
     @property
     def doubts(self) -> list[Item]:
-        return self.twins.doubts
+        return self.duplicates.doubts
 
 
 def asked(*, answers: int, item: Item = VERSION) -> Watch:
@@ -198,10 +198,10 @@ def test_the_same_message_at_once_was_doubled_by_the_link(
 ) -> None:
     """On the wire two messages take longer."""
     watch = at(-TICK_S).asks().answers()
-    watch.twins.heard(catalogue.encode(VERSION, version()), apart_s)
+    watch.duplicates.heard(catalogue.encode(VERSION, version()), apart_s)
     assert watch.doubts == ([VERSION] if is_second else [])
     watch = at(-2 * TICK_S).sends(Command.RESET).hears(FeedbackMessage())
-    watch.twins.heard(FeedbackMessage().to_message(0x725), apart_s)
+    watch.duplicates.heard(FeedbackMessage().to_message(0x725), apart_s)
     assert watch.evidence == (CONFIRMED_TWICE if is_second else "")
 
 
@@ -212,7 +212,7 @@ def test_two_versions_are_two_devices_and_the_fields_that_differ_are_named() -> 
     assert watch.evidence == (
         f"{TWO_ANSWERED}: serial number W1 / W2; firmware version V1r0r0_20220512 / V9r0r0_20250101"
     )
-    assert watch.twins.contents == {
+    assert watch.duplicates.contents == {
         VERSION.key: [version(), version("W2"), version("W1", "V9r0r0_20250101")]
     }
 
@@ -229,15 +229,15 @@ def test_eight_different_answers_are_kept() -> None:
     watch = Watch().asks(RUNNING)
     for current_ma in range(10):
         watch.answers(replace(BATTERY, mean_current_ma=current_ma), RUNNING)
-    kept = watch.twins.contents[RUNNING.key]
+    kept = watch.duplicates.contents[RUNNING.key]
     assert [getattr(each, "mean_current_ma", None) for each in kept] == list(range(8))
 
 
 def test_an_answer_of_another_size_counts_and_is_not_read() -> None:
     watch = asked(answers=1).wait(1)
-    watch.twins.heard(Message(*VERSION.key[:1], 0x0C, VERSION.key[1], b"\1"), watch.now)
+    watch.duplicates.heard(Message(*VERSION.key[:1], 0x0C, VERSION.key[1], b"\1"), watch.now)
     assert watch.doubts == [VERSION]
-    assert watch.twins.contents[VERSION.key] == [version()]
+    assert watch.duplicates.contents[VERSION.key] == [version()]
 
 
 def test_a_write_that_is_confirmed_twice_is_two_devices_at_once() -> None:
@@ -250,19 +250,19 @@ def test_a_write_that_is_confirmed_twice_is_two_devices_at_once() -> None:
 def test_a_question_of_somebody_else_has_an_answer_of_its_own() -> None:
     display = Message(0x732, 0x11, 0x5100, b"")
     watch = asked(answers=1)
-    watch.twins.heard(display, watch.now)
+    watch.duplicates.heard(display, watch.now)
     assert watch.answers().doubts == []
     assert watch.answers().doubts == [VERSION]
     other_mode = display._replace(mode=0x16)
     watch = asked(answers=1)
-    watch.twins.heard(other_mode, watch.now)
+    watch.duplicates.heard(other_mode, watch.now)
     assert watch.answers().doubts == [VERSION], "that was no question"
 
 
 def test_what_nobody_asked_for_is_no_answer() -> None:
     watch = Watch().answers().answers()
     assert watch.doubts == []
-    assert watch.twins.contents == {}
+    assert watch.duplicates.contents == {}
 
 
 def garbled(message: Message, *, doubled: bool = False) -> Damage:
@@ -286,19 +286,19 @@ def test_an_answer_that_was_begun_counts_unless_its_frame_was_doubled(
     damage: Damage, *, counts: bool
 ) -> None:
     watch = asked(answers=1).wait(1)
-    watch.twins.heard(damage, watch.now)
+    watch.duplicates.heard(damage, watch.now)
     assert watch.doubts == ([VERSION] if counts else [])
 
 
 def test_a_confirmation_that_was_spoilt_counts() -> None:
     watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
-    watch.twins.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
+    watch.duplicates.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
     assert watch.evidence == CONFIRMED_TWICE
     watch = Watch().announces(0).sends(Command.RESET).wait(1)
-    watch.twins.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
-    assert watch.twins.is_beside
+    watch.duplicates.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
+    assert watch.duplicates.is_beside
     watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
-    watch.twins.heard(garbled(Ack(1).to_message(0x725)), watch.now)
+    watch.duplicates.heard(garbled(Ack(1).to_message(0x725)), watch.now)
     assert watch.evidence == ""
 
 
@@ -329,34 +329,36 @@ def test_a_reset_that_is_confirmed_while_a_bootloader_announces_itself(
 ) -> None:
     """A bootloader does not know the reset."""
     watch = Watch().announces(0).sends(Command.RESET).wait(after_ticks - 1)
-    assert watch.twins.announces(0x725, watch.now)
-    assert not watch.twins.announces(0x720, watch.now)
+    assert watch.duplicates.announces(0x725, watch.now)
+    assert not watch.duplicates.announces(0x720, watch.now)
     watch.hears(FeedbackMessage())
-    assert watch.twins.is_beside is is_beside
-    assert watch.wait(500).sends(Command.RESET).hears(FeedbackMessage()).twins.is_beside is False
+    assert watch.duplicates.is_beside is is_beside
+    assert (
+        watch.wait(500).sends(Command.RESET).hears(FeedbackMessage()).duplicates.is_beside is False
+    )
 
 
 def test_it_stays_so_until_the_next_reset_or_update_command() -> None:
-    assert not Watch().twins.is_beside
+    assert not Watch().duplicates.is_beside
     for command in (Command.RESET, Command.UPDATE):
         watch = Watch().announces(0).sends(Command.RESET).hears(FeedbackMessage()).wait(500)
-        assert watch.sends(Command.END_OF_TRANSFER).hears(FeedbackMessage()).twins.is_beside
+        assert watch.sends(Command.END_OF_TRANSFER).hears(FeedbackMessage()).duplicates.is_beside
         watch.sends(command)
-        assert not watch.twins.is_beside
+        assert not watch.duplicates.is_beside
     watch.announces(1).hears(FeedbackMessage())
-    assert not watch.twins.is_beside, "a bootloader may confirm the update command"
+    assert not watch.duplicates.is_beside, "a bootloader may confirm the update command"
 
 
 def test_an_announcement_counts_since_the_last_reset_or_update_command() -> None:
     for command in (Command.RESET, Command.UPDATE):
         watch = Watch()
-        assert not watch.twins.has_announced(0x725)
-        assert watch.announces(0).twins.has_announced(0x725)
-        assert not watch.twins.has_announced(0x720)
-        assert not watch.sends(command).twins.has_announced(0x725)
-        assert watch.announces(9).twins.has_announced(0x725)
+        assert not watch.duplicates.has_announced(0x725)
+        assert watch.announces(0).duplicates.has_announced(0x725)
+        assert not watch.duplicates.has_announced(0x720)
+        assert not watch.sends(command).duplicates.has_announced(0x725)
+        assert watch.announces(9).duplicates.has_announced(0x725)
     watch.sends(Command.PACKET, 1)
-    assert watch.twins.has_announced(0x725)
+    assert watch.duplicates.has_announced(0x725)
 
 
 @each("apart, overlap", [(47, True), (48, False), (64, False)])
@@ -364,11 +366,11 @@ def test_two_announcements_nearer_than_one_bootloader_sends_them(
     apart: int, *, overlap: bool
 ) -> None:
     watch = Watch().announces(0)
-    assert not watch.twins.overlap(0x725)
+    assert not watch.duplicates.overlap(0x725)
     watch.announces(apart)
-    assert watch.twins.overlap(0x725) is overlap
-    assert not watch.twins.overlap(0x720)
-    assert not watch.announces(64).twins.overlap(0x725), "the last two are compared"
+    assert watch.duplicates.overlap(0x725) is overlap
+    assert not watch.duplicates.overlap(0x720)
+    assert not watch.announces(64).duplicates.overlap(0x725), "the last two are compared"
 
 
 def test_two_boot_versions_are_two_bootloaders() -> None:
@@ -517,7 +519,7 @@ def test_one_packet_with_two_acks_is_two_devices_where_they_are_clearly_apart(
 ) -> None:
     watch = at(-4 * TICK_S).transfers(1)
     assert watch.now == 0.0
-    watch.twins.heard(Ack(1).to_message(0x725), apart_s)
+    watch.duplicates.heard(Ack(1).to_message(0x725), apart_s)
     expected = "packet 1 was acknowledged more often than it was sent"
     assert watch.evidence == (expected if is_second else "")
 
@@ -680,7 +682,7 @@ def test_a_check_code_that_another_node_asks_for_has_its_answer() -> None:
     watch = Watch()
     for _ in range(2):
         watch.wait(100)
-        watch.twins.heard(Message(0x712, 0x11, 0x3200, b""), watch.now)
+        watch.duplicates.heard(Message(0x712, 0x11, 0x3200, b""), watch.now)
         watch.answers(CheckCode(bytes(12)), code)
     assert watch.doubts == []
     assert watch.answers(CheckCode(bytes(12)), code).doubts == [code]

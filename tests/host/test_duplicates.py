@@ -34,7 +34,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode, split
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
 from tests.host.bench import BOOT, Bench
-from tests.host.twins import Slow, play, world
+from tests.host.duplicates import Slow, play, world
 from tests.loops import each
 
 LATER_S = 0.006

@@ -1,6 +1,6 @@
 """Detects a second device of the same kind (R27), by what a single one does not send; pure.
 
-It counts: what was sent once is answered once. `Twins` is told of every message that leaves
+It counts: what was sent once is answered once. `DuplicateDetector` is told of every message that leaves
 (`asked`, `left`) and of all that comes (`heard`, `see`). What speaks for a second device:
 
 - the reset, a packet or end of transfer has more answers than copies of it have left; a question
@@ -36,7 +36,7 @@ from flasher.protocol.text import printable
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message
 
-LISTENS_ON_S: Final = 0.1
+SECOND_DEVICE_WAIT_S: Final = 0.1
 """How much later than the first device a second one is still heard."""
 _DOUBLED_S: Final = 0.0003
 """The same message again within less than this was doubled by the link: on the wire, two messages
@@ -166,7 +166,7 @@ class _Runs:
         return len(self._seen) > 1
 
 
-class Twins:
+class DuplicateDetector:
     """What speaks for a second device on the bus."""
 
     def __init__(self, timings: Timings) -> None:
