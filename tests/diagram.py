@@ -51,11 +51,11 @@ def host_arrows(*, is_overview: bool = False) -> Iterator[_Arrow]:
         for event, move in row.items():
             if event.name in _EVERYWHERE or move.action in _QUIET:
                 continue
-            if is_overview and event is host.Event.LINK_BACK:
+            if is_overview and event is host.UpgradeEvent.LINK_BACK:
                 continue
             words = move.action.replace("_", " ")
             for target in move.leads_to or (state,):
-                if isinstance(target, host.State):
+                if isinstance(target, host.UpgradeState):
                     yield state, event, words, target
                 elif not is_overview or target in _GOOD:
                     yield state, event, f"ends, {wording(target)}", None
@@ -72,8 +72,8 @@ def device_arrows() -> Iterator[_Arrow]:
 def overview() -> str:
     """A Mermaid state diagram of the host, with one arrow from a state to another."""
     lines = ["```mermaid", "stateDiagram-v2"]
-    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in host.State]
-    lines.append(f"    [*] --> {next(iter(host.State)).name.lower()}")
+    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in host.UpgradeState]
+    lines.append(f"    [*] --> {next(iter(host.UpgradeState)).name.lower()}")
     drawn: dict[tuple[str, str], dict[str, None]] = {}
     for state, event, _words, target in host_arrows(is_overview=True):
         to = "stopping" if target is None else target.name.lower()

@@ -11,7 +11,7 @@ import numpy
 from asammdf import MDF, Signal
 
 from flasher.export.names import key
-from flasher.export.signals import UpgradeMessage
+from flasher.export.signals import Row
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import FlagsField, flag_names
@@ -33,7 +33,7 @@ class _Group:
     channels: dict[str, _Channel] = field(default_factory=dict)
 
 
-def write_mf4(rows: Iterable[UpgradeMessage], to: Path) -> int:
+def write_mf4(rows: Iterable[Row], to: Path) -> int:
     """Write the numbers and flags of all messages, a channel each; returns how many channels there
     are. Raises OSError.
     """

@@ -1,7 +1,7 @@
 """Detects a second device of the same kind (R27), by what a single one does not send; pure.
 
-It counts: what was sent once is answered once. `DuplicateDetector` is told of every message that leaves
-(`asked`, `left`) and of all that comes (`heard`, `see`). What speaks for a second device:
+A message that was sent once is answered once. Call `asked` and `left` for every message sent,
+`heard` and `see` for everything received. Evidence of a second device:
 
 - the reset, a packet or end of transfer has more answers than copies of it have left; a question
   has, twice in a row: an answer on a broadcast id may be one to a question that was not received;

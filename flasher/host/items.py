@@ -112,7 +112,7 @@ def _holder(item: Item, queries: Mapping[str, Readable]) -> Readable | None:
     return None
 
 
-NamedItem = TypeVar("Found", Readable, Writable)
+NamedItem = TypeVar("NamedItem", Readable, Writable)
 
 
 def find_item(name: str, among: Mapping[str, NamedItem], target: Target, verb: str) -> NamedItem:

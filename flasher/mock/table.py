@@ -1,9 +1,9 @@
 """The upgrade as a table, seen from the device: what it does on every event in every state.
 
-A received message or an expired timer is classified into an `BootloaderEvent` first (see `model`; a choice
-of the profile that changes the state is made there). Then `TABLE[state][event]` names the action, a
-method of `flasher.mock.model.MockDevice`, and the next state. A pair that is not listed cannot
-happen: it is a bug. The state diagram in the documentation is drawn from this table.
+A received message or an expired timer becomes a `BootloaderEvent` (see `model`, which also applies
+the profile's choices). `TABLE[state][event]` names the action, a method of
+`flasher.mock.model.MockDevice`, and the next state. A missing pair is a bug. The state diagram in
+the documentation is drawn from this table.
 """
 
 from __future__ import annotations

@@ -68,7 +68,8 @@ def test_the_target_of_an_image(
 
 
 HARDWARE, DOWNGRADE, SAME, PREVIOUS = (
-    IdentityCheck.HARDWARE, IdentityCheck.DOWNGRADE, IdentityCheck.SAME_VERSION, IdentityCheck.PREVIOUS,
+    IdentityCheck.HARDWARE, IdentityCheck.DOWNGRADE,
+    IdentityCheck.SAME_VERSION, IdentityCheck.PREVIOUS,
 )  # fmt: skip
 PASSED, UNKNOWN, REFUSED, WARNED = (
     CheckVerdict.PASSED, CheckVerdict.UNKNOWN, CheckVerdict.REFUSED, CheckVerdict.WARNED,
@@ -198,7 +199,8 @@ def judged(
         (Image.from_bytes(bytes(4) + VECTORS), Identity(cpu=Cpu.OTHER), UNKNOWN,
          "the profile says that the processor is another", ""),
         (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(cpu=Cpu.OTHER), REFUSED, "zip", ""),
-        (Image.from_bytes(bytes(4) + VECTORS), Identity(waived=frozenset({IdentityCheck.PLAUSIBLE})),
+        (Image.from_bytes(bytes(4) + VECTORS),
+         Identity(waived=frozenset({IdentityCheck.PLAUSIBLE})),
          CheckVerdict.WAIVED, "no Cortex-M vector table", ""),
     ],
 )  # fmt: skip

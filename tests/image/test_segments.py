@@ -120,10 +120,10 @@ def test_more_bytes_than_an_image_can_have_are_refused_when_they_come() -> None:
 
 def test_too_many_pieces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments, "PIECES_MAX", 3)
-    scattered_error = sparse((0, b"a"), (2, b"a"), (4, b"a"))
-    scattered_error.add(5, b"on the end of one", place)
+    scattered = sparse((0, b"a"), (2, b"a"), (4, b"a"))
+    scattered.add(5, b"on the end of one", place)
     with pytest.raises(ImageError, match="more than 3 separate pieces"):
-        scattered_error.add(50, b"a", place)
+        scattered.add(50, b"a", place)
 
 
 PIECES = st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=12)), max_size=12)

@@ -76,7 +76,8 @@ EXAMPLES: Final[list[tuple[str, Content, bytes]]] = [
     (
         "the lowest fault of each half",
         contents.Faults(
-            BatteryFault.SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION | BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
+            BatteryFault.SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION
+            | BatteryFault.CHARGE_OVER_VOLTAGE_WARNING
         ),
         wire("01 00 01 00"),
     ),

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from flasher.host.options import firmware_version
 from flasher.protocol import catalogue, messages
-from flasher.protocol.contents import ResetCommand, SerialNumber
+from flasher.protocol.contents import Reset, SerialNumber
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, Mode, Node, Target, can_id, packet_count
@@ -74,7 +74,7 @@ class Restarts:
         if isinstance(row, messages.UpdateCommand):
             self.is_identified = self._is_told = True
             self._is_due, self._requested_at = False, None
-        elif isinstance(row, ResetCommand | messages.EndOfTransfer | messages.Unknown):
+        elif isinstance(row, Reset | messages.EndOfTransfer | messages.Unknown):
             # Products may have a reset of their own.
             self._is_due = self._is_due or message.mode == Mode.WRITE
             self._requested_at = None
