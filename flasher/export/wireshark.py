@@ -42,7 +42,7 @@ _MARK: Final = "{} --[[ tables ]]"
 _LINE_MAX: Final = 96
 _LUA_WORDS: Final = frozenset({"and", "end", "false", "function", "in", "nil", "not", "or", "true"})
 _ANSWERS: Final[dict[type[messages.UpgradeMessage], tuple[type[messages.UpgradeMessage], ...]]] = {
-    messages.ResetCommand: (messages.FeedbackMessage,),
+    messages.ResetCommand: (messages.GeneralFeedbackMessage,),
     messages.UpdateCommand: (messages.RequestTransfer,),
     messages.Packet: (messages.Ack, messages.Nak),
     messages.EndOfTransfer: (messages.Complete, messages.Nak),

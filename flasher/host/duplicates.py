@@ -389,7 +389,7 @@ class DuplicateDetector:
         if isinstance(row, BootVersion):
             self._announce(message.can_id, row, now)
             return
-        if isinstance(row, messages.FeedbackMessage):
+        if isinstance(row, messages.GeneralFeedbackMessage):
             self._take_feedback(message.can_id, now)
         if not self._was_told_to_update:
             return

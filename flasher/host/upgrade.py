@@ -35,7 +35,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Malformed,
     Nak,
     RequestTransfer,
@@ -57,7 +57,7 @@ _EVENTS: Final[dict[type, UpgradeEvent]] = {
     BootVersion: UpgradeEvent.BOOT_VERSION,
     RequestTransfer: UpgradeEvent.REQUEST,
     Complete: UpgradeEvent.COMPLETE,
-    FeedbackMessage: UpgradeEvent.FEEDBACK,
+    GeneralFeedbackMessage: UpgradeEvent.FEEDBACK,
 }
 """The events of messages; all others are unexpected."""
 _PHASES: Final = {
@@ -595,7 +595,7 @@ class UpgradeStage:
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + self._burst_s)
 
-    def _watch_on(self, row: BootVersion | FeedbackMessage) -> None:
+    def _watch_on(self, row: BootVersion | GeneralFeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at
         if isinstance(row, BootVersion) and self._is_foreign(row):
             self._end(Ending.WRONG_DEVICE, row)

@@ -21,7 +21,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Packet,
     RequestTransfer,
     ResetCommand,
@@ -147,7 +147,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
     device.add(
         row.to_message(target.answer_id)
         for row in (
-            FeedbackMessage(),
+            GeneralFeedbackMessage(),
             BootVersion(target.boot_name, _NOMINAL_BOOT_VERSION),
             RequestTransfer(),
             Complete(),

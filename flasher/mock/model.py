@@ -359,7 +359,7 @@ class MockDevice(Machine):
 
     def _send_feedback(self, now: float) -> str:
         if self.profile.upgrade_in_application == "general_feedback":
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         return ""
 
     def _answer(self, now: float) -> str:
@@ -368,7 +368,7 @@ class MockDevice(Machine):
         return ""
 
     def _confirm_reset(self, now: float) -> str:
-        self._send(messages.FeedbackMessage())
+        self._send(messages.GeneralFeedbackMessage())
         self._await_restart(now)
         return "reset"
 

@@ -138,7 +138,7 @@ class ResetCommand(_Constant):
 
 
 @dataclass(frozen=True)
-class FeedbackMessage(_Constant):
+class GeneralFeedbackMessage(_Constant):
     """Application to tool: the write was received."""
 
     MODE = Mode.REPORT
@@ -269,7 +269,7 @@ class Complete(_Constant):
 
 UpgradeMessage = (
     ResetCommand
-    | FeedbackMessage
+    | GeneralFeedbackMessage
     | BootVersion
     | UpdateCommand
     | RequestTransfer
@@ -284,7 +284,7 @@ UPGRADE_MESSAGES: Final[dict[int, type[UpgradeMessage]]] = {
     row.COMMAND: row
     for row in (
         ResetCommand,
-        FeedbackMessage,
+        GeneralFeedbackMessage,
         BootVersion,
         UpdateCommand,
         RequestTransfer,

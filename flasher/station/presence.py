@@ -16,7 +16,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     BootVersion,
     Complete,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     RequestTransfer,
     decode,
 )
@@ -138,7 +138,7 @@ class TargetWatcher:
                 self.version = printable(version)
             case RequestTransfer():
                 self.transfer_requests += 1
-            case FeedbackMessage():
+            case GeneralFeedbackMessage():
                 self.confirmations += 1
             case Complete():
                 self.completions += 1

@@ -123,7 +123,7 @@ _TO_TOOL: Final = frozenset(target.answer_id for target in TARGETS.values())
 
 TITLES: Final[dict[type[messages.UpgradeMessage], str]] = {
     messages.ResetCommand: "reset",
-    messages.FeedbackMessage: "general feedback",
+    messages.GeneralFeedbackMessage: "general feedback",
     messages.BootVersion: "boot version",
     messages.UpdateCommand: "update command",
     messages.RequestTransfer: "request transfer",

@@ -53,7 +53,7 @@ class _ConfirmsUnknown(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
         is_write = isinstance(row, messages.Unknown) and row.message.mode == Mode.WRITE
         if is_write and self.state in _BOOTLOADER:
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)
 
 
@@ -63,7 +63,7 @@ class _ConfirmsAll(_ConfirmsUnknown):
     def _take_row(self, row: AnyRow, now: float) -> None:
         upgrade = messages.UpdateCommand | messages.Packet | messages.EndOfTransfer
         if isinstance(row, upgrade) and self.state in _BOOTLOADER:
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)
 
 

@@ -117,7 +117,7 @@ class Confirming(MockDevice):
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if self.state is not BootloaderState.APPLICATION:
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)
 
     def _acknowledge(self, now: float) -> str:

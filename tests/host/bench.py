@@ -22,7 +22,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Malformed,
     Packet,
     RequestTransfer,
@@ -141,7 +141,7 @@ class Bench:
     def to_boot(self) -> None:
         """Up to the boot version, which is not announced yet."""
         self.expect(ResetCommand)
-        self.say(FeedbackMessage())
+        self.say(GeneralFeedbackMessage())
 
     def to_request(self) -> None:
         """Up to the update command, which is not answered yet."""

@@ -21,7 +21,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     RequestTransfer,
     UpdateCommand,
@@ -38,7 +38,7 @@ rows = st.one_of(
     st.just(BootVersion("BMS", "V1.2.3")),
     st.just(RequestTransfer()),
     st.just(Complete()),
-    st.just(FeedbackMessage()),
+    st.just(GeneralFeedbackMessage()),
 )
 frames = st.builds(
     Frame,
@@ -120,7 +120,7 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
     assert len(unheard(0.0)) <= bench.outcome.sent_into_silence <= len(unheard(leaving_s))
     for at in unheard(0.0):
         if at == commands[0]:
-            assert FeedbackMessage() not in [row for said_at, row in said if said_at < at]
+            assert GeneralFeedbackMessage() not in [row for said_at, row in said if said_at < at]
 
 
 @pytest.mark.slow

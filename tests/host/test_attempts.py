@@ -10,7 +10,7 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -94,7 +94,7 @@ def test_an_adapter_that_is_back_before_the_update_command_begins_again() -> Non
     bench.to_boot()
     bench.engine.link_back(bench.now)
     bench.expect(ResetCommand)
-    bench.say(FeedbackMessage(), BOOT)
+    bench.say(GeneralFeedbackMessage(), BOOT)
     bench.expect(UpdateCommand)
     assert bench.seen(events.AttemptStarted)
 

@@ -22,7 +22,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -252,7 +252,7 @@ def test_feedbacks_that_begin_in_the_middle_are_another_devices() -> None:
     bench.say(RequestTransfer())
     bench.on_to_packet(8, first=1)
     for number in range(8, 20):
-        bench.say(FeedbackMessage(), Ack(number))
+        bench.say(GeneralFeedbackMessage(), Ack(number))
         if bench.engine.done:
             break
         bench.expect(Packet)
@@ -314,7 +314,7 @@ class Confirming(MockDevice):
             BootloaderState.OFF,
             BootloaderState.RESTARTING,
         ):
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)
 
 
@@ -410,7 +410,7 @@ def test_a_question_that_was_not_received_here_makes_no_second_device() -> None:
 
 def test_a_general_feedback_to_somebody_else_before_the_reset_is_none_to_it() -> None:
     stage = Stage("wmc")
-    feedback = split(WMC.answer_id, encode(FeedbackMessage().to_message(WMC.answer_id)))
+    feedback = split(WMC.answer_id, encode(GeneralFeedbackMessage().to_message(WMC.answer_id)))
     stage.bus.attach(Speaker(*feedback, every_s=0.001, begins_at=0.05, limit=4))
     assert stage.flash().ok
 
@@ -418,7 +418,7 @@ def test_a_general_feedback_to_somebody_else_before_the_reset_is_none_to_it() ->
 def test_a_link_that_doubles_every_frame_is_no_second_device() -> None:
     bench = Bench(300)
     bench.expect(ResetCommand)
-    for frame in split(0x725, encode(FeedbackMessage().to_message(0x725))) * 2:
+    for frame in split(0x725, encode(GeneralFeedbackMessage().to_message(0x725))) * 2:
         bench.engine.receive(frame, bench.now)
     bench.say(BOOT)
     bench.expect(UpdateCommand)

@@ -19,7 +19,7 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     Complete,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     RequestTransfer,
     UpgradeMessage,
@@ -200,8 +200,8 @@ def test_the_same_message_at_once_was_doubled_by_the_link(
     watch = at(-TICK_S).asks().answers()
     watch.duplicates.heard(catalogue.encode(VERSION, version()), apart_s)
     assert watch.doubts == ([VERSION] if is_second else [])
-    watch = at(-2 * TICK_S).sends(Command.RESET).hears(FeedbackMessage())
-    watch.duplicates.heard(FeedbackMessage().to_message(0x725), apart_s)
+    watch = at(-2 * TICK_S).sends(Command.RESET).hears(GeneralFeedbackMessage())
+    watch.duplicates.heard(GeneralFeedbackMessage().to_message(0x725), apart_s)
     assert watch.evidence == (CONFIRMED_TWICE if is_second else "")
 
 
@@ -241,9 +241,9 @@ def test_an_answer_of_another_size_counts_and_is_not_read() -> None:
 
 
 def test_a_write_that_is_confirmed_twice_is_two_devices_at_once() -> None:
-    watch = Watch().asks(WRITTEN).hears(FeedbackMessage())
+    watch = Watch().asks(WRITTEN).hears(GeneralFeedbackMessage())
     assert watch.evidence == ""
-    assert watch.hears(FeedbackMessage()).evidence == CONFIRMED_TWICE
+    assert watch.hears(GeneralFeedbackMessage()).evidence == CONFIRMED_TWICE
     assert watch.doubts == [WRITTEN]
 
 
@@ -291,13 +291,13 @@ def test_an_answer_that_was_begun_counts_unless_its_frame_was_doubled(
 
 
 def test_a_confirmation_that_was_spoilt_counts() -> None:
-    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
-    watch.duplicates.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
+    watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(1)
+    watch.duplicates.heard(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
     assert watch.evidence == CONFIRMED_TWICE
     watch = Watch().announces(0).sends(Command.RESET).wait(1)
-    watch.duplicates.heard(garbled(FeedbackMessage().to_message(0x725)), watch.now)
+    watch.duplicates.heard(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
     assert watch.duplicates.is_beside
-    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).wait(1)
+    watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(1)
     watch.duplicates.heard(garbled(Ack(1).to_message(0x725)), watch.now)
     assert watch.evidence == ""
 
@@ -314,13 +314,13 @@ def test_an_update_command_ends_all_questions() -> None:
 
 def test_each_reset_may_be_confirmed_once() -> None:
     watch = Watch().sends(Command.RESET).sends(Command.RESET)
-    assert watch.hears(FeedbackMessage(), FeedbackMessage()).evidence == ""
-    assert watch.hears(FeedbackMessage()).evidence == CONFIRMED_TWICE
+    assert watch.hears(GeneralFeedbackMessage(), GeneralFeedbackMessage()).evidence == ""
+    assert watch.hears(GeneralFeedbackMessage()).evidence == CONFIRMED_TWICE
 
 
 def test_a_confirmation_before_anything_was_sent_is_somebody_elses() -> None:
-    watch = Watch().hears(FeedbackMessage(), FeedbackMessage()).sends(Command.RESET)
-    assert watch.hears(FeedbackMessage()).evidence == ""
+    watch = Watch().hears(GeneralFeedbackMessage(), GeneralFeedbackMessage()).sends(Command.RESET)
+    assert watch.hears(GeneralFeedbackMessage()).evidence == ""
 
 
 @each("after_ticks, is_beside", [(79, True), (80, False)])
@@ -331,21 +331,26 @@ def test_a_reset_that_is_confirmed_while_a_bootloader_announces_itself(
     watch = Watch().announces(0).sends(Command.RESET).wait(after_ticks - 1)
     assert watch.duplicates.announces(0x725, watch.now)
     assert not watch.duplicates.announces(0x720, watch.now)
-    watch.hears(FeedbackMessage())
+    watch.hears(GeneralFeedbackMessage())
     assert watch.duplicates.is_beside is is_beside
     assert (
-        watch.wait(500).sends(Command.RESET).hears(FeedbackMessage()).duplicates.is_beside is False
+        watch.wait(500).sends(Command.RESET).hears(GeneralFeedbackMessage()).duplicates.is_beside
+        is False
     )
 
 
 def test_it_stays_so_until_the_next_reset_or_update_command() -> None:
     assert not Watch().duplicates.is_beside
     for command in (Command.RESET, Command.UPDATE):
-        watch = Watch().announces(0).sends(Command.RESET).hears(FeedbackMessage()).wait(500)
-        assert watch.sends(Command.END_OF_TRANSFER).hears(FeedbackMessage()).duplicates.is_beside
+        watch = Watch().announces(0).sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(500)
+        assert (
+            watch.sends(Command.END_OF_TRANSFER)
+            .hears(GeneralFeedbackMessage())
+            .duplicates.is_beside
+        )
         watch.sends(command)
         assert not watch.duplicates.is_beside
-    watch.announces(1).hears(FeedbackMessage())
+    watch.announces(1).hears(GeneralFeedbackMessage())
     assert not watch.duplicates.is_beside, "a bootloader may confirm the update command"
 
 
@@ -649,24 +654,24 @@ def test_feedbacks_that_begin_or_end_in_a_transfer_are_another_devices(
     packets: str, *, is_odd: bool
 ) -> None:
     """Each packet with an ACK: + also with a general feedback."""
-    watch = Watch().sends(Command.RESET).hears(FeedbackMessage()).transfers(0)
+    watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage()).transfers(0)
     for number, kind in enumerate(packets, 1):
         watch.sends(Command.PACKET, number)
-        watch.hears(*[FeedbackMessage()] * (kind == "+"), Ack(number))
+        watch.hears(*[GeneralFeedbackMessage()] * (kind == "+"), Ack(number))
     mixed = "some packets were confirmed by general feedback, others were not"
     assert watch.evidence == (mixed if is_odd else "")
 
 
 def test_in_the_transfer_one_feedback_too_many_is_an_odd_answer() -> None:
     watch = Watch().transfers(0)
-    watch.sends(Command.PACKET, 1).hears(*[FeedbackMessage()] * 3)
+    watch.sends(Command.PACKET, 1).hears(*[GeneralFeedbackMessage()] * 3)
     assert watch.evidence == "", "one for the update command, one for the packet, and one odd"
-    watch.hears(FeedbackMessage())
+    watch.hears(GeneralFeedbackMessage())
     assert watch.evidence == TOO_OFTEN
 
 
 def test_what_was_seen_first_is_what_is_told() -> None:
-    watch = Watch().sends(Command.RESET).hears(FeedbackMessage(), FeedbackMessage())
+    watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage(), GeneralFeedbackMessage())
     assert watch.announces(1).announces(1, boot=BootVersion("BMS", "V9.9.9")).evidence == (
         CONFIRMED_TWICE
     )

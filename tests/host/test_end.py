@@ -17,7 +17,7 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -99,7 +99,7 @@ def test_a_doubled_nak_counts_once() -> None:
 def test_general_feedback_after_the_end_is_ignored() -> None:
     bench = Bench(200)
     bench.to_end()
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(1.0)
     assert bench.unread == []
     assert bench.complete().ok

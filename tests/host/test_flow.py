@@ -19,7 +19,7 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Packet,
     RequestTransfer,
     ResetCommand,
@@ -40,7 +40,7 @@ def test_a_right_device_is_upgraded_with_every_message_once(
 ) -> None:
     bench = Bench(300, target=target)
     bench.expect(ResetCommand)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.say(BootVersion(boot_name, "V1.2.3"))
     assert bench.expect(UpdateCommand) == UpdateCommand(text, 300)
     bench.say(RequestTransfer())
@@ -94,7 +94,7 @@ def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
 def test_reset_stops_at_general_feedback() -> None:
     bench = Bench()
     bench.expect(ResetCommand)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(1.5)
     assert bench.unread == []
 
@@ -141,7 +141,7 @@ def test_the_boot_version_may_come_up_to_five_seconds_after_the_reset(
     bench = Bench()
     bench.expect(ResetCommand)
     left_at = bench.sent[-1][0]
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(left_at + 5.0 + late_s - bench.now)
     if answered:
         bench.say(BOOT)

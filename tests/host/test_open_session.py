@@ -14,7 +14,7 @@ from flasher.protocol.messages import (
     Ack,
     BootVersion,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -123,7 +123,7 @@ def test_an_application_that_answers_the_reset_is_never_told_to_update_unasked(
 ) -> None:
     bench = Bench(options=options)
     bench.expect(ResetCommand)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(120.0)
     assert bench.unread == []
     wanted = Ending.NO_ANNOUNCEMENT if options.at_power_up else Ending.NO_BOOT_VERSION
@@ -137,7 +137,7 @@ def test_feedback_that_comes_late_counts_as_well(options: UpgradeOptions) -> Non
     bench = Bench(options=options)
     bench.wait(4.0)
     assert resets(bench)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(120.0)
     assert bench.unread == []
     assert bench.outcome.device_left is DeviceLeft.UNTOUCHED

@@ -22,7 +22,7 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -310,7 +310,7 @@ def test_another_tool_is_waited_for_once_the_device_was_told_to_erase(state: str
     bench.wait(0.2)
     bench.engine.second_tool(SEEN, bench.now)
     bench._read = len(bench.sent)
-    for answer in (RequestTransfer(), Ack(2), Nak(1), BOOT, Complete(), FeedbackMessage()):
+    for answer in (RequestTransfer(), Ack(2), Nak(1), BOOT, Complete(), GeneralFeedbackMessage()):
         bench.say(answer)
     bench.wait(1.5)
     bench.engine.second_tool(SEEN, bench.now)

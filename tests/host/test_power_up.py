@@ -8,7 +8,7 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.protocol.messages import (
     BootVersion,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Packet,
     RequestTransfer,
     ResetCommand,
@@ -50,8 +50,8 @@ def test_every_announcement_of_the_burst_is_answered_until_one_is_heard() -> Non
     assert bench.expect(Packet).number == 1
 
 
-@each("row", [FeedbackMessage(), RequestTransfer()])
-def test_nothing_else_that_the_device_says_is_answered(row: FeedbackMessage) -> None:
+@each("row", [GeneralFeedbackMessage(), RequestTransfer()])
+def test_nothing_else_that_the_device_says_is_answered(row: GeneralFeedbackMessage) -> None:
     bench = Bench(options=WAITING)
     bench.say(row)
     bench.wait(1.0)

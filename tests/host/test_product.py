@@ -8,7 +8,7 @@ from flasher.host.table import Ending
 from flasher.host.verify import Level, possible_levels
 from flasher.image.image import Image
 from flasher.image.plan import plan
-from flasher.protocol.messages import FeedbackMessage, UpdateCommand
+from flasher.protocol.messages import GeneralFeedbackMessage, UpdateCommand
 from flasher.protocol.spec import WMC
 from flasher.protocol.wire import Message
 from flasher.settings.profile import VersionQuery
@@ -23,7 +23,7 @@ VERSION = "V2r0r1_20260102"
 def test_the_products_own_reset_is_sent() -> None:
     bench = Bench(options=UpgradeOptions(reset_command=0x4F04, reset_data=b"BOOT"))
     assert bench.expect(Message) == Message(0x752, 0x16, 0x4F04, b"BOOT")
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(0.5)
     assert bench.unread == []
 

@@ -34,7 +34,7 @@ from flasher.protocol.messages import (
     Ack,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -134,7 +134,7 @@ def test_a_battery_is_asked_before_the_reset_and_what_it_answered_is_kept() -> N
 def test_without_an_identity_nothing_is_asked_and_no_version_is_known() -> None:
     dialogue = Dialogue()
     dialogue.expect(ResetCommand)
-    dialogue.say(FeedbackMessage())
+    dialogue.say(GeneralFeedbackMessage())
     dialogue.engine.cancel(dialogue.now)
     assert dialogue.result.previous_version is None
     assert dialogue.seen(events.CheckMade) == []

@@ -17,7 +17,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -452,7 +452,7 @@ def test_general_feedback_in_the_transfer_is_ignored() -> None:
     """R15."""
     bench = Bench()
     bench.to_packet(1)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(0.3)
     assert bench.unread == []
     bench.say(Ack(1))

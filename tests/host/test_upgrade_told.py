@@ -18,7 +18,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Nak,
     Packet,
     RequestTransfer,
@@ -87,7 +87,7 @@ def test_it_has_begun_to_erase_with_the_first_frame_of_the_update_command() -> N
     bench.on_frame = lambda _number: begun.append(stage(bench).has_begun_to_erase)
     bench.expect(ResetCommand)
     assert not any(begun)
-    bench.say(FeedbackMessage(), BOOT)
+    bench.say(GeneralFeedbackMessage(), BOOT)
     begun.clear()
     bench.expect(UpdateCommand)
     assert begun == [False, True, True]
@@ -454,7 +454,7 @@ def test_a_reset_that_has_not_left_when_it_is_needed_no_more_is_not_sent() -> No
     bench = Bench()
     bench.expect(ResetCommand)
     passes(bench, 0.25)
-    hears(bench, FeedbackMessage())
+    hears(bench, GeneralFeedbackMessage())
     bench._flush()
     assert bench.unread == []
 

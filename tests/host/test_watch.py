@@ -15,7 +15,7 @@ from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
     BootVersion,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Packet,
     RequestTransfer,
     ResetCommand,
@@ -113,14 +113,14 @@ def beside(options: UpgradeOptions | None = None) -> tuple[Bench, float]:
     bench.expect(ResetCommand)
     bench.say(BOOT)
     bench.wait(0.005)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     return bench, bench.now
 
 
 def test_the_application_is_reset_again_when_the_announcements_have_ended() -> None:
     bench, confirmed_at = beside()
     assert begins(bench, ResetCommand) == pytest.approx(confirmed_at + BURST_S)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(1.0)
     bench.say(BOOT)
     bench.expect(UpdateCommand, within_s=WATCH_S + 3 * FRAME_S)
@@ -139,7 +139,7 @@ def test_it_is_reset_again_once() -> None:
     bench.expect(ResetCommand)
     bench.say(BOOT)
     bench.wait(0.005)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     confirmed_at = bench.now
     assert begins(bench, UpdateCommand) == pytest.approx(confirmed_at + BURST_S)
 
@@ -194,7 +194,7 @@ def test_an_application_that_answers_that_reset_is_waited_for() -> None:
     bench = heard_before()
     bench.expect(ResetCommand)
     bench.wait(0.01)
-    bench.say(FeedbackMessage())
+    bench.say(GeneralFeedbackMessage())
     bench.wait(1.0)
     assert bench.unread == []
     bench.say(BOOT)

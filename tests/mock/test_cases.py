@@ -61,7 +61,7 @@ def test_a_second_reset_during_the_restart_makes_one_clean_restart() -> None:
     bench.run(0.02)
     bench.send(messages.ResetCommand())
     bench.run(0.3)
-    assert [type(row) for row in bench.take()] == [messages.FeedbackMessage] + 4 * [
+    assert [type(row) for row in bench.take()] == [messages.GeneralFeedbackMessage] + 4 * [
         messages.BootVersion
     ]
 
@@ -108,7 +108,7 @@ def test_what_follows_a_reset_in_the_same_bytes_is_not_heard() -> None:
     inner = bench.encoded(messages.ResetCommand()) + bench.encoded(READ_VERSION)
     bench.put_wire(bench.encoded(Packet(1, 1, inner.ljust(128, b"\xff")))[:-1] + b"\x00")
     bench.run(0.04)
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
     assert bench.device.state is BootloaderState.RESTARTING
 
 
@@ -129,7 +129,7 @@ def test_a_reset_that_is_none_is_ignored(can_id: int, mode: Mode, data: bytes) -
     bench.run(1.0)
     # 2.2.1(2): an application confirms every write.
     is_write = (can_id, mode) == (0x752, Mode.WRITE)
-    assert bench.take() == ([messages.FeedbackMessage()] if is_write else [])
+    assert bench.take() == ([messages.GeneralFeedbackMessage()] if is_write else [])
     assert bench.device.state is BootloaderState.APPLICATION
 
 
@@ -631,7 +631,7 @@ def test_a_second_end_is_answered_as_the_profile_says(choice: str, answer: list[
     assert bench.take() == answer
     bench.run_to(BootloaderState.APPLICATION)
     bench.send(EndOfTransfer())
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
 
 
 def test_an_update_command_or_a_reset_after_complete_does_not_touch_the_new_image() -> None:
@@ -814,7 +814,7 @@ def test_cancelled_it_finishes_the_message_under_way_and_is_done() -> None:
     assert device.deadline() is not None
     bench.accepts_frames = True
     bench._partial = first.data
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
     assert (finished_early, device.done) == (False, True)
     assert device.deadline() is None
 

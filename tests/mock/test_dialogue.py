@@ -217,7 +217,7 @@ def test_the_application_answers_upgrade_messages_with_feedback_or_not_and_erase
     for row in rows + packets_of(image_of(10)):
         bench.send(row)
         bench.run(5.0)
-        assert bench.take() == ([messages.FeedbackMessage()] if answers else [])
+        assert bench.take() == ([messages.GeneralFeedbackMessage()] if answers else [])
     assert bench.device.state is BootloaderState.APPLICATION
     assert bench.device.stored_image == before
     assert (bench.device.erase_count, bench.device.program_count) == (0, 0)
@@ -226,7 +226,7 @@ def test_the_application_answers_upgrade_messages_with_feedback_or_not_and_erase
 def test_the_update_text_of_another_target_is_a_write_like_others_to_the_application() -> None:
     bench = Bench()
     bench.send(messages.UpdateCommand("OBC_UPD", 300))
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
     assert bench.device.state is BootloaderState.APPLICATION
 
 
@@ -245,7 +245,7 @@ def test_frames_of_other_ids_and_kinds_between_those_of_a_message_are_nothing() 
         Frame(0x752, first, is_error=True),
     ]
     bench.put(*strays, Frame(0x752, first), *strays, Frame(0x752, second))
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
 
 
 @each("size", range(1, 9))
@@ -254,7 +254,7 @@ def test_a_message_is_understood_in_whatever_pieces_it_comes(size: int) -> None:
     bench = Bench()
     wire = case("bms reset").wire
     bench.put(*(Frame(0x752, wire[at : at + size]) for at in range(0, len(wire), size)))
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
 
 
 def test_junk_before_a_message_is_passed_over() -> None:
@@ -262,7 +262,7 @@ def test_junk_before_a_message_is_passed_over() -> None:
     bench = Bench()
     bench.put(Frame(0x752, b"\x00\x55"))
     bench.put_wire(b"\x55" + case("bms reset").wire)
-    assert bench.take() == [messages.FeedbackMessage()]
+    assert bench.take() == [messages.GeneralFeedbackMessage()]
 
 
 def test_unknown_and_malformed_messages_are_rejected_and_the_malformed_ones_reported() -> None:
@@ -395,4 +395,7 @@ def test_a_bus_that_takes_nothing_does_not_pile_announcements_up() -> None:
 def test_feedback_and_announcement_both_come_when_a_restart_takes_no_time() -> None:
     bench = Bench(dataclasses.replace(QUICK, reset_delay_s=0.0, boot_version="V1.0.0"))
     bench.send(messages.ResetCommand())
-    assert bench.take() == [messages.FeedbackMessage(), messages.BootVersion("BMS", "V1.0.0")]
+    assert bench.take() == [
+        messages.GeneralFeedbackMessage(),
+        messages.BootVersion("BMS", "V1.0.0"),
+    ]

@@ -12,7 +12,7 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    FeedbackMessage,
+    GeneralFeedbackMessage,
     Malformed,
     Nak,
     Packet,
@@ -33,7 +33,7 @@ _PAYLOAD: Final = bytes(range(128))
 # The typed form, its CAN id, and the message typed from the tables: mode, command, data.
 _ROWS: Final[list[tuple[UpgradeMessage, int, str]]] = [
     (ResetCommand(), 0x751, "16 4205 52 45 53 45 54"),
-    (FeedbackMessage(), 0x715, "0C 5503 41 43 4B"),
+    (GeneralFeedbackMessage(), 0x715, "0C 5503 41 43 4B"),
     (BootVersion("WMC", "V1.2.3"), 0x715, "0C C109 57 4D 43 56 31 2E 32 2E 33"),
     (BootVersion("BMS", "V1.2.3"), 0x725, "0C C109 42 4D 53 56 31 2E 32 2E 33"),
     (BootVersion("PBU", "V1.2.3"), 0x735, "0C C109 50 42 55 56 31 2E 32 2E 33"),

@@ -212,7 +212,7 @@ class CompiledDevice(Machine):
     def _take_message(self, message: Message, now: float) -> None:
         row = messages.decode(message) if message.can_id == self.target.request_id else None
         if isinstance(row, messages.ResetCommand):
-            self.send(messages.FeedbackMessage().to_message(self.target.answer_id))
+            self.send(messages.GeneralFeedbackMessage().to_message(self.target.answer_id))
             self._due_at = now + _RESTART_S
         else:
             self.application.take(message, now)

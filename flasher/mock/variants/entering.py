@@ -319,7 +319,7 @@ class FeedbackAfterVersion(MockDevice):
         detail = super()._announce(now)
         if self._owes_feedback:
             self._owes_feedback = False
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         return detail
 
 

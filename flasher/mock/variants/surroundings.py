@@ -242,7 +242,7 @@ class AnswersInBootloader(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
         command = row.message.command if isinstance(row, messages.Unknown) else None
         if self.state is not BootloaderState.APPLICATION and command in _APPLICATION_COMMANDS:
-            self._send(messages.FeedbackMessage())
+            self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)
 
 
