@@ -73,7 +73,8 @@ def catalogue_messages(reel: Reel, chance: random.Random) -> None:
 def upgrade_messages(reel: Reel, chance: random.Random) -> None:
     """Every message of the upgrade, both ways, for each target, right and with each byte wrong."""
     rows: list[messages.UpgradeMessage] = [
-        messages.ResetCommand(), messages.GeneralFeedbackMessage(), messages.BootVersion("PBU", "V1.2.3"),
+        messages.ResetCommand(), messages.GeneralFeedbackMessage(),
+        messages.BootVersion("PBU", "V1.2.3"),
         messages.BootVersion("\xff\x1b[", "2J\n\0.\xe9"), messages.RequestTransfer(),
         messages.Packet(1, 613, bytes(range(128))), messages.Packet(65535, 65535, bytes(128)),
         messages.Ack(300), messages.Nak(1), messages.Ack(0), messages.EndOfTransfer(),

@@ -8,9 +8,9 @@ from flasher.protocol.messages import (
     BootVersion,
     Complete,
     EndOfTransfer,
-    GeneralFeedback,
+    GeneralFeedbackMessage,
     RequestTransfer,
-    Reset,
+    ResetCommand,
     UpdateCommand,
 )
 from flasher.protocol.spec import BMS
@@ -62,8 +62,8 @@ def test_a_second_burst_after_the_complete_image_is_of_another_unit(
 ) -> None:
     """A small image is stored before the burst that preceded it could be over."""
     run = Watched(tmp_path)
-    run.send(1.1, Reset())
-    run.hear(1.11, GeneralFeedback())
+    run.send(1.1, ResetCommand())
+    run.hear(1.11, GeneralFeedbackMessage())
     run.announce(1.2, 1)
     run.send(1.21, UpdateCommand(BMS.update_text, 256))
     run.hear(1.22, RequestTransfer())

@@ -15,7 +15,7 @@ from typing import cast
 
 import pytest
 
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.station import codes
 from flasher.station.continuity import Continuity
 from flasher.station.line import Line
@@ -460,8 +460,8 @@ def test_each_reason_is_of_a_story() -> None:
     assert set(undetectable.UNDETECTABLE) <= {reason for reason, _ in UNDETECTABLE.values()}
 
 
-@pytest.mark.parametrize("state", list(State))
-def test_a_unit_that_answers_something_else_can_be_detected(state: State) -> None:
+@pytest.mark.parametrize("state", list(BootloaderState))
+def test_a_unit_that_answers_something_else_can_be_detected(state: BootloaderState) -> None:
     exchanges = undetectable.Exchanges()
     pulled = undetectable.Pulled("W2605001", 3.0, state, StepName.FLASH, was_silent=False)
     for socket, is_alike in (("A", True), ("B", False)):
@@ -469,7 +469,7 @@ def test_a_unit_that_answers_something_else_can_be_detected(state: State) -> Non
         exchanges.put(socket, "W2605002", 3.5, is_new=True, is_alike=is_alike)
     text = "the unit with the label W2605002 now says that it is W2605001"
     alike = exchanges.reason_of(Violation("NUMBER", text, "A"))
-    assert bool(alike) == (state in (State.RESTARTING, State.STARTING))
+    assert bool(alike) == (state in (BootloaderState.RESTARTING, BootloaderState.STARTING))
     assert exchanges.reason_of(Violation("NUMBER", text, "B")) == ""
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.station.events import (
     RunEnded,
     RunStarted,
@@ -164,7 +164,9 @@ class Promises:
         if run is None or not answers:
             return
         if (run.is_identified or was_calm) and not run.is_flashed:
-            run.was_running = run.was_running or run.unit.engine.state is State.APPLICATION
+            run.was_running = (
+                run.was_running or run.unit.engine.state is BootloaderState.APPLICATION
+            )
 
     def numbers_known(self, socket: str, step: StepName | None) -> frozenset[str]:
         """What the unit of the run that goes on in a socket may report in this step, without being

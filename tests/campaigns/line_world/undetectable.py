@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.station.records.model import StepName
 from tests.campaigns.line_world.promises import Violation
@@ -28,7 +28,7 @@ class Pulled:
 
     label: str
     at_s: float
-    state: State
+    state: BootloaderState
     """Of its device."""
     step: StepName | None
     """Of the run; None: none went on."""
@@ -55,14 +55,18 @@ class Exchange:
 
 def _awaits_its_answer(pulled: Pulled) -> bool:
     """It has confirmed its image, and its new application has not answered."""
-    is_mute = pulled.is_mute and pulled.state is State.APPLICATION and pulled.step is StepName.FLASH
-    return is_mute or pulled.state is State.STARTING
+    is_mute = (
+        pulled.is_mute
+        and pulled.state is BootloaderState.APPLICATION
+        and pulled.step is StepName.FLASH
+    )
+    return is_mute or pulled.state is BootloaderState.STARTING
 
 
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
     "silent when its label was scanned": lambda each: each.pulled.was_silent,
     "between the confirmed reset and the announcement": lambda each: (
-        each.pulled.state is State.RESTARTING
+        each.pulled.state is BootloaderState.RESTARTING
         and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
     ),
     "between the complete image and the first answer": lambda each: (

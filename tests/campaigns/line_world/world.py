@@ -18,7 +18,7 @@ from sqlalchemy import event
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import State
+from flasher.mock.table import BootloaderState
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Command
 from flasher.station.events import (
     LineResumed,
@@ -428,7 +428,7 @@ class World:
         if self.setup.line.tells:
             if bay.run and bay.emptied_at < bay.run_at:
                 # The run waits for the first unit that is heard.
-                awaited = Pulled(bay.run, bay.run_at, State.OFF, None, was_silent=True)
+                awaited = Pulled(bay.run, bay.run_at, BootloaderState.OFF, None, was_silent=True)
                 self.exchanges.pull(bay.name, awaited)
             known = self.promises.numbers_known(bay.name, bay.step if bay.is_working else None)
             number = _stored(unit).number
