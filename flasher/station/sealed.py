@@ -23,6 +23,7 @@ from flasher.station.records import chain
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.heads import Head
 from flasher.station.records.model import RunDetails, RunRecord, RunState, UnitLife, UnitState
+from flasher.station.records.queries import details_of_content
 from flasher.station.records.signatures import is_signed
 
 CERTIFICATE_MAX_SIZE: Final = 8 * 1024 * 1024
@@ -129,7 +130,6 @@ class CheckedCertificate:
 
 
 _TYPE: Final = TypeAdapter(Sealed)
-_DETAILS: Final = TypeAdapter(RunDetails)
 _RUN: Final = TypeAdapter(RunRecord)
 
 
@@ -143,46 +143,6 @@ def plain(run: RunRecord) -> dict[str, Any]:
         else value
         for name, value in asdict(run).items()
     }
-
-
-def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) -> RunDetails:
-    """A run of the rows that are carried. Raises ValidationError, KeyError, TypeError."""
-    run, unit = content["run"], content["unit"]
-    ended_s, begun_s = run["ended_monotonic_s"], run["begun_monotonic_s"]
-    images = {each["id"]: each for each in content["artifacts"]}
-    facts = {
-        **{name: unit[name] for name in ("serial", "part")},
-        "run_id": run["id"],
-        "lot": content["lot"] and content["lot"]["name"],
-        "duration_s": None if ended_s is None else ended_s - begun_s,
-        **{name: content[name]["name"] for name in ("station", "socket", "operator")},
-        "recipe": recipe["name"],
-        "recipe_revision": recipe["revision"],
-        "recipe_sha256": recipe["sha256"],
-        "verified": run["verification_reached"],
-    }
-    targets = [
-        each
-        | {
-            "image": images[each["artifact_id"]]["name"],
-            "image_sha256": images[each["artifact_id"]]["sha256"],
-            "version": images[each["artifact_id"]]["version"],
-        }
-        for each in content["targets"]
-    ]
-    steps = [
-        each | {"measurements": [m for m in content["measurements"] if m["step_id"] == each["id"]]}
-        for each in content["steps"]
-    ]
-    return _DETAILS.validate_python(
-        {
-            "run": run | facts,
-            "targets": targets,
-            "steps": steps,
-            "writes": [each | {"write_id": each["id"]} for each in content["writes"]],
-            "attachments": content["attachments"],
-        }
-    )
 
 
 def as_text(sealed: Sealed) -> str:

@@ -45,6 +45,9 @@ RECIPE: Final = "recipe"
 ENDINGS: Final = (FINISHED, INTERRUPTED)
 """Rows that vouch for a run as it ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
+_CANONICAL: Final = json.JSONEncoder(
+    sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr
+)
 EVENTS: Final = (
     BEGUN, CLAIMED, FINISHED, INTERRUPTED, RECIPE, *(event.value for event in AuditEvent), CLOCK,
     RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED,
@@ -104,7 +107,7 @@ class Trail:
 
 def canonical(data: Any) -> str:
     """JSON in a canonical form: equal data gives the same text."""
-    return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr)
+    return _CANONICAL.encode(data)
 
 
 def digest(data: Any) -> str:
@@ -251,9 +254,22 @@ def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict
     """The digests of runs, by what they cover; a run that is not there is left out. They cover
     names and contents, not keys of tables alone.
     """
+    return digests_in(contents_of(connection, run_ids))
+
+
+def digests_in(contents: Mapping[int, Mapping[str, Any]]) -> dict[int, dict[str, str]]:
+    """The digests of runs whose rows have been read."""
+    known: dict[int, str] = {}
+
+    def digest_of(value: Any) -> str:
+        """A recipe or an operator is one object for all runs that name it."""
+        if id(value) not in known:
+            known[id(value)] = digest(value)
+        return known[id(value)]
+
     return {
-        run_id: {name: digest(value) for name, value in content.items()}
-        for run_id, content in contents_of(connection, run_ids).items()
+        run_id: {name: digest_of(value) for name, value in content.items()}
+        for run_id, content in contents.items()
     }
 
 
@@ -265,17 +281,17 @@ def claim_of(content: Mapping[str, Any]) -> list[Any]:
 
 def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, Any]]:
     """The rows of runs and of all that they name, by what they are."""
-    known: dict[tuple[str, Any], dict[str, Any] | None] = {}
+    wanted = list(run_ids)
 
-    def row_of(table: Table, key: Any) -> dict[str, Any] | None:
-        if (table.name, key) not in known:
-            row = connection.execute(select(table).where(table.c.id == key)).mappings().first()
-            known[table.name, key] = None if row is None else dict(row)
-        return known[table.name, key]
+    def named_by(rows: Iterable[Mapping[str, Any]], table: Table) -> dict[Any, dict[str, Any]]:
+        """The rows of a table that others name, by their ids."""
+        keys = dict.fromkeys(row[f"{table.name}_id"] for row in rows)
+        found = grouped(connection, select(table), table.c.id, keys)
+        return {key: row for key, (row,) in found.items()}
 
     def parts_of(table: Table) -> dict[int, list[dict[str, Any]]]:
         query = select(table).order_by(table.c.id)
-        return grouped(connection, query, table.c.run_id, run_ids)
+        return grouped(connection, query, table.c.run_id, wanted)
 
     measurement, step = schema.measurement, schema.step
     of_steps = select(measurement, step.c.run_id).join_from(measurement, step)
@@ -283,27 +299,33 @@ def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dic
     parts = {
         "steps": parts_of(step),
         "measurements": grouped(
-            connection, of_steps.order_by(measurement.c.id), step.c.run_id, run_ids
+            connection, of_steps.order_by(measurement.c.id), step.c.run_id, wanted
         ),
         "writes": parts_of(schema.device_write),
         "attachments": parts_of(schema.attachment),
         "targets": targets,
     }
-    runs = select(schema.run).order_by(schema.run.c.id)
+    in_order = select(schema.run).order_by(schema.run.c.id)
+    runs = {
+        run_id: row
+        for run_id, (row,) in grouped(connection, in_order, schema.run.c.id, wanted).items()
+    }
+    of_runs = {
+        table.name: named_by(runs.values(), table)
+        for table in (schema.unit, schema.socket, schema.operator, schema.recipe, schema.lot)
+    }
+    stations = named_by(of_runs["socket"].values(), schema.station)
+    artifacts = named_by((target for some in targets.values() for target in some), schema.artifact)
     found = {}
-    for run_id, (row,) in grouped(connection, runs, schema.run.c.id, run_ids).items():
-        socket = row_of(schema.socket, row["socket_id"])
-        data = {
+    for run_id, row in runs.items():
+        others = {name: rows.get(row[f"{name}_id"]) for name, rows in of_runs.items()}
+        socket = others["socket"]
+        found[run_id] = {
             "run": row,
             CLAIM: claim_of({"run": row, "targets": targets[run_id]}),
-            "unit": row_of(schema.unit, row["unit_id"]),
-            "socket": socket,
-            "station": row_of(schema.station, socket and socket["station_id"]),
-            "operator": row_of(schema.operator, row["operator_id"]),
-            "recipe": row_of(schema.recipe, row["recipe_id"]),
-            "lot": row_of(schema.lot, row["lot_id"]),
-            "artifacts": [row_of(schema.artifact, each["artifact_id"]) for each in targets[run_id]],
+            **others,
+            "station": socket and stations.get(socket["station_id"]),
+            "artifacts": [artifacts.get(each["artifact_id"]) for each in targets[run_id]],
             **{name: rows[run_id] for name, rows in parts.items()},
         }
-        found[run_id] = data
     return found

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, func, or_, select
 from flasher.errors import FlasherError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
-from flasher.station.records.chain import NAMED, OWN, digests_of
+from flasher.station.records.chain import NAMED, OWN, contents_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.examined import Examined, ExaminedChain
@@ -35,7 +35,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.places import PATIENCE_S, Place, patiently
 from flasher.station.records.proof import contradictions, traces_of_targets
-from flasher.station.records.queries import details_of
+from flasher.station.records.queries import details_of_content, is_whole
 from flasher.station.records.rows import batches, grouped
 from flasher.station.records.signatures import is_signed
 from flasher.station.records.triggers import fingerprint_of, stated_differences
@@ -43,6 +43,7 @@ from flasher.trace.reader import read_trace
 
 _RUNS_NAMED: Final = 5
 _HASH_BYTES: Final = 32
+_CACHE_KB: Final = 256 * 1024
 _BRIEFLY_S: Final = 0.5
 """A page waits no longer for a place of heads."""
 _USED: Final = {
@@ -173,8 +174,6 @@ class Examiner:
         kept: list[_Kept],
     ) -> Iterator[Problem]:
         since = self._since
-        if self._database.backend == "sqlite" and since is None:
-            yield from _sqlite_problems(connection)
         run, audit = schema.run.c, schema.audit.c
         some_runs = select(run.id).order_by(run.id)
         if since is not None:
@@ -183,6 +182,9 @@ class Examiner:
         rows = connection.execute(select(func.count()).select_from(schema.audit)).scalar_one()
         before = 0 if since is None else sum(each.rows for each in since.chains.values())
         self._total = rows - before + len(chosen)
+        self._did(0)  # shows the bar: what comes first takes minutes where there are many runs
+        if self._database.backend == "sqlite" and since is None:
+            yield from _sqlite_problems(connection)
         yield from self._trails(connection, records_id, kept)
         gone = select(audit.run_id).outerjoin(schema.run, run.id == audit.run_id).distinct()
         gone = gone.where(audit.run_id.is_not(None), run.id.is_(None)).order_by(audit.run_id)
@@ -192,10 +194,8 @@ class Examiner:
             yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
         for some in batches(chosen):
-            stated = _stated(connection, some)
-            for run_id, digests in digests_of(connection, some).items():
-                yield from self._digests(run_id, digests, stated[run_id], changed)
-            yield from self._runs(connection, some, stated)
+            stated, contents = _stated(connection, some), contents_of(connection, some)
+            yield from self._contents(contents, stated, changed)
         yield from _shared(changed)
         yield from _unused(connection)
         yield from _same_traces(connection)
@@ -410,10 +410,9 @@ class Examiner:
                     ending = row
             stated = _stated(connection, [run_id])
             changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-            for digests in digests_of(connection, [run_id]).values():
-                problems += self._digests(run_id, digests, stated[run_id], changed)
+            contents = contents_of(connection, [run_id])
+            problems += self._contents(contents, stated, changed)
             problems += _shared(changed)
-            problems += self._runs(connection, [run_id], stated)
             places = []
             if ending is not None:
                 problems += _schema_of(connection, ending["name"])
@@ -477,25 +476,27 @@ class Examiner:
             what = f"changed after it was recorded: {', '.join(own)}"
             yield Problem(where, what, (run_id,))
 
-    def _runs(
-        self, connection: Connection, run_ids: list[int], stated: Mapping[int, _Stated]
+    def _contents(
+        self,
+        contents: Mapping[int, Mapping[str, Any]],
+        stated: Mapping[int, _Stated],
+        changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
-        """Check that the runs can be read, and their attachments."""
-        try:
-            found = tuple(details_of(connection, schema.run.c.id.in_(run_ids)))
-        except ValidationError as error:
-            if len(run_ids) > 1:
-                for run_id in run_ids:
-                    yield from self._runs(connection, [run_id], stated)
-            else:
+        """Check runs by their rows, which are read once."""
+        for run_id, digests in chain.digests_in(contents).items():
+            yield from self._digests(run_id, digests, stated[run_id], changed)
+        for run_id, content in contents.items():
+            if not is_whole(content):
+                continue  # its digests tell
+            try:
+                details = details_of_content(content, content["recipe"])
+            except ValidationError as error:
                 (first, *_) = error.errors()
                 said = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
-                yield Problem(f"run {run_ids[0]}", f"it cannot be read: {said}", tuple(run_ids))
-            return
-        for details in found:
-            run_id = details.run.run_id
-            is_over = details.run.state is not RunState.RUNNING
+                yield Problem(f"run {run_id}", f"it cannot be read: {said}", (run_id,))
+                continue
             self._did(1)
+            is_over = details.run.state is not RunState.RUNNING
             if stated[run_id].is_known and is_over != bool(stated[run_id].ending):
                 what = "it is finished" if is_over else "it goes on"
                 what += ", but the audit trail says otherwise"
@@ -721,7 +722,8 @@ def _differences(trail: _Trail, place: str, held: list[Head]) -> Iterator[Proble
 def _unused(connection: Connection) -> Iterator[Problem]:
     """Rows that no station adds without a run."""
     for table, naming in _USED.items():
-        query = select(table).where(table.c.id.not_in(select(naming).where(naming.is_not(None))))
+        # A join: of NOT IN (...), a server makes a list that it walks through for each row.
+        query = select(table).outerjoin(naming.table, naming == table.c.id).where(naming.is_(None))
         for row in connection.execute(query.order_by(table.c.id).limit(_RUNS_NAMED)).mappings():
             name = row.get("serial") or row.get("name")
             yield Problem(f"{table.name} {printable(str(name))}", "it was added: no run names it")
@@ -746,7 +748,13 @@ def _table(value: Any) -> Mapping[str, str]:
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
-    for (found,) in connection.exec_driver_sql("PRAGMA integrity_check").all():
+    # Each row is looked up in each index, among them those of hashes, in no order: with SQLite's
+    # own cache of 2 MB nearly every look-up reads a page again.
+    usual = connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
+    connection.exec_driver_sql(f"PRAGMA cache_size = -{_CACHE_KB}")
+    damage = connection.exec_driver_sql("PRAGMA integrity_check").scalars().all()
+    connection.exec_driver_sql(f"PRAGMA cache_size = {usual}")
+    for found in damage:
         if found != "ok":
             yield Problem("database", printable(str(found)))
     for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all():

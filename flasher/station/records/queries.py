@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -27,14 +27,16 @@ from flasher.station.records.model import (
     Verified,
 )
 from flasher.station.records.rollup import Ended, Rest, Rollup, Units
-from flasher.station.records.rows import batches, grouped
+from flasher.station.records.rows import batches
 
 _EVERYTHING: Final = RunFilter()
 VERIFIED: Final = case(
     {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
 ).label("verified")
 """How far a run was verified, by its word."""
-_DETAILS: Final = TypeAdapter(list[RunDetails])
+_DETAILS: Final = TypeAdapter(RunDetails)
+_NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
+"""What every run names."""
 
 
 class Records:
@@ -179,43 +181,59 @@ def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
     """The runs that a condition chooses, with their parts, in the order of their ids; one that
     names what is not there is left out. Raises ValidationError for what no station writes.
     """
-    query = run_query(schema.run.c.verification_reached.label("verified")).where(chosen)
-    runs = connection.execute(query.order_by(schema.run.c.id)).mappings()
-    by_id = {row["run_id"]: row for row in runs}
-    artifact, measurement = schema.artifact.c, schema.measurement
-    of_target = select(
-        schema.run_target,
-        artifact.name.label("image"),
-        artifact.sha256.label("image_sha256"),
-        artifact.version,
-    ).join_from(schema.run_target, schema.artifact)
-    write = schema.device_write
-    queries = {
-        "targets": (schema.run_target, of_target),
-        "steps": (schema.step, select(schema.step)),
-        "writes": (write, select(write, write.c.id.label("write_id"))),
-        "attachments": (schema.attachment, select(schema.attachment)),
+    run_ids = connection.execute(select(schema.run.c.id).where(chosen).order_by(schema.run.c.id))
+    for some in batches(run_ids.scalars().all()):
+        for content in chain.contents_of(connection, some).values():
+            if is_whole(content):
+                yield details_of_content(content, content["recipe"])
+
+
+def is_whole(content: Mapping[str, Any]) -> bool:
+    """True where what the run names is there."""
+    return all(content[name] is not None for name in _NAMED)
+
+
+def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) -> RunDetails:
+    """A run of its rows. Raises ValidationError; KeyError, TypeError for rows that are none."""
+    run, unit = content["run"], content["unit"]
+    begun_s, ended_s = run["begun_monotonic_s"], run["ended_monotonic_s"]
+    images = {each["id"]: each for each in content["artifacts"] if each is not None}
+    # What is no number is refused below.
+    has_numbers = all(isinstance(each, int | float) for each in (begun_s, ended_s))
+    facts = {
+        **{name: unit[name] for name in ("serial", "part")},
+        "run_id": run["id"],
+        "lot": content["lot"] and content["lot"]["name"],
+        "duration_s": ended_s - begun_s if has_numbers else ended_s,
+        **{name: content[name]["name"] for name in ("station", "socket", "operator")},
+        "recipe": recipe["name"],
+        "recipe_revision": recipe["revision"],
+        "recipe_sha256": recipe["sha256"],
+        "verified": run["verification_reached"],
     }
-    for some in batches(by_id):
-        parts = {
-            name: grouped(connection, select_parts.order_by(table.c.id), table.c.run_id, some)
-            for name, (table, select_parts) in queries.items()
+    targets = [
+        each
+        | {
+            "image": images[each["artifact_id"]]["name"],
+            "image_sha256": images[each["artifact_id"]]["sha256"],
+            "version": images[each["artifact_id"]]["version"],
         }
-        steps = [step for rows in parts["steps"].values() for step in rows]
-        measured = grouped(
-            connection,
-            select(measurement).order_by(measurement.c.id),
-            measurement.c.step_id,
-            [step["id"] for step in steps],
-        )
-        for step in steps:
-            step["measurements"] = measured[step["id"]]
-        yield from _DETAILS.validate_python(
-            [
-                {"run": dict(by_id[run_id]), **{name: rows[run_id] for name, rows in parts.items()}}
-                for run_id in some
-            ]
-        )
+        for each in content["targets"]
+        if each["artifact_id"] in images
+    ]
+    steps = [
+        each | {"measurements": [m for m in content["measurements"] if m["step_id"] == each["id"]]}
+        for each in content["steps"]
+    ]
+    return _DETAILS.validate_python(
+        {
+            "run": run | facts,
+            "targets": targets,
+            "steps": steps,
+            "writes": [each | {"write_id": each["id"]} for each in content["writes"]],
+            "attachments": content["attachments"],
+        }
+    )
 
 
 def run_query(verified: Any) -> Select[Any]:

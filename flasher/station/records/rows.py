@@ -41,8 +41,11 @@ def grouped(
     """The rows of an ordered query by the value that they have in `column`, for these values."""
     found = defaultdict(list)
     for some in batches(keys):
-        for row in connection.execute(query.where(column.in_(some))).mappings():
-            found[row[column.name]].append(dict(row))
+        rows = connection.execute(query.where(column.in_(some)))
+        names = list(rows.keys())  # once: each row of a result would look them up anew
+        for row in rows:
+            each = dict(zip(names, row, strict=True))
+            found[each[column.name]].append(each)
     return found
 
 

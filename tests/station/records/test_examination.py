@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
-from sqlalchemy import Connection
+from sqlalchemy import Connection, event
 
 from flasher.station.records import chain, examination, heads
 from flasher.station.records.model import Examination, RunId, RunState
@@ -53,6 +54,27 @@ def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) 
     assert not again.problems
     assert again.traces == 1  # of the run that went on then
     assert examined.store.examine().traces == 3
+
+
+def test_more_runs_are_no_more_statements(any_bench: Bench) -> None:
+    """All rows of many runs are read together: an examination of a million runs asks for each page
+    of the database about once.
+    """
+    asked: list[str] = []
+
+    def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
+        asked.append(statement)
+
+    event.listen(any_bench.store.database.engine, "before_cursor_execute", note)
+    counts = []
+    for serial in ("W2605002", "W2605003", "W2605004"):
+        any_bench.make(serial=serial)
+        asked.clear()
+        assert not any_bench.store.examine().problems
+        counts.append(len(asked))
+    assert counts == counts[:1] * 3
+    reads = [statement for statement in asked if " step" in statement]
+    assert len(reads) == 2, reads  # steps, and the measurements of steps
 
 
 @pytest.mark.parametrize(
@@ -132,13 +154,13 @@ def test_a_run_is_examined_without_going_through_the_records(
 ) -> None:
     examined.make(serial="W2605004")
     calls: list[int] = []
-    real = chain.digests_of
+    real = chain.contents_of
 
-    def counted(connection: Connection, runs: list[int]) -> dict[int, dict[str, str]]:
+    def counted(connection: Connection, runs: list[int]) -> dict[int, dict[str, Any]]:
         calls.extend(runs)
         return real(connection, runs)
 
-    monkeypatch.setattr(examination, "digests_of", counted)
+    monkeypatch.setattr(examination, "contents_of", counted)
     monkeypatch.setattr(heads.HeadsFile, "entries", None)
     first, last = (examined.store.examine_run(RunId(run_id)) for run_id in (1, 3))
     assert calls == [1, 3]
