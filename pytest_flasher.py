@@ -113,9 +113,9 @@ def btl_run(
     """
     if not _is_active(request.config):
         pytest.skip("no device under test: give --btl-target with an adapter, or --btl-mock")
-    from flasher.conformance.plugin import opened_run  # noqa: PLC0415  only where it is used
+    from flasher.conformance.plugin import open_run  # noqa: PLC0415  only where it is used
 
-    with opened_run(request.config, btl_power_control, btl_readback_control) as run:
+    with open_run(request.config, btl_power_control, btl_readback_control) as run:
         yield run
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Final
 
 from flasher.conformance import cases  # noqa: F401  registers them
-from flasher.conformance.catalogue import CASES, in_order
-from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, ClauseReading, contents
+from flasher.conformance.catalogue import CASES, catalogue_order
+from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, ClauseReading, clause_texts
 
 ROOT: Final = Path(__file__).parents[1]
 DOCUMENT: Final = ROOT / "docs" / "explanation" / "readings.md"
@@ -204,7 +204,7 @@ def _reading(number: str, reading: ClauseReading) -> Iterator[str]:
 
 
 def _cases(label: str) -> list[str]:
-    return [one for one in in_order(CASES) if label in contents(CASES[one].clause)]
+    return [one for one in catalogue_order(CASES) if label in clause_texts(CASES[one].clause)]
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from flasher.conformance.catalogue import (
     QUICK,
     WEAR,
     Selection,
-    in_order,
+    catalogue_order,
 )
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.results import CaseVerdict
@@ -35,7 +35,7 @@ PATH: Final = Path(__file__).parents[1] / "docs" / "reference" / "variants.md"
 TARGET: Final = "bms"
 AREA_BYTES: Final = 80 * 1024
 """Smaller than the mock's own, since the largest image is sent often; larger than 16 bits tell."""
-_RUN: Final = [case_id for case_id in in_order(CASES) if case_id not in WEAR]
+_RUN: Final = [case_id for case_id in catalogue_order(CASES) if case_id not in WEAR]
 """A whole run, of cases that need not be named."""
 _COUNTING: Final = frozenset({"hangs-at-20th-update"})
 """Which case meets the fault depends on those before it."""
@@ -72,13 +72,13 @@ def row_of(name: str, cases: Sequence[str] = ()) -> Row:
     subject = MockSubject(TARGET, profile=device, make_device=variant_maker(name))
     report = run(subject, profile_of_mock(device), selection=Selection(cases=tuple(cases)))
     failed = {result.case_id for result in report.results if result.verdict in _CAUGHT}
-    return Row(name, tuple(in_order(failed)), report.count(CaseVerdict.NOT_RUN))
+    return Row(name, tuple(catalogue_order(failed)), report.count(CaseVerdict.NOT_RUN))
 
 
 def told_otherwise(listed: tuple[str, tuple[str, ...]]) -> str:
     """What a quick run and the cases listed for a variant say otherwise; "" for nothing."""
     name, fails = listed
-    row = row_of(name, () if name in _COUNTING else in_order({*QUICK, *fails}))
+    row = row_of(name, () if name in _COUNTING else catalogue_order({*QUICK, *fails}))
     return "" if row.fails == fails else f"{name}: {', '.join(row.fails) or 'nothing fails'}"
 
 

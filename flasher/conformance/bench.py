@@ -28,7 +28,7 @@ from flasher.conformance.wire import (
     Received,
     describe,
     packet_count,
-    told_version,
+    reported_version,
 )
 
 _PIECES: Final = 64
@@ -114,7 +114,7 @@ class Bench:
     def reset_measured(self, within_s: float) -> Received:
         """The same, with the times of general feedback, if it comes, and boot version measured."""
         self.forget()
-        with self.tester.hearing_feedback():
+        with self.tester.collecting_feedback():
             sent = self.send(self.encoder.reset())
             heard = self.wait_for(MessageKind.FEEDBACK, MessageKind.BOOT_VERSION, within_s=within_s)
         if heard is not None and heard.kind is MessageKind.FEEDBACK:
@@ -124,7 +124,7 @@ class Bench:
         self.measure(Times.FIRST, found.at - sent.left_at)
         return found
 
-    def wait_to_be_heard(self) -> None:
+    def wait_until_listening(self) -> None:
         """After the first boot version, wait until the device takes the update command: not at all,
         or until the burst is over (up_04_burst).
         """
@@ -211,7 +211,7 @@ class Bench:
         ok = len(heard) == len(right) in wanted
         return self.check(ok, f"rejected: {' or '.join(wanted.values())}", describe(heard))
 
-    def right_to_repetition(self, number: int) -> list[str]:
+    def repetition_answers(self, number: int) -> list[str]:
         """The right answers to a packet that was stored last and is sent again (tx_02)."""
         words = {"ack": f"ACK {number}", "nak_next": f"NAK {number + 1}"}
         return [answer for word, answer in words.items() if self.profile.allows("tx_02", word)]
@@ -277,11 +277,11 @@ class Bench:
         """
         chosen = self.good_image if image is None else image
         self._check_runs(chosen)
-        if self.tester.update_was_sent and told_version(self.subject.target, chosen) is None:
+        if self.tester.update_was_sent and reported_version(self.subject.target, chosen) is None:
             self.check_stored(chosen, runs=True)
 
     def _check_runs(self, image: bytes) -> None:
-        wanted = told_version(self.subject.target, image)
+        wanted = reported_version(self.subject.target, image)
         if wanted is not None:
             found = self.application_version(self.limit("start_s"))
             self.check(
@@ -301,7 +301,7 @@ class Bench:
         try:
             differs_at = self.difference(image, runs=runs)
         except Unsupported as lacking:
-            tells = told_version(self.subject.target, self.good_image) is not None
+            tells = reported_version(self.subject.target, self.good_image) is not None
             why = "" if tells else ", and the device does not tell which application runs"
             self.unsupported(expected, f"{lacking}{why}")
             return
@@ -361,7 +361,7 @@ class Bench:
         self.forget()
         self.power_on()
 
-    def begin_anew(self, size_bytes: int) -> None:
+    def restart_transfer(self, size_bytes: int) -> None:
         """Abandon a transfer and get request transfer for another one: by the update command where
         the profile says that it starts over (up_08), else as `leave_transfer` does, which raises
         Unsupported.
@@ -405,7 +405,7 @@ class Bench:
             self.power_cycle()
             self.await_message(MessageKind.BOOT_VERSION)
 
-    def without_application(self) -> None:
+    def erase_application(self) -> None:
         """Erase the application, and let the bootloader announce itself."""
         self.start_transfer(len(self.good_image))
         self.leave_transfer()

@@ -30,7 +30,7 @@ from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 from flasher.settings.device_model import set_options
 
-_ECHOING: Final[Mapping[str, Mapping[str, Any]]] = {
+_ECHO_OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "socketcan": {"receive_own_messages": True},
     "udp_multicast": {},
 }
@@ -102,7 +102,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
 
     named = bus_config(options.bus, options.fallback)
-    asked = _ECHOING.get(named["interface"])
+    asked = _ECHO_OPTIONS.get(named["interface"])
     bus = {**(asked or {}), **options.bus}
     echoes = asked is not None and bus.get("receive_own_messages", True) is True
     with api.connect(

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final
 
-from flasher.conformance.clauses import contents
+from flasher.conformance.clauses import clause_texts
 from flasher.conformance.results import CaseText, Gap
 from flasher.conformance.subject import Subject, readback_source
-from flasher.conformance.wire import told_version
+from flasher.conformance.wire import reported_version
 from flasher.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:  # the profile needs the validation library, which the list of groups does not
@@ -140,7 +140,7 @@ def case(
     def register(run: CaseScript) -> CaseScript:
         if case_id in CASES:
             raise ValueError(f"there are two cases {case_id}")
-        contents(clause)
+        clause_texts(clause)
         needs = frozenset(requires)
         CASES[case_id] = Case(case_id, title, clause, run=run, requires=needs, **more)
         return run
@@ -158,7 +158,7 @@ def known_cases() -> tuple[str, ...]:
     return (*CASES, *NOT_IMPLEMENTED)
 
 
-def in_order(case_ids: Iterable[str]) -> list[str]:
+def catalogue_order(case_ids: Iterable[str]) -> list[str]:
     """Case ids in the order of the catalogue."""
     groups = list(GROUPS)
     return sorted(case_ids, key=lambda case_id: (groups.index(group_of(case_id)), case_id))
@@ -176,7 +176,7 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
         group_of(case_id),
         case.title,
         case.clause,
-        contents(case.clause),
+        clause_texts(case.clause),
         case.stimulus,
         case.expectation,
         tuple(sorted(need.value for need in case.requires)),
@@ -212,7 +212,7 @@ class Selection:
 
     def chosen(self) -> list[str]:
         """The ids of all cases to be run, in the order of the catalogue."""
-        return [case_id for case_id in in_order(known_cases()) if self.has(case_id)]
+        return [case_id for case_id in catalogue_order(known_cases()) if self.has(case_id)]
 
     def wears(self, upgrades: int | None = None) -> dict[str, int]:
         """Those of `WEAR` that are to be run, with how often each one has the device upgraded."""
@@ -236,7 +236,7 @@ class Selection:
 # -- what a bench cannot judge --------------------------------------------------------------------
 
 _SIMULATED: Final = "--mock, or --subject"
-BARE: Final = {
+MISSING_ON_BARE_BENCH: Final = {
     Requirement.POWER: ("power control", "--power-cmd"),
     Requirement.READBACK: ("readback of the flash past the protocol", "--readback-cmd"),
     Requirement.IMAGE_READBACK: (
@@ -253,7 +253,7 @@ BARE: Final = {
 }
 """What a bench of device, adapter and good image lacks, each with what adds it."""
 _LACKS: Final = {
-    **BARE,
+    **MISSING_ON_BARE_BENCH,
     Requirement.CHECKSUM: (
         "images with a checksum of their own",
         "a product that has one, and en_04 in the profile",
@@ -284,7 +284,7 @@ _WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01", "
 """Destructive cases that do not look into the flash; of all others, some part compares it."""
 
 
-def lacking(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
+def missing_requirements(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
     """What this bench does not have."""
     has = {
         Requirement.POWER: subject.has_power,
@@ -295,12 +295,12 @@ def lacking(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
         Requirement.TIMED_CUT: subject.has_timed_cuts,
         Requirement.ERROR_FRAMES: subject.port.sends_error_frames,
         Requirement.CHECKSUM: profile.choice("en_04") != "none",
-        Requirement.VERSION: told_version(subject.target, subject.good_image) is not None,
+        Requirement.VERSION: reported_version(subject.target, subject.good_image) is not None,
     }
     return [need for need, is_there in has.items() if not is_there]
 
 
-def gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[Gap, ...]:
+def bench_gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[Gap, ...]:
     """What a bench that lacks this cannot judge of the `chosen` cases."""
     cases = [CASES[case_id] for case_id in chosen if case_id in CASES]
     run = [case for case in cases if not case.requires.intersection(lacks)]
@@ -308,13 +308,13 @@ def gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[Gap, ..
     for need, (name, remedy) in _LACKS.items():
         if need in lacks:
             unsupported = tuple(case.id for case in cases if need in case.requires)
-            in_part = tuple(case.id for case in run if need.value in in_part_without(case.id))
+            in_part = tuple(case.id for case in run if need.value in full_verdict_needs(case.id))
             if unsupported or in_part:
                 found.append(Gap(need.value, name, remedy, unsupported, in_part))
     return tuple(found)
 
 
-def in_part_without(case_id: str) -> tuple[str, ...]:
+def full_verdict_needs(case_id: str) -> tuple[str, ...]:
     """What a bench needs to judge all of a case, beside what it needs to run it."""
     case = CASES.get(case_id)
     found = [need for need, case_ids in _IN_PART.items() if case_id in case_ids]
@@ -324,7 +324,9 @@ def in_part_without(case_id: str) -> tuple[str, ...]:
     return tuple(need.value for need in found)
 
 
-def what_is_missing(case: Case, subject: Subject, profile: ConformanceProfile) -> str:
+def why_unsupported(case: Case, subject: Subject, profile: ConformanceProfile) -> str:
     """Why this bench cannot run a case; empty when it can."""
-    lacks = [_LACKS[need][0] for need in lacking(subject, profile) if need in case.requires]
+    lacks = [
+        _LACKS[need][0] for need in missing_requirements(subject, profile) if need in case.requires
+    ]
     return f"needs {' and '.join(lacks)}" if lacks else ""

@@ -293,7 +293,7 @@ CLAUSES: Final = {
 """Every clause with its content."""
 
 
-def contents(clause: str) -> dict[str, str]:
+def clause_texts(clause: str) -> dict[str, str]:
     """The clauses that a case names ("Welling 5.2, table 8 (A10B); R9") with their contents.
 
     Raises ValueError for one that does not exist.

@@ -78,25 +78,25 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
         why = f": check {parts}, and whether the device is a {encoder.target}" if has_wires else ""
         return [f"{errors}no frame at all was received{why}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
-        return [_who_speaks(frames, encoder)]
+        return [_diagnose_senders(frames, encoder)]
     decoder = DeviceDecoder(encoder)
     messages = [found for frame, at in heard for found in decoder.feed(frame, at)]
     to_tool = [message for message in messages if message.can_id == encoder.to_tool]
     damaged = [message for message in to_tool if message.kind is MessageKind.DAMAGED]
     if damaged:
-        return [_what_would_fit(damaged, own)]
-    return _what_is_strange(to_tool, own, encoder) or [
-        f"{own} speaks, and its messages are right: {_counted(map(str, to_tool))}"
+        return [_diagnose_framing(damaged, own)]
+    return _diagnose_protocol(to_tool, own, encoder) or [
+        f"{own} speaks, and its messages are right: {_with_counts(map(str, to_tool))}"
     ]
 
 
-def _counted(texts: Iterable[str]) -> str:
+def _with_counts(texts: Iterable[str]) -> str:
     """The most frequent ones, with their numbers."""
     found = Counter(texts).most_common(_SHOWN)
     return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in found)
 
 
-def _who_speaks(frames: Sequence[RawFrame], encoder: Encoder) -> str:
+def _diagnose_senders(frames: Sequence[RawFrame], encoder: Encoder) -> str:
     """Nothing came on the id that has to answer."""
     own = f"{encoder.to_tool:03X}"
     extended = [frame.can_id for frame in frames if frame.is_extended]
@@ -108,11 +108,11 @@ def _who_speaks(frames: Sequence[RawFrame], encoder: Encoder) -> str:
                 f"{other.to_tool:03X} speaks, and {own} does not: the device is another one, and "
                 f"-t {other.target} fits it"
             )
-    ids = _counted(f"{frame.can_id:03X}" for frame in frames)
+    ids = _with_counts(f"{frame.can_id:03X}" for frame in frames)
     return f"nothing was received from {own}; heard were the ids {ids}"
 
 
-def _what_would_fit(damaged: Sequence[Received], own: str) -> str:
+def _diagnose_framing(damaged: Sequence[Received], own: str) -> str:
     """Messages came that are none: which other form makes messages of all of them."""
     raws = [message.raw for message in damaged]
     if any(raw.startswith(_OTHER_HEADER) for raw in raws):
@@ -138,7 +138,7 @@ def _what_would_fit(damaged: Sequence[Received], own: str) -> str:
     )
 
 
-def _what_is_strange(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
+def _diagnose_protocol(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
     """The messages are whole; what about them does not belong to the protocol."""
     names = {one.boot_name for one in messages if one.kind is MessageKind.BOOT_VERSION}
     for other in encoder.others():

@@ -90,25 +90,25 @@ def read_report(path: Path) -> ReportDocument:
         document = parse_json(raw)
     except ValueError as error:
         why = f"it is no JSON that can be read ({printable(str(error))})"
-        raise _no_report(path, why) from error
+        raise _not_a_report(path, why) from error
     if isinstance(document, dict) and isinstance(document.get("report"), dict):
         document = document["report"]  # what --json prints
     if not isinstance(document, dict) or "report_schema" not in document:
-        raise _no_report(path, "it holds no conformance report")
+        raise _not_a_report(path, "it holds no conformance report")
     if document["report_schema"] != SCHEMA_VERSION:
         found = printable(str(document["report_schema"])[:20])
         why = f"its schema is version {found}, and this program reads {SCHEMA_VERSION}"
-        raise _no_report(path, why, "Run the suite again, and compare what one version wrote.")
+        raise _not_a_report(path, why, "Run the suite again, and compare what one version wrote.")
     try:
         return adapter().validate_python(document)
     except ValidationError as error:
         wrong = error.errors()[0]
         place = ".".join(map(str, wrong["loc"]))
         why = f"a part of it is missing or wrong ({printable(place)[:80]}: {wrong['msg']})"
-        raise _no_report(path, why) from error
+        raise _not_a_report(path, why) from error
 
 
-def _no_report(
+def _not_a_report(
     path: Path,
     why: str,
     remedy: str = "Compare files that `flasher conformance --json-report FILE` wrote.",
@@ -145,7 +145,7 @@ def compare(
             case_id, titles.get(case_id, ""), was, is_now, reasons.get(case_id, "")
         )
         found[kind].append(change)
-    moved = _moved(old, new, threshold_percent)
+    moved = _changed_times(old, new, threshold_percent)
     return Difference(
         threshold_percent=threshold_percent,
         **found,
@@ -183,7 +183,9 @@ def reasons_of(report: ReportDocument) -> dict[str, str]:
     return found
 
 
-def _moved(old: ReportDocument, new: ReportDocument, threshold_percent: float) -> list[TimeChange]:
+def _changed_times(
+    old: ReportDocument, new: ReportDocument, threshold_percent: float
+) -> list[TimeChange]:
     """Times of both runs whose median or 95th percentile is another one."""
     found = []
     by_name = {times.name: times for times in old.times}

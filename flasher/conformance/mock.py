@@ -97,7 +97,7 @@ def variant_maker(name: str) -> Callable[[str, DeviceProfile], MockDevice]:
 
 # -- the model's choices as the suite's -----------------------------------------------------------
 
-_FROM_MODEL: Final[dict[str, tuple[str, dict[str, str]]]] = {
+_MODEL_OPTIONS: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "rs_02": ("reset_in_bootloader", {}),
     "rs_03": ("without_application", {}),
     "up_03": ("upgrade_in_application", {"general_feedback": "feedback"}),
@@ -112,7 +112,7 @@ _FROM_MODEL: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "en_04": ("image_checksum", {}),
 }
 """Key of the suite to the model's option and the values that are called differently."""
-_OF_MODEL: Final = {
+_FIXED_CHOICES: Final = {
     "fr_01": "accepted",
     "fr_02": "found",
     "fr_04": "rescanned",
@@ -128,8 +128,8 @@ _OF_MODEL: Final = {
 
 def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     """The conformance profile of a device model with these choices."""
-    given: dict[str, Value] = dict(_OF_MODEL)
-    for key, (option, renamed) in _FROM_MODEL.items():
+    given: dict[str, Value] = dict(_FIXED_CHOICES)
+    for key, (option, renamed) in _MODEL_OPTIONS.items():
         value = str(getattr(device, option))
         given[key] = renamed.get(value, value)
     if device.start_delay_s < _SOON_S:  # its application may run by then

@@ -9,7 +9,13 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
-from flasher.conformance.wire import MEMORY_BYTES, MessageKind, Received, packet_count, told_version
+from flasher.conformance.wire import (
+    MEMORY_BYTES,
+    MessageKind,
+    Received,
+    packet_count,
+    reported_version,
+)
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
@@ -109,7 +115,7 @@ class PatientHost:
         tester = self._tester
         deadline = tester.now + limit_s
         while True:
-            with tester.hearing_feedback():
+            with tester.collecting_feedback():
                 tester.send(self._encoder.reset())
                 runs = tester.wait_for(MessageKind.FEEDBACK) is not None
             if runs or tester.now >= deadline:
@@ -165,14 +171,14 @@ class PatientHost:
         for attempt in range(ATTEMPTS):
             if reset and not attempt:
                 self._tester.send(self._encoder.reset())
-            if not self._ask_for_transfer(len(image), blind=blind and not attempt):
+            if not self._request_transfer(len(image), blind=blind and not attempt):
                 return ended
             ended = self.transfer(image)
             if ended.ok or not ended.reason.startswith(MessageKind.BOOT_VERSION.value):
                 return ended
         return ended
 
-    def _ask_for_transfer(self, size_bytes: int, *, blind: bool) -> bool:
+    def _request_transfer(self, size_bytes: int, *, blind: bool) -> bool:
         """Answer boot versions with the update command until request transfer (R2)."""
         limit = self._profile.limit
         limit_s = limit("first_version_s")
@@ -206,12 +212,12 @@ class PatientHost:
         """All packets and the end, after request transfer; repeats what is lost."""
         began_at = self._tester.now
         for number in range(1, packet_count(len(image)) + 1):
-            trouble = self.insist_on_packet(image, number, began_at)
+            trouble = self.deliver_packet(image, number, began_at)
             if trouble:
                 return UpgradeResult(ok=False, reason=f"{trouble} (packet {number})")
-        return self.insist_on_end(image)
+        return self.deliver_end(image)
 
-    def insist_on_end(self, image: bytes) -> UpgradeResult:
+    def deliver_end(self, image: bytes) -> UpgradeResult:
         """End of transfer until there is a final answer, or the version of `image` is told."""
         refusals = 0
         for _ in range(END_TRIES):
@@ -222,12 +228,12 @@ class PatientHost:
             refusals += heard is not None
             if refusals == 2:
                 return UpgradeResult(ok=False, reason="the image was refused")
-        wanted = told_version(self._encoder.target, image)
+        wanted = reported_version(self._encoder.target, image)
         if wanted is None or self.application_version(self._profile.limit("start_s")) != wanted:
             return UpgradeResult(ok=False, reason="no final answer")
         return UpgradeResult(ok=True)
 
-    def insist_on_packet(self, image: bytes, number: int, began_at: float) -> str:
+    def deliver_packet(self, image: bytes, number: int, began_at: float) -> str:
         """Send a packet until it is acknowledged; returns what went wrong in the end, or "". The
         transfer began at `began_at`, with request transfer.
         """

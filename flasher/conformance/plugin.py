@@ -23,9 +23,9 @@ from flasher.conformance.catalogue import (
     Requirement,
     Selection,
     case_text,
-    in_order,
+    catalogue_order,
     known_cases,
-    what_is_missing,
+    why_unsupported,
 )
 from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.profile import ConformanceProfile, check_deviations
@@ -34,8 +34,8 @@ from flasher.conformance.reports import (
     TRACED,
     candump,
     distribution,
+    failure_details,
     is_traced,
-    told,
     trace_file_name,
 )
 from flasher.conformance.results import (
@@ -129,22 +129,22 @@ class PluginRun:
         self._traces: dict[tuple[str, int], str] = {}
         self._has_begun = False
 
-    def judge(self, case: Case, node: pytest.Item) -> None:
+    def run_case(self, case: Case, node: pytest.Item) -> None:
         """Run a case of the suite; its verdict becomes that of the test."""
-        missing = what_is_missing(case, self.subject, self.profile)
+        missing = why_unsupported(case, self.subject, self.profile)
         if missing:
-            self._run.leave_out(case.id, missing)
+            self._run.skip_case(case.id, missing)
             pytest.skip(missing)
         self._begin()
-        result = self._run.take(case)
+        result = self._run.run_case(case)
         self.measurements.add(result.measurements)
         if is_traced(result):
             self._traces[result.key] = trace_file_name(result)
-            self._keep("trace_dir", lambda: candump(result.trace), self._traces[result.key])
+            self._write("trace_dir", lambda: candump(result.trace), self._traces[result.key])
         _report(node, result)
         said = f"{result.verdict.text}: {result.reason}"
         text = case_text(case.id, self.profile)
-        details = told(text, result, self._replay(case.id))
+        details = failure_details(text, result, self._replay(case.id))
         match result.verdict:
             case CaseVerdict.PASS_IN_PART if self._is_strict:
                 pytest.fail(said, pytrace=False)
@@ -160,7 +160,7 @@ class PluginRun:
 
     def report(self) -> RunReport:
         """What came of the cases of the suite so far."""
-        return self._run.report(in_order(self._run.judged))
+        return self._run.report(catalogue_order(self._run.judged))
 
     def bench_for(self, node: pytest.Item) -> Iterator[Bench]:
         """The bench of one test, with the device in the known state before and after it."""
@@ -178,7 +178,7 @@ class PluginRun:
         if trouble:
             pytest.fail(f"the device is not reachable afterwards: {trouble}", pytrace=False)
 
-    def keep_failed(self, node: pytest.Item, bench: Bench) -> None:
+    def save_failed(self, node: pytest.Item, bench: Bench) -> None:
         """Keep the frames of a test of the user's own that failed."""
         result = CaseResult(
             node.name,
@@ -188,7 +188,7 @@ class PluginRun:
             trace_dropped=bench.tester.trace_dropped,
         )
         name = f"{_NO_FILE_NAME.sub('-', node.name)}.log"
-        self._keep("trace_dir", lambda: candump(result.trace), name)
+        self._write("trace_dir", lambda: candump(result.trace), name)
         _report(node, result)
 
     def finish(self) -> None:
@@ -208,12 +208,12 @@ class PluginRun:
 
             return html_page(report, **told_by).encode("utf-8")
 
-        self._keep("json_report", lambda: to_bytes(report_document(report, **told_by)))
-        self._keep("html", page)
+        self._write("json_report", lambda: to_bytes(report_document(report, **told_by)))
+        self._write("html", page)
         if final != FINAL_IMAGE_OK:
             pytest.fail(f"the good image at the end: {final}", pytrace=False)
 
-    def _keep(self, option: str, made: Callable[[], bytes], name: str = "") -> None:
+    def _write(self, option: str, made: Callable[[], bytes], name: str = "") -> None:
         """Write what is `made` to the file that an option names, or to a file in its folder."""
         given = self._config.getoption(f"btl_{option}")
         if given is None:
@@ -247,7 +247,7 @@ class PluginRun:
 
 
 @contextmanager
-def opened_run(
+def open_run(
     config: pytest.Config,
     power: Callable[[bool], None] | None,
     readback: Callable[[], bytes] | None,
@@ -345,7 +345,7 @@ class Hooks:
             failed = [str(check) for check in checks if check.outcome is CheckOutcome.FAIL]
             if failed:
                 if isinstance(run, PluginRun):
-                    run.keep_failed(pyfuncitem, bench)
+                    run.save_failed(pyfuncitem, bench)
                 pytest.fail("\n".join(failed), pytrace=False)
         return result
 
@@ -383,7 +383,7 @@ def _item(suite: _Suite, case: Case) -> pytest.Item:
         node: Any = request.node
         with warnings.catch_warnings(action="ignore"):  # that the fixture is experimental
             request.getfixturevalue("record_xml_attribute")("name", f"{case.id} {case.title}")
-        btl_run.judge(case, node)
+        btl_run.run_case(case, node)
 
     test_case.__doc__ = case.title
     item: pytest.Item = pytest.Function.from_parent(suite, name=case.id, callobj=test_case)

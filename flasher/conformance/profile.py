@@ -198,7 +198,7 @@ def profile_keys() -> dict[str, Key]:
     return {path: key for path, key in _READER.keys.items() if path != DEVIATIONS}
 
 
-def words(name: str) -> list[str]:
+def choice_words(name: str) -> list[str]:
     """What a choice can be, besides `either`."""
     return [word for word in profile_keys()[name].choices if word != "either"]
 

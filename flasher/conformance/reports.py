@@ -108,7 +108,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     if ended is JUnitResult.SKIPPED:
         message, kind = f"{word}: {message}", ""
     elif ended in (JUnitResult.FAILURE, JUnitResult.ERROR):
-        details = told(text, result, replay)
+        details = failure_details(text, result, replay)
     elif report.strict and result.deviation_resolved:
         ended, kind = JUnitResult.FAILURE, "resolved deviation"
         message = f"the profile says that it deviates ({text.deviation}), but it passes"
@@ -131,7 +131,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     )
 
 
-def told(text: CaseText, result: CaseResult, replay: str) -> str:
+def failure_details(text: CaseText, result: CaseResult, replay: str) -> str:
     """What a case asks for, what failed, and how to run it again, line by line."""
     failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
     lines = [f"clause: {label}: {content}" for label, content in text.clauses.items()]

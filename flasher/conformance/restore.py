@@ -20,7 +20,7 @@ from flasher.conformance.results import (
     TraceEntry,
 )
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import MessageKind, told_version
+from flasher.conformance.wire import MessageKind, reported_version
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
@@ -63,7 +63,7 @@ def restore(
     began_at = subject.port.now()
     ways: list[tuple[str, Callable[[Bench], str]]] = []
     if not flash:
-        ways.append((BY_NOTHING, _runs))
+        ways.append((BY_NOTHING, _check_version))
     ways.append((BY_UPGRADE, _upgrade))
     if subject.has_power:
         ways.append((BY_POWER, _power_cycle))
@@ -135,8 +135,8 @@ def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
     return waits_s + 4 * frames * 130 / subject.port.bitrate_bps + _MARGIN_S
 
 
-def _runs(bench: Bench) -> str:
-    wanted = told_version(bench.subject.target, bench.good_image)
+def _check_version(bench: Bench) -> str:
+    wanted = reported_version(bench.subject.target, bench.good_image)
     if wanted is None:
         return "" if bench.application_runs() else "no application answers"
     found = bench.application_version(bench.limit("start_s"))
@@ -165,7 +165,7 @@ def _upgrade(bench: Bench) -> str:
 
 def _upgraded(bench: Bench, *, reset: bool, blind: bool = False) -> str:
     ended = bench.upgrade(bench.good_image, reset=reset, blind=blind)
-    return _runs(bench) if ended.ok else ended.reason
+    return _check_version(bench) if ended.ok else ended.reason
 
 
 def _power_cycle(bench: Bench) -> str:

@@ -22,12 +22,12 @@ from flasher.conformance.catalogue import (
     WEAR,
     Case,
     Selection,
+    bench_gaps,
     case_text,
-    gaps,
-    in_order,
+    catalogue_order,
     known_cases,
-    lacking,
-    what_is_missing,
+    missing_requirements,
+    why_unsupported,
 )
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
 from flasher.conformance.restore import (
@@ -53,7 +53,7 @@ from flasher.conformance.results import (
     Unsupported,
 )
 from flasher.conformance.subject import Subject, readback_source
-from flasher.conformance.wire import told_version
+from flasher.conformance.wire import reported_version
 from flasher.errors import BusError
 
 
@@ -107,7 +107,7 @@ def run(
     """
     selection.check()
     check_deviations(profile, known_cases())
-    return SuiteRun(subject, profile, options, observer or RunObserver(), stopped).go(
+    return SuiteRun(subject, profile, options, observer or RunObserver(), stopped).run_all(
         selection.chosen()
     )
 
@@ -145,7 +145,7 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
 
 
 class SuiteRun:
-    """A run case by case (`begin`, `take`, `finish`, `report`), or whole (`go`)."""
+    """A run case by case (`begin`, `run_case`, `finish`, `report`), or whole (`run_all`)."""
 
     def __init__(
         self,
@@ -174,24 +174,24 @@ class SuiteRun:
         self._final_image = ""
         self._final_image_seen_by: tuple[str, ...] = ()
 
-    def go(self, chosen: Sequence[str]) -> RunReport:
+    def run_all(self, chosen: Sequence[str]) -> RunReport:
         """Run the cases with these ids; one that this bench cannot run has its result at once."""
         cases: list[Case] = []
         for case_id in chosen:
             case = CASES.get(case_id)
             missing = NOT_IMPLEMENTED.get(case_id, "")
             if case is not None:
-                missing = what_is_missing(case, self._subject, self._profile)
+                missing = why_unsupported(case, self._subject, self._profile)
             if case is not None and not missing:
                 cases.append(case)
             else:
-                self.leave_out(case_id, missing)
+                self.skip_case(case_id, missing)
         self._observer.run_began(len(cases) * self._options.repeat)
         if cases:
             self.begin()
             for repeat in range(1, self._options.repeat + 1):
                 for case in cases:
-                    self.take(case, repeat)
+                    self.run_case(case, repeat)
             self.finish()
         return self.report(chosen)
 
@@ -200,7 +200,7 @@ class SuiteRun:
         """The ids of the cases that have a result."""
         return {result.case_id for result in self._results}
 
-    def leave_out(self, case_id: str, why: str) -> None:
+    def skip_case(self, case_id: str, why: str) -> None:
         """Report a case as unsupported."""
         self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=why))
 
@@ -208,7 +208,7 @@ class SuiteRun:
         """Flash the good image, so that the first case finds the known state."""
         self._restore("before the first case", flash=True)
 
-    def take(self, case: Case, repeat: int = 1) -> CaseResult:
+    def run_case(self, case: Case, repeat: int = 1) -> CaseResult:
         """Run a case, unless the run has come to its end before."""
         if not self.stopped and self._subject.port.now() >= self._ends_at:
             self.stopped = "the run's own time limit is over"
@@ -285,7 +285,7 @@ class SuiteRun:
     def _compare_final_image(self) -> None:
         """The good image was flashed: see by what there is whether it is there."""
         subject, image = self._subject, self._subject.good_image
-        seen_by = [] if told_version(subject.target, image) is None else ["version"]
+        seen_by = [] if reported_version(subject.target, image) is None else ["version"]
         limit_s = CASES[BRING_UP].limit_s
         bench = Bench(subject, self._profile, limit_s=limit_s, seed=self._options.seed)
         try:
@@ -313,8 +313,8 @@ class SuiteRun:
             strict=self._options.strict,
             cases=tuple(case_text(case_id, self._profile) for case_id in chosen),
             results=tuple(self._results),
-            gaps=gaps(lacking(self._subject, self._profile), chosen),
-            not_selected=tuple(in_order(set(known_cases()).difference(chosen))),
+            gaps=bench_gaps(missing_requirements(self._subject, self._profile), chosen),
+            not_selected=tuple(catalogue_order(set(known_cases()).difference(chosen))),
             host_cases=HOST_CASES,
             stopped=self.stopped,
             adapter_failed=self._adapter_failed,

@@ -108,9 +108,9 @@ class BusTester:
         self.ends_at = self.began_at + limit_s
         self.update_was_sent = False
         """True once an update command went out: the application may be erased."""
-        self.hears_feedback = profile.choice("fr_10") == "silence"
+        self.collects_feedback = profile.choice("fr_10") == "silence"
         """Else general feedback that a write may be answered by (R15) is in the trace only."""
-        self.hears_application = False
+        self.collects_application = False
         """Set by a case that cares about `Kind.APPLICATION`; else they are in the trace only."""
         self.frames_sent = 0
         self.frames_received = 0
@@ -190,13 +190,13 @@ class BusTester:
         return (len(sizes) * _FRAME_BITS + sum(sizes) + stuff_bits) / self.port.bitrate_bps
 
     @contextmanager
-    def hearing_feedback(self) -> Iterator[None]:
+    def collecting_feedback(self) -> Iterator[None]:
         """General feedback is heard inside the `with`, as that of an application is waited for."""
-        before, self.hears_feedback = self.hears_feedback, True
+        before, self.collects_feedback = self.collects_feedback, True
         try:
             yield
         finally:
-            self.hears_feedback = before
+            self.collects_feedback = before
 
     @contextmanager
     def disturb(self, *faults: LineFault) -> Iterator[None]:
@@ -286,15 +286,15 @@ class BusTester:
         copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
         for _ in range(copies):
             heard = self._decoder.feed(frame, at)
-            self._received.extend(filter(self._is_heard, heard))
+            self._received.extend(filter(self._is_collected, heard))
 
-    def _is_heard(self, one: Received) -> bool:
-        if one.kind is MessageKind.FEEDBACK and not self.hears_feedback:
+    def _is_collected(self, one: Received) -> bool:
+        if one.kind is MessageKind.FEEDBACK and not self.collects_feedback:
             is_late = one.first_at - self._written_at > self.profile.limit("feedback_s")
             if self._feedback_due and not is_late:
                 self._feedback_due -= 1
                 return False
-        return self.hears_application or one.kind is not MessageKind.APPLICATION
+        return self.collects_application or one.kind is not MessageKind.APPLICATION
 
     def _send_disturbed(self, frame: RawFrame) -> None:
         fault = self._faults.get((False, self.frames_sent - self._fault_origin[0]))

@@ -152,7 +152,7 @@ def version_in(image: bytes) -> str | None:
     return found.pop().decode("ascii") if len(found) == 1 else None
 
 
-def filled_up(frames: Sequence[RawFrame], filler: int = 0) -> list[RawFrame]:
+def padded_to_frame(frames: Sequence[RawFrame], filler: int = 0) -> list[RawFrame]:
     """The frames, the last one filled up to 8 bytes."""
     last = frames[-1]
     return [*frames[:-1], last._replace(data=last.data.ljust(FRAME_BYTES, bytes((filler,))))]
@@ -176,7 +176,7 @@ _TARGETS: Final = {
 TARGET_NAMES: Final = tuple(_TARGETS)
 
 
-def told_version(target: str, image: bytes) -> str | None:
+def reported_version(target: str, image: bytes) -> str | None:
     """The version by which a device tells that it runs `image`; None where it cannot."""
     return version_in(image) if _TARGETS[target].has_version_query else None
 

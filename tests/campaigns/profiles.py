@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Final
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.init import ask
+from flasher.conformance.init import ask_device
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import FINAL_IMAGE_OK, CaseVerdict
@@ -67,7 +67,7 @@ def some_device(seed: str) -> tuple[str, DeviceProfile]:
 def faults(seed: str, selection: Selection = Selection()) -> list[str]:  # noqa: B008  frozen
     """What is wrong with the profile that this device's answers give, by these cases."""
     target, device = some_device(seed)
-    asked = ask(MockSubject(target, profile=device), ConformanceProfile())
+    asked = ask_device(MockSubject(target, profile=device), ConformanceProfile())
     if asked.stopped:
         return [asked.stopped]
     own = profile_of_mock(device)

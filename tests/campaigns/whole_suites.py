@@ -12,10 +12,10 @@ import traceback
 from functools import partial
 from typing import Final
 
-from flasher.conformance.catalogue import CASES, WEAR, in_order
+from flasher.conformance.catalogue import CASES, WEAR, catalogue_order
 from tests.conformance import test_gaps, test_init, test_other_device
 
-_CASES: Final = tuple(in_order(CASES))
+_CASES: Final = tuple(catalogue_order(CASES))
 _CHECKS: Final = (
     *(partial(test_gaps.check_bare_bench, *bench, _CASES) for bench in test_gaps.BENCHES),
     partial(test_gaps.check_full_bench, _CASES),

@@ -7,7 +7,7 @@ from dataclasses import fields
 import pytest
 
 from flasher.conformance.catalogue import CASES, case
-from flasher.conformance.clauses import CLAUSES, READINGS, contents
+from flasher.conformance.clauses import CLAUSES, READINGS, clause_texts
 from flasher.conformance.profile import profile_keys
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import TARGETS
@@ -23,7 +23,7 @@ def test_a_case_cannot_name_a_clause_that_does_not_exist() -> None:
 
 
 def test_every_clause_of_the_document_that_is_listed_has_a_case() -> None:
-    named = {label for one in CASES.values() for label in contents(one.clause)}
+    named = {label for one in CASES.values() for label in clause_texts(one.clause)}
     assert [label for label in CLAUSES if label[0] != "R" and label not in named] == []
 
 
@@ -35,7 +35,7 @@ def test_the_document_of_the_readings_is_drawn_from_them() -> None:
 
 
 def test_every_reading_has_a_case_or_a_test_that_exists() -> None:
-    named = {label for one in CASES.values() for label in contents(one.clause)}
+    named = {label for one in CASES.values() for label in clause_texts(one.clause)}
     assert [number for number in READINGS if number not in {*named, *HOLDERS}] == []
     for test in (test for tests in HOLDERS.values() for test in tests):
         path, _, name = test.partition("::")

@@ -11,7 +11,7 @@ import pytest
 
 from flasher.conformance.explore import Explorer, ExploreResult
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
-from flasher.conformance.explore.stimuli import REFUSED, TransferPosition, make
+from flasher.conformance.explore.stimuli import REFUSED, TransferPosition, make_stimulus
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.restore import BY_NOTHING, restore
@@ -93,8 +93,8 @@ def test_pairs_of_phase_and_step_that_were_never_met_are_told() -> None:
     explored = _explorer().explore(5)
     met = {(phase, step) for phase, step, count in explored.coverage if count}
     assert met
-    assert met.isdisjoint(explored.never)
-    assert len(met) + len(explored.never) == len(reachable_pairs())
+    assert met.isdisjoint(explored.not_covered)
+    assert len(met) + len(explored.not_covered) == len(reachable_pairs())
 
 
 def test_what_is_transferred_and_does_not_run_is_never_completed() -> None:
@@ -156,7 +156,7 @@ def test_every_step_is_written_and_read() -> None:
 
 def test_no_two_messages_that_are_refused_are_the_same_and_none_is_the_right_one() -> None:
     place = TransferPosition(Encoder("bms"), filler(640), 2, 0x20000)
-    made = {name: make(name, place) for name in REFUSED}
+    made = {name: make_stimulus(name, place) for name in REFUSED}
     sent = {name: tuple(refused.frames) for name, refused in made.items()}
     assert len(set(sent.values())) == len(sent)
     right = {

@@ -16,7 +16,7 @@ from flasher.conformance.explore.walk import Walk
 from flasher.conformance.init.answers import Trial
 from flasher.conformance.init.session import InitSession
 from flasher.conformance.init.transfer_questions import in_forms
-from flasher.conformance.profile import words
+from flasher.conformance.profile import choice_words
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.conformance.wire import Encoder
@@ -62,7 +62,7 @@ def test_a_form_that_is_added_is_sent_in_walks() -> None:
 
 @each("key", KEYS)
 def test_a_walk_judges_by_the_profile_as_a_case_does(key: str) -> None:
-    _, not_taken = words(key)
+    _, not_taken = choice_words(key)
     stated = replace(PROFILE, given={**PROFILE.given, key: not_taken})
     steps = [*START, f"packet-open={key}-0"]
     found = Explorer(subject(), stated).replay(steps).finding

@@ -11,13 +11,13 @@ from dataclasses import replace
 import pytest
 
 from flasher.conformance.catalogue import (
-    BARE,
     CASES,
     FULL_BENCH,
+    MISSING_ON_BARE_BENCH,
     Selection,
-    gaps,
-    in_order,
-    lacking,
+    bench_gaps,
+    catalogue_order,
+    missing_requirements,
 )
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
@@ -29,7 +29,7 @@ from tests.loops import each
 
 AREA_BYTES = 34 * 1024
 LONGEST = ("CR-01", "CR-02", "TX-07", "TM-05", "BU-01", "PW-01", "SE-01", "SE-03", "CO-01")
-SHORT = [case_id for case_id in in_order(CASES) if case_id not in LONGEST]
+SHORT = [case_id for case_id in catalogue_order(CASES) if case_id not in LONGEST]
 BENCHES = [("bms", 0), ("bms", AREA_START), ("wmc", AREA_START)]
 """Targets, with the address by which the bench knows the memory that the application tells."""
 
@@ -57,7 +57,7 @@ def check_bare_bench(target: str, address: int, cases: Sequence[str]) -> None:
     subject = bare(target)
     given = profile_of_mock(subject.device.profile).given
     profile = ConformanceProfile({**given, "device.application_address": address})
-    foreseen = gaps(lacking(subject, profile), cases)
+    foreseen = bench_gaps(missing_requirements(subject, profile), cases)
     selection = Selection(cases=(*cases, "BU-07"))
     report = run(subject, profile, selection=selection, options=RunOptions(upgrades=4))
     assert report.gaps == foreseen
@@ -99,8 +99,11 @@ def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
 
 
 def test_more_of_a_bench_judges_more() -> None:
-    chosen = in_order(CASES)
-    bare_bench, full_bench = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
+    chosen = catalogue_order(CASES)
+    bare_bench, full_bench = (
+        bench_gaps(MISSING_ON_BARE_BENCH, chosen),
+        bench_gaps(set(MISSING_ON_BARE_BENCH).difference(FULL_BENCH), chosen),
+    )
     assert [gap.requirement for gap in bare_bench[:4]] == [need.value for need in FULL_BENCH]
     assert [gap.remedy for gap in bare_bench[:2]] == ["--power-cmd", "--readback-cmd"]
     assert "device.application_address" in bare_bench[2].remedy

@@ -12,8 +12,8 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.subject import open_subject
-from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, InitResult, ask
-from flasher.conformance.init.answers import Trial, decided, limit
+from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, InitResult, ask_device
+from flasher.conformance.init.answers import Trial, decide, limit_answer
 from flasher.conformance.mock import (
     GOOD_IMAGE,
     MOCK_PROFILE,
@@ -178,14 +178,14 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
     assert max(map(len, words.values())) == 3
     chosen = {key: each[turn % len(each)] for key, each in words.items()}
     options: dict[str, Any] = {CHOICES[key]: value for key, value in chosen.items()}
-    asked = ask(mock(**options), ConformanceProfile())
+    asked = ask_device(mock(**options), ConformanceProfile())
     wanted = {
         key: OTHER_WORDS.get((key, value)) or OTHER_WORDS.get(value) or value
         for key, value in chosen.items()
     }
     found = values(asked)
     assert {key: found[key] for key in wanted} == wanted
-    assert set(asked.open) - {"limits.pause_s"} == OPEN
+    assert set(asked.open_keys) - {"limits.pause_s"} == OPEN
 
 
 @pytest.mark.slow
@@ -235,41 +235,41 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
     ],
 )
 def test_other_ways_are_seen(make: Callable[[], Subject], wanted: dict[str, Any]) -> None:
-    found = values(ask(make(), ConformanceProfile()))
+    found = values(ask_device(make(), ConformanceProfile()))
     assert {key: found[key] for key in wanted} == wanted
 
 
 @pytest.mark.slow
 def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
-    slow = values(ask(bench(SlowBursts("bms", capacity_bytes=3000)), ConformanceProfile()))
+    slow = values(ask_device(bench(SlowBursts("bms", capacity_bytes=3000)), ConformanceProfile()))
     assert slow["limits.ack_s"] > 3 * 0.4
     assert slow["limits.complete_s"] > 3 * 6.0
     assert slow["limits.first_version_s"] > 3 * 1.0
     erasing = mock(erase_time_s=0.1, transfer_timeout_s=12.5, window_s=0.321)
-    found = values(ask(erasing, ConformanceProfile()))
+    found = values(ask_device(erasing, ConformanceProfile()))
     assert found["limits.erase_s"] > AREA_BYTES / 2048 * 0.1  # the largest image
     assert found["limits.pause_s"] == 12.5
     assert found["limits.window_s"] == pytest.approx(0.32, abs=0.002)
 
 
 def test_a_limit_has_its_margin_and_says_it() -> None:
-    found = limit("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
+    found = limit_answer("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
     assert found.value == 0.64
     assert found.seen == (
         "measured 2 times, at most 210.0 ms; the limit is 3 times that, and 0.1 s at the least"
     )
-    assert limit("limits.ack_s", [], 0.1, 0.0).value is None
+    assert limit_answer("limits.ack_s", [], 0.1, 0.0).value is None
 
 
 def test_what_differs_is_either_or_stays_open() -> None:
     trials = [Trial(value, value.upper(), "it") for value in ("nak", "silence", "nak")]
-    assert decided("up_02", trials).value == "either"
+    assert decide("up_02", trials).value == "either"
     own = [Trial(value, value.upper(), "it") for value in ("crc32", "none", "crc32")]
-    assert decided("en_04", own).value is None
-    assert decided("en_04", own).seen == (
+    assert decide("en_04", own).value is None
+    assert decide("en_04", own).seen == (
         "it differs: CRC32 to it, 2 of 3 times; NONE to it, 1 of 3 times"
     )
-    unheard = decided("tx_03", [Trial("", "COMPLETE", "it")])
+    unheard = decide("tx_03", [Trial("", "COMPLETE", "it")])
     assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"
 
 
@@ -284,7 +284,7 @@ def check_python_bootloader(cases: Sequence[str]) -> None:
     """It passes these cases by the profile that its answers give."""
     what, start = "tests.peers.python_bootloader:PythonBootloader", ConformanceProfile()
     with open_subject(what, "bms", start, good_image=None, second_image=None) as (subject, _):
-        profile = ask(subject, start).profile(start)
+        profile = ask_device(subject, start).profile(start)
         report = run(subject, profile, selection=Selection(cases=tuple(cases)))
     assert profile.choice("up_05") == "each"
     assert profile.value("device.largest_image_bytes") == 0xF000
@@ -302,7 +302,7 @@ def test_only_the_good_image_is_completed_and_it_is_there_in_the_end() -> None:
     subject = mock(Witness)
     assert isinstance(subject.device, Witness)
     subject.device.completed = set()
-    values(ask(subject, ConformanceProfile()))
+    values(ask_device(subject, ConformanceProfile()))
     assert subject.device.completed == {GOOD_IMAGE}
     assert subject.device.stored_image == GOOD_IMAGE
 
@@ -311,7 +311,7 @@ def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
     subject = mock(DeafDevice)
     assert isinstance(subject.device, DeafDevice)
     subject.device.hangs = subject.device.hangs_for_good = True
-    asked = ask(subject, ConformanceProfile())
+    asked = ask_device(subject, ConformanceProfile())
     assert not asked.was_brought_up
     assert asked.stopped.startswith("before the first question, the device could not be brought")
 
@@ -323,7 +323,7 @@ def test_one_that_is_stopped_has_its_good_image() -> None:
         calls.append(1)
         return len(calls) > 3000
 
-    asked = ask(subject, ConformanceProfile(), stopped=stopped)
+    asked = ask_device(subject, ConformanceProfile(), stopped=stopped)
     assert asked.stopped == "the run was stopped"
     assert subject.device.stored_image == GOOD_IMAGE
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import flasher.conformance.cases  # noqa: F401  registers the cases
 from flasher.conformance.bench import Bench
-from flasher.conformance.catalogue import CASES, Case, group_of, what_is_missing
+from flasher.conformance.catalogue import CASES, Case, group_of, why_unsupported
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
@@ -47,7 +47,7 @@ def verdicts(
 
 def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> CaseVerdict:
     """As a run of this case alone, but for what a run does afterwards."""
-    if what_is_missing(case, subject, profile):
+    if why_unsupported(case, subject, profile):
         return CaseVerdict.UNSUPPORTED
     bench = Bench(subject, profile, limit_s=case.limit_s, seed=f"1/{case.id}/1")
     _put_image(subject)

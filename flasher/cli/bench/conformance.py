@@ -47,19 +47,19 @@ from flasher.cli.framework import (
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.conformance.catalogue import (
-    BARE,
     BRING_UP,
     CASES,
     FULL_BENCH,
     GROUPS,
+    MISSING_ON_BARE_BENCH,
     WEAR,
     Selection,
+    bench_gaps,
     case_text,
-    gaps,
-    in_order,
-    in_part_without,
+    catalogue_order,
+    full_verdict_needs,
     known_cases,
-    lacking,
+    missing_requirements,
 )
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
 from flasher.conformance.json_report import ReportDocument
@@ -272,7 +272,7 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
         opened(described, output) as (subject, profile, stopped),
         progress(output) as observer,
     ):
-        missing = gaps(lacking(subject, profile), chosen.selection.chosen())
+        missing = bench_gaps(missing_requirements(subject, profile), chosen.selection.chosen())
         for line in gap_lines("this bench", missing) if missing else ():
             output.progress(line)
         report = run(
@@ -419,13 +419,13 @@ def _list(selection: Selection, output: Output) -> int:
 
     selection.check()
     # Those that run only when they are named have to be found somewhere.
-    chosen = in_order(known_cases()) if selection == Selection() else selection.chosen()
+    chosen = catalogue_order(known_cases()) if selection == Selection() else selection.chosen()
     texts = [case_text(case_id, ConformanceProfile()) for case_id in chosen]
     found = [
         document_of(
             ListedCase,
             text,
-            in_part_without=in_part_without(text.id),
+            in_part_without=full_verdict_needs(text.id),
             choices=tuple(text.choices),
             can_be_run=text.id in CASES,
             only_when_named=text.id in WEAR,
@@ -433,7 +433,10 @@ def _list(selection: Selection, output: Output) -> int:
         for text in texts
     ]
     output.results(list_lines(found, verbose=output.verbosity > 0))
-    bare, full = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
+    bare, full = (
+        bench_gaps(MISSING_ON_BARE_BENCH, chosen),
+        bench_gaps(set(MISSING_ON_BARE_BENCH).difference(FULL_BENCH), chosen),
+    )
     for name, missing in (
         ("a bare bench (device, adapter, good image)", bare),
         ("a full bench (with power, readback and a second image)", full),

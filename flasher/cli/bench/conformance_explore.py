@@ -162,9 +162,9 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
         f"{printable(explored.seed)}"
     )
     output.result(f"{met} of {len(explored.coverage)} pairs of phase and step were met")
-    if explored.never and output.verbosity > 0:
-        for phase in dict.fromkeys(phase for phase, _ in explored.never):
-            names = [name for its, name in explored.never if its == phase]
+    if explored.not_covered and output.verbosity > 0:
+        for phase in dict.fromkeys(phase for phase, _ in explored.not_covered):
+            names = [name for its, name in explored.not_covered if its == phase]
             output.result(f"  never in the phase {phase}: {', '.join(names)}")
     found = None
     if finding is not None:

@@ -91,7 +91,7 @@ def init(
     """Ask a device everything that a profile says, on the bus alone, and write the profile with
     what was seen. The good image runs before and after it.
     """
-    from flasher.conformance.init import UPGRADES, ask  # noqa: PLC0415  much is loaded
+    from flasher.conformance.init import UPGRADES, ask_device  # noqa: PLC0415  much is loaded
     from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
 
     described = bench.described(bus)
@@ -106,7 +106,7 @@ def init(
         opened(described, output) as (subject, _, stopped),
         Bar(output, leave=False, unit=" questions") as bar,
     ):
-        asked = ask(subject, start, stopped=stopped, progress=bar.move_to)
+        asked = ask_device(subject, start, stopped=stopped, progress=bar.move_to)
         was_stopped = stopped()
     rows = []
     for one in asked.answers:
@@ -126,13 +126,13 @@ def init(
         output.error_line(f"no profile is written: {printable(asked.stopped)}")
     else:
         head = f"# What {printable(asked.subject)} answered, target {asked.target}."
-        toml = head + "\n" + asked.profile(start).to_toml(asked.open)
+        toml = head + "\n" + asked.profile(start).to_toml(asked.open_keys)
         check_new(path, _OUTPUT, force=force)
         write_whole(path, toml.encode("utf-8"), _OUTPUT)
-        count = len(asked.answers)
+        total, still_open = len(asked.answers), len(asked.open_keys)
         output.result(
-            f"{printable(str(path))}: {count - len(asked.open)} of {count} keys, each with what "
-            f"was seen; {len(asked.open)} stay open"
+            f"{printable(str(path))}: {total - still_open} of {total} keys, each with its "
+            f"observations; {still_open} stay open"
         )
     return output.document(
         document_of(

@@ -23,9 +23,9 @@ How to write a case
 - Before a case the application of `bench.good_image` runs. After it the runner brings the device
   back to that, whatever state it was left in; a case need not tidy up. One that may erase says
   DESTRUCTIVE. Only good images are ever ended: a transfer of `bench.filler(n)` is left as it is.
-- Never import from flasher.protocol, host, image or mock: bytes come from `bench.encoder` and
-  `conformance.wire`, what is received too; with `bench.tester.hears_application` so does what the
-  application sends to other nodes. Faults: `with bench.disturb(Fault(...))` on the line;
+- Never import from flasher.protocol, host, image or mock: use `bench.encoder` and
+  `conformance.wire` to send and receive. `bench.tester.collects_application` adds the messages of
+  the application to other nodes. Faults: `with bench.disturb(LineFault(...))` on the line;
   `power_cycle`, `subject.bus_off`, `subject.cut_in_operation` at the device, each with its
   requirement.
 - `check` records and goes on, `require` and `expect` end the case; texts say what is expected and

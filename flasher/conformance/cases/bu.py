@@ -171,16 +171,16 @@ def bus_off(bench: Bench) -> None:
 def same_id(bench: Bench) -> None:
     image = bench.good_image
     with bench.step("to the application"):
-        _say_as_device(bench)
+        _answer_as_device(bench)
         bench.check_application()
     with bench.step("to the announcing bootloader"):
         bench.reset_to_bootloader()
-        _say_as_device(bench)
+        _answer_as_device(bench)
         bench.update(len(image))
     with bench.step("in the transfer"):
         for number in range(1, packet_count(len(image)) + 1):
             if number <= _REPORTS_AT_ONCE:
-                _say_as_device(bench)
+                _answer_as_device(bench)
             bench.packet(image, number)
         bench.end_transfer()
         bench.check_image(image)
@@ -263,7 +263,7 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
                 heard = bench.wait_for(MessageKind.ACK, MessageKind.NAK)
             last = ""
             if heard is None or heard.kind is not MessageKind.ACK or heard.number != number:
-                last = bench.host.insist_on_packet(image, number, began_at)
+                last = bench.host.deliver_packet(image, number, began_at)
             if last.startswith(MessageKind.BOOT_VERSION.value):
                 bench.info(f"the device restarts: {disturbance.name}")
                 return False
@@ -292,7 +292,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     if heard is not None and heard.kind is MessageKind.COMPLETE:
         return True
     with bench.step("; ".join(names) or "end of transfer"):
-        done = bench.host.insist_on_end(image)
+        done = bench.host.deliver_end(image)
     if not done.ok:
         bench.info(f"{done.reason}: {'; '.join(names)}")
     return "refused" not in done.reason
@@ -301,7 +301,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
 # -- another device -------------------------------------------------------------------------------
 
 
-def _say_as_device(bench: Bench) -> None:
+def _answer_as_device(bench: Bench) -> None:
     """Send complete answers, and the first frame of one, on the device's own id."""
     answer = bench.encoder.answer
     for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):

@@ -45,7 +45,7 @@ _LOADED_PACKETS: Final = 24
 _BABBLE_ID: Final = 0x001
 _BABBLE_S: Final = 1.0
 _BABBLE_BURST: Final = 16
-_BABBLE_SHORTLY: Final = 10 * (RawFrame(_BABBLE_ID, bytes(8)),)
+_SHORT_BABBLE: Final = 10 * (RawFrame(_BABBLE_ID, bytes(8)),)
 
 _REPORTS: Final = (
     # Of the motor controller.
@@ -110,7 +110,7 @@ def load(bench: Bench) -> None:
             bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
         bench.send(_under_load(bench.encoder.reset()))
         _expect_under_load(bench, MessageKind.BOOT_VERSION)
-        bench.wait_to_be_heard()
+        bench.wait_until_listening()
     with bench.step("update command under load"):
         bench.send(_under_load(bench.encoder.update(len(image))))
         _expect_under_load(bench, MessageKind.REQUEST)
@@ -125,11 +125,11 @@ def load(bench: Bench) -> None:
         _babble(bench)
         heard_all = bench.collect(bench.limit("ack_s"))
         if not any(one.kind is MessageKind.ACK and one.number == loaded for one in heard_all):
-            trouble = bench.host.insist_on_packet(image, loaded, began_at)
+            trouble = bench.host.deliver_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
     with bench.step("end of transfer, the bus taken behind it"):
         bench.packets(image, loaded + 1)
-        bench.send([*bench.encoder.end(), *_BABBLE_SHORTLY])
+        bench.send([*bench.encoder.end(), *_SHORT_BABBLE])
         bench.expect(MessageKind.COMPLETE)
         bench.check_image(image)
 
@@ -150,15 +150,15 @@ def two_upgrades(bench: Bench) -> None:
     for other in bench.encoder.others():
         with bench.step(f"beside the {other.target.upper()}"):
             bench.reset_to_bootloader()
-            bench.wait_to_be_heard()
-            _between(bench, bench.encoder.update(len(image)), other.update(len(image)))
+            bench.wait_until_listening()
+            _send_interleaved(bench, bench.encoder.update(len(image)), other.update(len(image)))
             bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
                 # The other's packet has other data; its next one comes alone.
                 inverse = inverted(packet_payload(image, number))
                 own = bench.encoder.packet_of(image, number)
-                _between(bench, own, other.packet(number, total, inverse))
+                _send_interleaved(bench, own, other.packet(number, total, inverse))
                 bench.expect(MessageKind.ACK, number=number)
                 bench.send(other.answer(ACK, number.to_bytes(2, "little")))
                 if number < total:
@@ -186,7 +186,7 @@ def two_upgrades(bench: Bench) -> None:
 def application_traffic(bench: Bench) -> None:
     image = bench.good_image
     total = packet_count(len(image))
-    traffic = list(_traffic(bench.encoder))
+    traffic = list(_chapter_3_frames(bench.encoder))
     with bench.step("during the announcements"):
         bench.reset_to_bootloader()
         bench.send(traffic)
@@ -234,7 +234,7 @@ def _babble(bench: Bench) -> None:
 # -- another upgrade ------------------------------------------------------------------------------
 
 
-def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) -> None:
+def _send_interleaved(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) -> None:
     """Send the frames of two messages alternately; the device's own message ends last."""
     frames: list[RawFrame] = []
     for index in range(max(len(own), len(others))):
@@ -246,7 +246,7 @@ def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) 
 # -- chapter 3 ------------------------------------------------------------------------------------
 
 
-def _traffic(encoder: Encoder) -> Iterator[RawFrame]:
+def _chapter_3_frames(encoder: Encoder) -> Iterator[RawFrame]:
     """The messages of chapter 3, without those that the device itself sends."""
     for can_id, mode, command, data in _REPORTS:
         if can_id & 0x0F0 != encoder.to_all & 0x0F0:

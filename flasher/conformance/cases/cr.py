@@ -41,15 +41,15 @@ _FIELDS: Final = (
     ("tail", 143, 144),
 )
 """The fields of a packet: name, first byte, byte behind the last."""
-_LIKE_PACKETS: Final = range(6, 143)
+_PACKET_LIKE_BYTES: Final = range(6, 143)
 """Bytes whose damage leaves a message of the same size and kind: it is over with its last frame."""
-_CALM: Final = bytes(byte for byte in range(256) if byte not in b"\x55\xaa\xf0")
+_NO_HEADER_BYTES: Final = bytes(byte for byte in range(256) if byte not in b"\x55\xaa\xf0")
 """Bytes that a single flip does not make a header of, as it takes two."""
 _BURST_BITS: Final = 8
 _BURSTS: Final = 250
 _SILENT_BATCH: Final = 16
 """Damaged packets in a row, where a device does not answer them."""
-_CALM_BYTES: Final = 16 * PACKET_BYTES
+_NO_HEADER_SIZE: Final = 16 * PACKET_BYTES
 _DOCUMENT_SIZE: Final = 78351
 Damage = tuple[str, Callable[[bytes], bytes]]
 """What is done to a packet, by name, and the function from its bytes to the damaged ones."""
@@ -65,14 +65,14 @@ Damage = tuple[str, Callable[[bytes], bytes]]
     limit_s=1800.0,
 )
 def single_bits(bench: Bench) -> None:
-    probe = _calm_probe(bench)
+    probe = _probe_without_headers(bench)
     probe.begin()
     for name, first, behind in _FIELDS:
         with bench.step(name):
             bits = range(8 * first, 8 * behind)
             flips = [(f"bit {bit % 8} of byte {bit // 8}", _flipping(bit, 1)) for bit in bits]
-            _check_none_taken(bench, probe, flips, framed=first in _LIKE_PACKETS)
-    probe.plain()
+            _check_none_accepted(bench, probe, flips, framed=first in _PACKET_LIKE_BYTES)
+    probe.send_next()
     probe.check_stored()
 
 
@@ -87,11 +87,11 @@ def single_bits(bench: Bench) -> None:
     limit_s=1800.0,
 )
 def bursts(bench: Bench) -> None:
-    probe = _calm_probe(bench)
+    probe = _probe_without_headers(bench)
     probe.begin()
     with bench.step("bursts"):
         chosen = [_burst(bench) for _ in range(_BURSTS)]
-        _check_none_taken(bench, probe, chosen, framed=True)
+        _check_none_accepted(bench, probe, chosen, framed=True)
     with bench.step("frames"):
         # Those after which no intact packet is left: the first or the last frame doubled leaves
         # one, and behind the last frame there is none to swap it with.
@@ -109,9 +109,9 @@ def bursts(bench: Bench) -> None:
             with bench.disturb(fault):
                 bench.send(frames)
                 heard = bench.collect(probe.settle_s())
-            _require_none_taken(bench, f"a packet whose {fault}", heard)
+            _require_none_accepted(bench, f"a packet whose {fault}", heard)
         bench.succeed(f"none of {len(faults)} packets is accepted", "none was")
-    probe.plain()
+    probe.send_next()
     probe.check_stored()
 
 
@@ -129,12 +129,12 @@ def other_checksums(bench: Bench) -> None:
     kinds = list(_wrong_checksums(bench))
     update = joined(bench.encoder.update(len(probe.image)))
     with bench.step("update commands"):
-        probe.enter_past(*(bench.encoder.frames(damage(update)) for _, damage in kinds))
-    probe.plain()
+        probe.enter_after_rejected(*(bench.encoder.frames(damage(update)) for _, damage in kinds))
+    probe.send_next()
     for kind in kinds:
         with bench.step(f"packet, {kind[0]}"):
-            _check_none_taken(bench, probe, [kind], framed=True)
-    probe.plain()
+            _check_none_accepted(bench, probe, [kind], framed=True)
+    probe.send_next()
     probe.check_stored()
 
 
@@ -155,7 +155,7 @@ def vectors(bench: Bench) -> None:
         exact.enter(encoder.update(len(image)))
         bench.packets(image)
         bench.send(exact.frames("end"))
-        exact.hear("complete", limit("complete_s"))
+        exact.expect("complete", limit("complete_s"))
         runs = bench.application_runs()  # which one it is, is EN-08
         bench.check(runs, "the application runs", "it answers" if runs else "no answer")
     with bench.step("beginning of an upgrade"):
@@ -168,9 +168,9 @@ def vectors(bench: Bench) -> None:
         if bench.choice("tx_01") != "silence":
             damaged = packet[3]._replace(data=bytes(8))
             bench.send([*packet[:3], damaged, *packet[4:]])
-            exact.hear_first_nak(limit("ack_s"))
+            exact.expect_first_nak(limit("ack_s"))
         bench.send(packet)
-        exact.hear("ack", limit("ack_s"))
+        exact.expect("ack", limit("ack_s"))
 
 
 # -- written-out messages --------------------------------------------------------------------------
@@ -245,11 +245,11 @@ class _WrittenMessages:
         """A written-out message."""
         return self._bench.encoder.frames(self._written[name])
 
-    def hear(self, name: str, within_s: float) -> None:
+    def expect(self, name: str, within_s: float) -> None:
         """Require that the next message is the written-out one."""
         self._judge(name, self._written[name], self._bench.next_message(within_s))
 
-    def hear_first_nak(self, within_s: float) -> None:
+    def expect_first_nak(self, within_s: float) -> None:
         """Require the same of NAK 1. Whether a NAK comes, and with which number, is TX-01."""
         heard = self._bench.next_message(within_s)
         if (
@@ -267,7 +267,7 @@ class _WrittenMessages:
         bench, encoder, limit = self._bench, self._bench.encoder, self._bench.limit
         bench.forget()
         is_own = (encoder.reset_command, encoder.reset_data) != (RESET, RESET_TEXT)
-        with bench.tester.hearing_feedback():
+        with bench.tester.collecting_feedback():
             bench.send(encoder.reset() if is_own else self.frames("reset"))
             heard = bench.next_message(limit("first_version_s"))
         if (
@@ -302,9 +302,11 @@ class _WrittenMessages:
 # -- damage ---------------------------------------------------------------------------------------
 
 
-def _calm_probe(bench: Bench) -> Probe:
+def _probe_without_headers(bench: Bench) -> Probe:
     """A probe whose data has no bytes that one flipped bit turns into a header."""
-    return Probe(bench, bytes(bench.random.choice(_CALM) for _ in range(_CALM_BYTES)))
+    return Probe(
+        bench, bytes(bench.random.choice(_NO_HEADER_BYTES) for _ in range(_NO_HEADER_SIZE))
+    )
 
 
 def _flipping(first_bit: int, pattern: int) -> Callable[[bytes], bytes]:
@@ -321,8 +323,8 @@ def _burst(bench: Bench) -> Damage:
     """A burst of 2 to 8 bits, its first and last one flipped, where the rest stays a packet."""
     length = bench.random.randint(2, _BURST_BITS)
     pattern = 1 | 1 << length - 1 | bench.random.getrandbits(length)
-    last = 8 * _LIKE_PACKETS.stop - length
-    first_bit = bench.random.randint(8 * _LIKE_PACKETS.start, last)
+    last = 8 * _PACKET_LIKE_BYTES.stop - length
+    first_bit = bench.random.randint(8 * _PACKET_LIKE_BYTES.start, last)
     return f"pattern {pattern:b} from bit {first_bit} on", _flipping(first_bit, pattern)
 
 
@@ -358,7 +360,7 @@ def _with_crc(field: bytes) -> Callable[[bytes], bytes]:
 # -- judging --------------------------------------------------------------------------------------
 
 
-def _check_none_taken(
+def _check_none_accepted(
     bench: Bench, probe: Probe, damages: Sequence[Damage], *, framed: bool
 ) -> None:
     """Send the next packet damaged in these ways. The first one that is acknowledged ends the case,
@@ -376,7 +378,7 @@ def _check_none_taken(
         probe.keep_alive()
         bench.send(bench.encoder.frames(damage(probe.raw())))
         heard = bench.collect(max(bench.limit("ack_s"), probe.settle_s()))
-        _require_none_taken(bench, f"a packet with {name}", heard)
+        _require_none_accepted(bench, f"a packet with {name}", heard)
         answers = bool(heard)
     size = _SILENT_BATCH if framed and not answers else 1
     for start in range(0, len(left), size):
@@ -392,12 +394,12 @@ def _check_none_taken(
             heard = bench.collect(probe.settle_s())
         first, last = batch[0][0], batch[-1][0]
         told = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
-        _require_none_taken(bench, f"a packet with {told}", heard)
-    _require_none_taken(bench, "the last ones", bench.collect(probe.settle_s()))
+        _require_none_accepted(bench, f"a packet with {told}", heard)
+    _require_none_accepted(bench, "the last ones", bench.collect(probe.settle_s()))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
 
 
-def _require_none_taken(bench: Bench, what: str, heard: Sequence[Received]) -> None:
+def _require_none_accepted(bench: Bench, what: str, heard: Sequence[Received]) -> None:
     """NAK or silence; which of them, with which number, is TX-01."""
     if any(one.kind is not MessageKind.NAK for one in heard):
         bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003

@@ -97,7 +97,7 @@ def end_early_and_twice(bench: Bench) -> None:
                 done += 1
             else:
                 bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
-                _begin_anew(bench, image, stored, heard)
+                _restart_transfer(bench, image, stored, heard)
     bench.packets(image, done + 1)
     for mark in _WRONG_MARKS:
         with bench.step(f"end of transfer with {mark:02X}"):
@@ -111,7 +111,7 @@ def end_early_and_twice(bench: Bench) -> None:
                 MessageKind.ACK, MessageKind.NAK, unlike=lambda one: one.number < total
             )
             if known is None:
-                _begin_anew(bench, image, total)
+                _restart_transfer(bench, image, total)
             break
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
@@ -119,7 +119,9 @@ def end_early_and_twice(bench: Bench) -> None:
         bench.check_image(image)
 
 
-def _begin_anew(bench: Bench, image: bytes, stored: int, heard: Received | None = None) -> None:
+def _restart_transfer(
+    bench: Bench, image: bytes, stored: int, heard: Received | None = None
+) -> None:
     """Send the packets up to that one in a new transfer; `heard` was the last message."""
     bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
@@ -203,7 +205,7 @@ def in_a_row(bench: Bench) -> None:
                 within_s = bench.limit("start_s") + bench.limit("first_version_s")
                 deadline, heard = bench.now + within_s, None
                 while heard is None and bench.now < deadline:
-                    with bench.tester.hearing_feedback():
+                    with bench.tester.collecting_feedback():
                         bench.send(bench.encoder.reset())
                         kinds = (MessageKind.FEEDBACK, MessageKind.BOOT_VERSION)
                         heard = bench.wait_for(*kinds, within_s=_RESET_PERIOD_S)

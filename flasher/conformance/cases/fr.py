@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probe import ACCEPTED, EITHER, REJECTED, Probe, is_as
+from flasher.conformance.cases.probe import ACCEPTED, EITHER, REJECTED, Probe, complies
 from flasher.conformance.catalogue import DESTRUCTIVE, case
 from flasher.conformance.judge import Times
-from flasher.conformance.profile import words
+from flasher.conformance.profile import choice_words
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     END,
@@ -27,9 +27,9 @@ from flasher.conformance.wire import (
     MessageKind,
     RawFrame,
     build,
-    filled_up,
     joined,
     message_crc,
+    padded_to_frame,
 )
 
 _HEADER: Final = b"\x55\xaa"
@@ -115,7 +115,7 @@ def splits(bench: Bench) -> None:
     choices=("fr_02",),
 )
 def junk(bench: Bench) -> None:
-    in_frame = _wanted(bench, "fr_02")
+    in_frame = _expected_acceptance(bench, "fr_02")
     probe = Probe(bench)
     probe.begin()
     long_junk = bytes(bench.random.choice(b"\x00\x11\x16\xaa\xf0") for _ in range(_LONG_JUNK_BYTES))
@@ -139,7 +139,7 @@ def junk(bench: Bench) -> None:
     requires={DESTRUCTIVE},
 )
 def header_in_data(bench: Bench) -> None:
-    payloads = dict(_treacherous_payloads(bench))
+    payloads = dict(_payloads_like_messages(bench))
     total = len(payloads) + len(_CRCS) + 1  # the probe has some bytes more
     for wanted in _CRCS:
         number = len(payloads) + 1
@@ -167,7 +167,7 @@ def wrong_tail(bench: Bench) -> None:
     probe.begin()
     for tail in _WRONG_TAILS:
         with bench.step(f"packet that ends with {tail:02X}"):
-            probe.discard(bench.encoder.frames(probe.raw()[:-1] + bytes((tail,))))
+            probe.check_discarded(bench.encoder.frames(probe.raw()[:-1] + bytes((tail,))))
     _offer_forms(bench, probe, "fr_04")
     probe.check_stored()
 
@@ -198,7 +198,7 @@ def too_short(bench: Bench) -> None:
         with bench.step(name):
             bench.send(bench.encoder.frames(raw))
             bench.wait(probe.settle_s())
-            probe.plain()
+            probe.send_next()
         with bench.step(f"{name}, a packet at once"):
             frames = bench.encoder.frames(raw) + probe.frames()
             if probe.offer(frames, EITHER):
@@ -220,13 +220,13 @@ def wrong_length(bench: Bench) -> None:
     update = encoder.update_text + struct.pack("<I", len(probe.image))
     with bench.step("update command, length greater by 1 and 4, and less by 1"):
         wrong = (update + b"\x00", update + bytes(4), update[:-1])
-        probe.enter_past(*(encoder.message(WRITE, UPDATE, data) for data in wrong))
-    probe.plain()
+        probe.enter_after_rejected(*(encoder.message(WRITE, UPDATE, data) for data in wrong))
+    probe.send_next()
     for name, length, make in _WRONG_LENGTHS:
         with bench.step(name):
             body = bytes((WRITE, length)) + make(probe.raw()[6:-5])
             crc = message_crc(bench.encoder.to_device, body)
-            probe.discard(bench.encoder.frames(_HEADER + body + crc + b"\xf0"))
+            probe.check_discarded(bench.encoder.frames(_HEADER + body + crc + b"\xf0"))
     probe.check_stored()
 
 
@@ -240,25 +240,25 @@ def wrong_length(bench: Bench) -> None:
     choices=("fr_07", "up_04_burst"),
 )
 def padded(bench: Bench) -> None:
-    choice, probe = _wanted(bench, "fr_07"), Probe(bench, bench.filler(1))
+    choice, probe = _expected_acceptance(bench, "fr_07"), Probe(bench, bench.filler(1))
     for index, filler in enumerate(PADDINGS):
         with bench.step(f"update command padded with {filler:02X}"):
             # In the midst of a transfer where the device starts over, which takes no pause (UP-08).
             if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
             update = bench.encoder.update(len(probe.image))
-            probe.enter(filled_up(update, filler), choice, reset=not index)
-            probe.plain()
+            probe.enter(padded_to_frame(update, filler), choice, reset=not index)
+            probe.send_next()
     image = bench.good_image
     with bench.step("end of transfer padded with 00"):
-        bench.begin_anew(len(image))
+        bench.restart_transfer(len(image))
         bench.packets(image)
-        sent = bench.send(filled_up(bench.encoder.end()))
+        sent = bench.send(padded_to_frame(bench.encoder.end()))
         within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
             within_s = min(within_s, bench.limit("pause_s") / 2)
         heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
-        ok = is_as(choice, heard is not None)
+        ok = complies(choice, heard is not None)
         bench.check(ok, f"end of transfer {choice}", heard or "nothing")
         if heard is None:
             bench.end_transfer()
@@ -291,7 +291,7 @@ def back_to_back(bench: Bench) -> None:
         frames, number = probe.frames(), probe.number
         bench.send(bench.encoder.packet_of(probe.image, number - 1) + frames)
         first = bench.next_message(bench.limit("ack_s"))
-        allowed = bench.right_to_repetition(number - 1)
+        allowed = bench.repetition_answers(number - 1)
         bench.require(str(first) in allowed, " or ".join(allowed), first or "nothing")
         bench.expect(MessageKind.ACK, number=number)
 
@@ -349,24 +349,26 @@ def unknown(bench: Bench) -> None:
     update = encoder.update_text + struct.pack("<I", len(probe.image))
     with bench.step("while it announces itself"):
         modes = [encoder.message(mode, UPDATE, update) for mode in _UNKNOWN_MODES]
-        commands = [_of_command(bench, command) for command in _UNKNOWN_COMMANDS[:-1]]
-        probe.enter_past(*modes, *commands)
+        commands = [_write_of(bench, command) for command in _UNKNOWN_COMMANDS[:-1]]
+        probe.enter_after_rejected(*modes, *commands)
     for mode in _UNKNOWN_MODES:
         with bench.step(f"packet of mode {mode:02X}"):
-            probe.discard(encoder.message(mode, PACKET, probe.raw()[6:-5]))
+            probe.check_discarded(encoder.message(mode, PACKET, probe.raw()[6:-5]))
     for command in _UNKNOWN_COMMANDS:
         with bench.step(f"command {command:04X}"):
-            probe.discard(_of_command(bench, command))
+            probe.check_discarded(_write_of(bench, command))
     for command in _LONG_UNKNOWN:
         with bench.step(f"command {command:04X} with a packet at the start of a frame of it"):
             data = bytes(2) + probe.raw()
-            probe.discard(encoder.message(WRITE, command, data.ljust(command & 0xFF, b"\x00")))
+            probe.check_discarded(
+                encoder.message(WRITE, command, data.ljust(command & 0xFF, b"\x00"))
+            )
     probe.check_stored()
 
 
-def _wanted(bench: Bench, key: str) -> str:
+def _expected_acceptance(bench: Bench, key: str) -> str:
     """Whether the message that a choice of the profile is about has to be accepted."""
-    taken, not_taken = words(key)
+    taken, not_taken = choice_words(key)
     return {taken: ACCEPTED, not_taken: REJECTED}.get(bench.choice(key), EITHER)
 
 
@@ -375,10 +377,10 @@ def _offer_forms(bench: Bench, probe: Probe, key: str) -> None:
     for form in forms(bench.encoder)[key]:
         with bench.step(form.step):
             frames = bench.encoder.frames(form.before + probe.raw(), form.frame_bytes)
-            probe.offer(frames, _wanted(bench, key))
+            probe.offer(frames, _expected_acceptance(bench, key))
 
 
-def _of_command(bench: Bench, command: int) -> list[RawFrame]:
+def _write_of(bench: Bench, command: int) -> list[RawFrame]:
     """A write of that command; its data are zeros, as many as the command says."""
     return bench.encoder.message(WRITE, command, bytes(command & 0xFF))
 
@@ -418,7 +420,7 @@ def forms(encoder: Encoder) -> dict[str, list[PacketForm]]:
     }
 
 
-def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
+def _payloads_like_messages(bench: Bench) -> Iterator[tuple[str, bytes]]:
     """Data that looks like the beginning or the end of messages, whatever the frame boundaries."""
     encoder, to_device = bench.encoder, bench.encoder.to_device
     yield "55 AA all over", _HEADER * (PACKET_BYTES // 2)
@@ -456,15 +458,15 @@ def _data_for_crc(bench: Bench, number: int, total: int, wanted: bytes) -> bytes
     basis: dict[int, tuple[int, int]] = {}
     """By its highest bit: a change of the CRC, and the bits that make it."""
     for bit in range(8 * _FREE_BYTES):
-        change, bits = _reduced(crc_of(1 << bit) ^ plain, 1 << bit, basis)
+        change, bits = _reduce(crc_of(1 << bit) ^ plain, 1 << bit, basis)
         if change:
             basis[change.bit_length()] = (change, bits)
-    missing, free = _reduced(plain ^ int.from_bytes(wanted, "big"), 0, basis)
+    missing, free = _reduce(plain ^ int.from_bytes(wanted, "big"), 0, basis)
     assert not missing  # noqa: S101  the free bytes reach every CRC
     return start + free.to_bytes(_FREE_BYTES, "big")
 
 
-def _reduced(change: int, bits: int, basis: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
+def _reduce(change: int, bits: int, basis: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
     """A change of the CRC without what others make, and the bits that make the rest of it."""
     for top in sorted(basis, reverse=True):
         if change.bit_length() == top:

@@ -28,7 +28,7 @@ _QUIET_S: Final = 0.05
 """Behind an ACK, for what else is said to the same bytes (R10)."""
 
 
-def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
+def complies(wanted: str, taken: bool) -> bool:  # noqa: FBT001
     """True when a message that was taken, or not, complies with one of the three words above."""
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
@@ -63,7 +63,7 @@ class PacketTransfer:
         """Longer than a bootloader waits for the rest of a message."""
         return 2 * self.bench.limit("inter_frame_s")
 
-    def is_taken(self, heard: Received) -> bool:
+    def is_accepted(self, heard: Received) -> bool:
         """True for the ACK of the next packet."""
         return heard.kind is MessageKind.ACK and heard.number == self.number
 
@@ -81,7 +81,7 @@ class PacketTransfer:
         heard: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
             heard.append(one)
-            if self.is_taken(one):
+            if self.is_accepted(one):
                 return heard + bench.collect(_QUIET_S)
         return heard
 
@@ -113,18 +113,18 @@ class Probe(PacketTransfer):
         bench = self.bench
         if reset:
             bench.reset_to_bootloader()
-            bench.wait_to_be_heard()
+            bench.wait_until_listening()
         sent = bench.send(frames)
         heard = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
         taken = heard is not None and heard.kind is MessageKind.REQUEST
-        bench.check(is_as(wanted, taken), f"update command {wanted}", heard or "no answer")
+        bench.check(complies(wanted, taken), f"update command {wanted}", heard or "no answer")
         if not taken:
             if reset and heard is None:  # by now the application was started
                 bench.reset_to_bootloader()
             bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
 
-    def enter_past(self, *stimuli: Sequence[RawFrame]) -> None:
+    def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:
         """At the first boot version, send what has to be rejected: it announces itself on, with NAK
         at the most in between, and takes the update command then.
         """
@@ -149,18 +149,18 @@ class Probe(PacketTransfer):
     def frames(self) -> list[RawFrame]:
         """The next packet as it should be; begins a new transfer when all were sent."""
         if self.stored == self.total:
-            self.bench.begin_anew(len(self.image))
+            self.bench.restart_transfer(len(self.image))
             self.stored = 0
         return super().frames()
 
     # -- stimuli ----------------------------------------------------------------------------------
 
-    def plain(self) -> None:
+    def send_next(self) -> None:
         """The next packet as it should be; its ACK has to come, else the case ends."""
         self.frames()
         self.bench.forget()
         self.bench.packet(self.image, self.number)
-        self._count()
+        self._note_stored()
 
     def keep_alive(self) -> None:
         """Send the next packet when none was taken for so long that the device may soon give the
@@ -168,7 +168,7 @@ class Probe(PacketTransfer):
         """
         if self.bench.now - self._taken_at > self.bench.limit("pause_s") / 2:
             self.bench.wait(self.settle_s())
-            self.plain()
+            self.send_next()
 
     def offer(
         self,
@@ -184,23 +184,23 @@ class Probe(PacketTransfer):
         Returns whether it was taken.
         """
         heard = self.answers(frames, gap_s=gap_s, gaps=gaps)
-        taken = any(map(self.is_taken, heard))
+        taken = any(map(self.is_accepted, heard))
         allowed = (MessageKind.NAK, *ignoring)
-        others = [one for one in heard if one.kind not in allowed and not self.is_taken(one)]
+        others = [one for one in heard if one.kind not in allowed and not self.is_accepted(one)]
         expected = {
             ACCEPTED: f"ACK {self.number}",
             REJECTED: "NAK or no answer",
             EITHER: f"ACK {self.number}, NAK or no answer",
         }
-        ok = is_as(wanted, taken) and not others
+        ok = complies(wanted, taken) and not others
         self.bench.check(ok, expected[wanted], describe(heard))
         if taken:
-            self._count()
+            self._note_stored()
         else:
-            self.plain()
+            self.send_next()
         return taken
 
-    def discard(self, frames: Sequence[RawFrame]) -> None:
+    def check_discarded(self, frames: Sequence[RawFrame]) -> None:
         """Send what has to be discarded: NAK or no answer, and after a pause the next packet is
         taken. A device that takes it ends the case, as it may have stored anything.
         """
@@ -210,7 +210,7 @@ class Probe(PacketTransfer):
         heard = bench.collect(self.settle_s())
         ok = all(one.kind is MessageKind.NAK for one in heard)
         bench.require(ok, "NAK or no answer", describe(heard))
-        self.plain()
+        self.send_next()
 
     def check_stored(self) -> None:
         """What was acknowledged is in the flash, and is right; the last packet of it may be on its
@@ -223,6 +223,6 @@ class Probe(PacketTransfer):
         else:
             bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
 
-    def _count(self) -> None:
+    def _note_stored(self) -> None:
         self.stored += 1
         self._taken_at = self.bench.now

@@ -55,7 +55,7 @@ class _InterruptedUpgrade:
     runs: bool = True
     """True while an application runs, so that the way into the bootloader is a reset."""
 
-    def turn(self) -> None:
+    def swap(self) -> None:
         """Swap the images: the new one runs, and the next upgrade is to the other one."""
         self.old, self.new = self.new, self.old
 
@@ -81,8 +81,8 @@ def cuts(bench: Bench) -> None:
             _check_after_cut(bench, upgrade)
     total = packet_count(len(upgrade.new))
     for cut in _cuts_at_frames(bench, upgrade.new):
-        with bench.step(_name_of(cut, total)):
-            _go_to(bench, upgrade, cut)
+        with bench.step(_cut_text(cut, total)):
+            _upgrade_up_to(bench, upgrade, cut)
             bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     _cut_erase(bench, upgrade)
@@ -116,12 +116,12 @@ def second_cut(bench: Bench) -> None:
         bench.unsupported("a second cut in the last packet and at end of transfer", why)
     for cut in second:
         with bench.step("first cut"):
-            _go_to(bench, upgrade, _Cut(1, 9))
+            _upgrade_up_to(bench, upgrade, _Cut(1, 9))
             bench.power_cycle(_OFF_S)
             bench.await_message(MessageKind.BOOT_VERSION)
-        with bench.step(f"second cut {_name_of(cut, total)}"):
+        with bench.step(f"second cut {_cut_text(cut, total)}"):
             upgrade.runs = False
-            _go_to(bench, upgrade, cut)
+            _upgrade_up_to(bench, upgrade, cut)
             bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     _check_upgrade(bench, upgrade)
@@ -152,7 +152,7 @@ def _cuts_at_frames(bench: Bench, image: bytes) -> Iterator[_Cut]:
         yield _Cut(total + 1, frames)
 
 
-def _name_of(cut: _Cut, total: int) -> str:
+def _cut_text(cut: _Cut, total: int) -> str:
     """The cut in words; `total` is the number of packets."""
     what = {0: "the update command", total + 1: "end of transfer"}
     return f"after frame {cut.frames} of {what.get(cut.packet, f'packet {cut.packet}')}"
@@ -187,7 +187,7 @@ def _enter(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     upgrade.runs = False
 
 
-def _go_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> None:
+def _upgrade_up_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> None:
     """Carry out the upgrade up to the cut."""
     total, encoder = packet_count(len(upgrade.new)), bench.encoder
     if not cut.packet:
@@ -257,11 +257,11 @@ def _check_whole(bench: Bench, upgrade: _InterruptedUpgrade) -> bool:
         got = "a whole one" if images else "a mixture"
         bench.require(bool(images), "the flash holds a whole image", got)
     if images == [upgrade.new]:
-        upgrade.turn()
+        upgrade.swap()
     return True
 
 
-def _run_old(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
+def _restore_old_image(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """Let the old image run, so that what is erased is an application. From a power-up, as a
     bootloader that only listens ignores the reset of a host (rs_03).
     """
@@ -278,17 +278,17 @@ def _run_old(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """A cut while the application is erased, at shares of the time that it took once."""
-    _run_old(bench, upgrade)
+    _restore_old_image(bench, upgrade)
     upgrade.end_was_sent = upgrade.runs = False
     bench.reset_to_bootloader()
-    bench.wait_to_be_heard()
+    bench.wait_until_listening()
     heard = bench.update(len(upgrade.new))
     erase_s = heard.at - bench.tester.left_at
     for share in _ERASE_SHARES:
         with bench.step(f"at {share:.0%} of the time until request transfer"):
-            _run_old(bench, upgrade)
+            _restore_old_image(bench, upgrade)
             bench.reset_to_bootloader()
-            bench.wait_to_be_heard()
+            bench.wait_until_listening()
             bench.send(bench.encoder.update(len(upgrade.new)))
             bench.wait(share * erase_s)
             bench.power_cycle(_OFF_S)
@@ -307,7 +307,7 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         for share in _SHARES:
             with bench.step(f"flash operation {operation + 1}, {share:.0%} of it done"):
                 if not upgrade.was_requested:
-                    _run_old(bench, upgrade)
+                    _restore_old_image(bench, upgrade)
                 if upgrade.runs:
                     bench.reset_to_bootloader()
                 upgrade.end_was_sent = False
@@ -316,7 +316,7 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
                 if not bench.subject.take_cut():
                     # Whole, and not cut: what it left is for EN-01 and EN-07 to judge.
                     upgrade.runs = bench.application_runs()
-                    upgrade.turn()
+                    upgrade.swap()
                     return
                 _check_after_cut(bench, upgrade, version)
     bench.info(f"only the first {_OPERATIONS_MAX} flash operations of the upgrade were cut")
@@ -370,7 +370,7 @@ def _cut_after_ack(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """What was said to be complete runs after a power cut."""
-    _run_old(bench, upgrade)
+    _restore_old_image(bench, upgrade)
     with bench.step("just after complete"):
         _enter(bench, upgrade)
         bench.packets(upgrade.new)
@@ -380,4 +380,4 @@ def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         bench.collect(bench.host.burst_s)
         bench.check_image(upgrade.new)
         upgrade.runs = True
-        upgrade.turn()
+        upgrade.swap()

@@ -48,7 +48,7 @@ _LISTENS_S: Final = 16.0
     requires={TIMING},
 )
 def reset(bench: Bench) -> None:
-    with bench.tester.hearing_feedback():
+    with bench.tester.collecting_feedback():
         sent = bench.send(bench.encoder.reset())
         feedback = bench.expect(MessageKind.FEEDBACK)
     bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
@@ -107,7 +107,7 @@ def no_update(bench: Bench) -> None:
         bench.collect(bench.host.burst_s)
         bench.check_application()
     with bench.step("without an application"):
-        bench.without_application()
+        bench.erase_application()
         if bench.choice("rs_03") == "either":
             more = _versions(bench.collect(_LISTENS_S))
             bench.info(f"without an application, {more + 1} boot versions in {_LISTENS_S:g} s")

@@ -32,10 +32,10 @@ _FLOOD_FRAMES: Final = 600
 _HEADS: Final = bytes((0x55, 0xAA, WRITE, 0xFF))
 _UNKNOWN: Final = 0x6F00
 """A command of no document, without data; its second byte is their number."""
-_DRIP_S: Final = 0.04
+_SLOW_GAP_S: Final = 0.04
 """Between two useless messages where time, not their number, is what matters."""
-_WILD_FRAMES: Final = 120
-_WILD_MESSAGES: Final = 30
+_RANDOM_FRAMES: Final = 120
+_RANDOM_MESSAGES: Final = 30
 _LIKELY: Final = (BOOT_VERSION, UPDATE, PACKET, END, QUERY_VERSION)
 _SETTINGS: Final = range(0x30, 0x50)
 """Serial numbers of commands that the application writes settings by: a bench device keeps them."""
@@ -80,11 +80,11 @@ def endless(bench: Bench) -> None:
     with bench.step("in a pause of the transfer"):
         if bench.choice("tx_12") == "announces":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            heard = _drip_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
+            heard = _send_slowly_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
             bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
         elif bench.choice("tx_12") == "either":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            _drip_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
+            _send_slowly_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
             bench.collect(2 * bench.limit("inter_frame_s"))
             bench.send_packet(image, len(floods) + 1)
             heard = bench.wait_for(MessageKind.ACK, MessageKind.BOOT_VERSION)
@@ -106,7 +106,7 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
             bench.send(frames)
     if bench.encoder.has_version_query:
         limit_s = bench.limit("start_s")
-        heard = _drip_until(
+        heard = _send_slowly_until(
             bench, MessageKind.VERSION_INFORMATION, limit_s, bench.encoder.query_version()
         )
         expected = f"an application that answers within {limit_s:g} s"
@@ -119,7 +119,7 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
     bench.check_application()
 
 
-def _drip_until(
+def _send_slowly_until(
     bench: Bench, kind: MessageKind, within_s: float, query: list[RawFrame]
 ) -> Received | None:
     """Send useless messages and bytes, `query` between them, until `kind` is received."""
@@ -130,10 +130,10 @@ def _drip_until(
     while heard is None and bench.now < deadline:
         # Quiet for long enough that the query is not taken for the rest of the bytes.
         bench.send([*next(drops)])
-        bench.wait(bench.limit("inter_frame_s") + _DRIP_S if query else 0.0)
+        bench.wait(bench.limit("inter_frame_s") + _SLOW_GAP_S if query else 0.0)
         if query:
             bench.send(query)
-        heard = bench.wait_for(kind, within_s=_DRIP_S)
+        heard = bench.wait_for(kind, within_s=_SLOW_GAP_S)
     return heard
 
 
@@ -153,32 +153,32 @@ def _drip_until(
 def noise(bench: Bench) -> None:
     image = transfer_image(bench)
     with bench.step("the application"):
-        _make_noise(bench)
+        _send_noise(bench)
         bench.check_application()
     with bench.step("the announcements"):
         bench.reset_to_bootloader()
-        _make_noise(bench)
+        _send_noise(bench)
         bench.collect(bench.host.burst_s)
         bench.check_image(image)
     with bench.step("while it erases"):
         bench.reset_to_bootloader()
         bench.send(bench.encoder.update(len(image)))
-        _make_noise(bench)
+        _send_noise(bench)
         bench.wait_for(MessageKind.REQUEST)
-        done = _carry_on(bench, image, 0)
+        done = _continue_transfer(bench, image, 0)
     for stored in (1, 3, packet_count(len(image))):
         with bench.step(f"after packet {stored}"):
             if not done:
                 bench.start_transfer(len(image))
             bench.packets(image, done + 1, stored)
-            _make_noise(bench)
-            done = _carry_on(bench, image, stored)
+            _send_noise(bench)
+            done = _continue_transfer(bench, image, stored)
     with bench.step("after complete"):
-        _make_noise(bench)
+        _send_noise(bench)
         bench.check_image(image)
 
 
-def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
+def _continue_transfer(bench: Bench, image: bytes, stored: int) -> int:
     """Send the next packet, or the end of transfer. A device that left the transfer has to take a
     whole upgrade instead. Returns the packets stored, 0 without a transfer.
     """
@@ -198,21 +198,21 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
     return 0
 
 
-def _make_noise(bench: Bench) -> None:
+def _send_noise(bench: Bench) -> None:
     """Frames of any bytes, then messages of any content with a right CRC."""
     chance, encoder = bench.random, bench.encoder
     frames = []
-    for _ in range(_WILD_FRAMES):
+    for _ in range(_RANDOM_FRAMES):
         data = chance.randbytes(chance.randrange(9))
         if not chance.randrange(4):
             data = (_HEADS[: chance.randrange(1, 5)] + data)[:8]
         frames.append(RawFrame(encoder.to_device, data))
     bench.send(frames)
-    bench.wait(bench.limit("inter_frame_s") + _DRIP_S if chance.randrange(2) else 0.0)
-    bench.send([frame for _ in range(_WILD_MESSAGES) for frame in _wild_message(bench)])
+    bench.wait(bench.limit("inter_frame_s") + _SLOW_GAP_S if chance.randrange(2) else 0.0)
+    bench.send([frame for _ in range(_RANDOM_MESSAGES) for frame in _random_message(bench)])
 
 
-def _wild_message(bench: Bench) -> list[RawFrame]:
+def _random_message(bench: Bench) -> list[RawFrame]:
     """Any mode, command and data; one that would write a setting becomes a read. That random data
     make a correct reset, update command or packet is too unlikely to be excluded.
     """

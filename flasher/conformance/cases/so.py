@@ -32,7 +32,7 @@ def many_upgrades(bench: Bench) -> None:
     while done < bench.upgrades and len(failed) < _FAILURES_MAX:
         done += 1
         with bench.step(f"upgrade {done}"):
-            if _is_upgraded(bench, images[done % 2 == 0]):
+            if _upgrade_once(bench, images[done % 2 == 0]):
                 continue
             failed.append(done)
             image = bench.good_image
@@ -48,7 +48,7 @@ def many_upgrades(bench: Bench) -> None:
     bench.info(f"flash wear: the application was erased and written {done} times")
 
 
-def _is_upgraded(bench: Bench, image: bytes) -> bool:
+def _upgrade_once(bench: Bench, image: bytes) -> bool:
     """Upgrade to `image`, each message once. What passed is not kept, check by check: a report of a
     thousand upgrades has to be read.
     """

@@ -10,13 +10,13 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tm import (
     check_times,
-    end_measured,
     measure_burst,
+    measure_end,
     measure_packets,
 )
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
 from flasher.conformance.judge import Times
-from flasher.conformance.wire import MessageKind, told_version
+from flasher.conformance.wire import MessageKind, reported_version
 
 _START_AGAIN: Final = "window's end to an application that answers"
 _TAKEN: Final = "last boot version to an update command that is taken"
@@ -45,7 +45,7 @@ _AT_THE_END: Final = 0.5
 )
 def answer_times(bench: Bench) -> None:
     image = bench.good_image
-    tells = told_version(bench.subject.target, image) is not None
+    tells = reported_version(bench.subject.target, image) is not None
     if not tells:
         why = "the device does not tell which application runs"
         bench.unsupported("the time to an application that answers", why)
@@ -56,7 +56,7 @@ def answer_times(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.update(len(image))
             measure_packets(bench, image)
-            _measure_start(bench, Times.START, end_measured(bench).at, is_asked=tells)
+            _measure_start(bench, Times.START, measure_end(bench).at, is_asked=tells)
     check_times(bench)
     for name in (Times.START, _START_AGAIN) if tells else ():
         bench.judge.check_measured(name, high_s=bench.limit("start_s"))

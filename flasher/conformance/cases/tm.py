@@ -78,12 +78,12 @@ def times(bench: Bench) -> None:
             filler = (bench.filler(_PACKETS) + _REST)[: bench.number("largest_image_bytes")]
             bench.update(len(filler))
             measure_packets(bench, filler)
-            bench.begin_anew(len(image))
+            bench.restart_transfer(len(image))
     else:
         bench.update(len(image))
     with bench.step("upgrade"):
         measure_packets(bench, image)
-        end_measured(bench)
+        measure_end(bench)
     for turn in range(_RESETS):
         # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
         if not bench.application_runs():
@@ -129,7 +129,7 @@ def measure_packets(bench: Bench, image: bytes) -> None:
         bench.measure(Times.ANSWER, heard.at - sent.left_at)
 
 
-def end_measured(bench: Bench) -> Received:
+def measure_end(bench: Bench) -> Received:
     """End of transfer; returns complete."""
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")

@@ -39,7 +39,7 @@ _NUMBER_MAX: Final = 0xFFFF
 _STORED: Final = 3
 """Packets stored when packets with a wrong head come."""
 _START_BYTES: Final = (0x00, 0x02, 0x04, 0x10, 0x81, 0xFF)
-_BEGUN: Final = 3
+_UNFINISHED_PACKETS: Final = 3
 """Packets of a transfer that is only begun."""
 _SHORT: Final = 0.5
 """A pause that is no pause, as a part of limits.pause_s."""
@@ -61,7 +61,7 @@ def transfer_image(bench: Bench) -> bytes:
     return image
 
 
-def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
+def _transfer_stopping_at(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
     """Transfer `image`, stopping before each of these packets: it is sent as it should be, and has
     to be accepted, when the case goes on. The whole ends with the application of the image.
     """
@@ -83,7 +83,7 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     answers them in a transfer.
     """
     bench.reset_to_bootloader()
-    bench.wait_to_be_heard()
+    bench.wait_until_listening()
     bench.send(frames)
     heard = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
     positive = [
@@ -110,7 +110,7 @@ def damaged(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
     lost = {3 + place: index for place, index in enumerate(_LOST_FRAMES)}
-    for number in _stops(bench, image, (1, 2, *lost, total)):
+    for number in _transfer_stopping_at(bench, image, (1, 2, *lost, total)):
         if number in lost:
             index, choice = lost[number], bench.choice("tx_01_lost_frame")
             trusts_it = bench.choice("tx_01") in ("nak_received", "either")
@@ -173,7 +173,7 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     total = packet_count(len(image))
     for number in bench.transfer_in_parts(image, (1, 2, total)):
         payload = changed(packet_payload(image, number))
-        allowed = bench.right_to_repetition(number)
+        allowed = bench.repetition_answers(number)
         # Behind the last packet there is no next one to ask for.
         more = [f"ACK {number}", f"NAK {number}"] if number == total and choice != "ack" else []
         for copy in range(1, _REPEATS + 1):
@@ -247,7 +247,7 @@ def wrong_total(bench: Bench) -> None:
     swapped = int.from_bytes(total.to_bytes(2, "little"), "big")
     wrong = dict.fromkeys((total - 1, total + 1, total + 256, 0, _NUMBER_MAX, swapped))
     wrong.pop(total, None)
-    for number in _stops(bench, image, (1, _STORED + 1, total)):
+    for number in _transfer_stopping_at(bench, image, (1, _STORED + 1, total)):
         for named in wrong:
             with bench.step(f"packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, packet_payload(image, number)))
@@ -266,7 +266,7 @@ def wrong_total(bench: Bench) -> None:
 def wrong_start_byte(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
-    for number in _stops(bench, image, (1, _STORED + 1, total)):
+    for number in _transfer_stopping_at(bench, image, (1, _STORED + 1, total)):
         payload = packet_payload(image, number)
         for start in _START_BYTES:
             with bench.step(f"packet {number} with {start:02X}"):
@@ -303,7 +303,7 @@ def many_packets(bench: Bench) -> None:
         bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
     with bench.step("once more, to its end"):
         bench.leave_transfer()
-        whole = _filled(bench, size)
+        whole = _largest_valid_image(bench, size)
         bench.update(len(whole))
         if not _send_all(bench, whole):
             return
@@ -332,7 +332,7 @@ def _send_all(bench: Bench, image: bytes) -> bool:
     return True
 
 
-def _filled(bench: Bench, size: int) -> bytes:
+def _largest_valid_image(bench: Bench, size: int) -> bytes:
     """The good image with FF behind it, as the flash behind it reads else, and with its checksum
     where the product's images have one.
     """
@@ -417,19 +417,19 @@ def _send_slowly(bench: Bench) -> None:
     for number in range(1, count + 1):
         bench.packet(image, number)
         bench.wait(apart_s)
-    bench.begin_anew(len(bench.good_image))
+    bench.restart_transfer(len(bench.good_image))
     bench.finish(bench.good_image)
 
 
 def _announces(bench: Bench) -> None:
-    image = bench.filler(_BEGUN)[:-1]
+    image = bench.filler(_UNFINISHED_PACKETS)[:-1]
     pause_s = bench.limit("pause_s")
     bench.start_transfer(len(image))
     with bench.step("a short pause"):
         bench.wait(_SHORT * pause_s)
         bench.packet(image, 1)
-    for stored in (1, _BEGUN, 0):
-        with bench.step(_place("a pause", stored)):
+    for stored in (1, _UNFINISHED_PACKETS, 0):
+        with bench.step(_step_text("a pause", stored)):
             # The short pause left packet 1 stored, a long one ended all.
             if stored != 1:
                 bench.update(len(image))
@@ -454,7 +454,7 @@ def _announces_or_waits(bench: Bench) -> None:
         bench.wait(_SHORT * bench.limit("pause_s"))
         bench.packet(image, 1)
     for stored in (1, packet_count(len(image))):
-        with bench.step(_place("a pause", stored)):
+        with bench.step(_step_text("a pause", stored)):
             bench.packets(image, 2, stored)
             heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=pause_s)
             bench.info(f"after {pause_s:g} s: {heard or 'nothing'}")
@@ -480,7 +480,7 @@ def _waits(bench: Bench) -> None:
     image = transfer_image(bench)
     pause_s = _LONG * bench.limit("pause_s")
     for stored in bench.transfer_in_parts(image, (0, 1, packet_count(len(image)))):
-        with bench.step(_place("a pause", stored)):
+        with bench.step(_step_text("a pause", stored)):
             bench.expect_silence(pause_s)
     with bench.step("a new upgrade after a pause"):
         starts_over = bench.choice("up_08") == "starts_over"
@@ -517,7 +517,7 @@ def reset(bench: Bench) -> None:
     bench.start_transfer(len(image))
     done = 0
     for stored in (0, 1, total):
-        with bench.step(_place("reset", stored)):
+        with bench.step(_step_text("reset", stored)):
             bench.packets(image, done + 1, stored)
             done = stored
             bench.send(bench.encoder.reset())
@@ -542,7 +542,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
     """
     image = bench.good_image
     bench.reset_to_bootloader()
-    bench.wait_to_be_heard()
+    bench.wait_until_listening()
     bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
     # Boot versions that were on their way when the update command came do not count (R11).
     bench.wait(UPDATE_SPACING_S)
@@ -562,5 +562,5 @@ def _reset_while_it_erases(bench: Bench) -> None:
     bench.finish(image)
 
 
-def _place(what: str, stored: int) -> str:
+def _step_text(what: str, stored: int) -> str:
     return f"{what} after packet {stored}" if stored else f"{what} before packet 1"

@@ -47,12 +47,12 @@ def sizes(bench: Bench) -> None:
     for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
         with bench.step(f"{size} bytes"):
             if index:
-                bench.begin_anew(size)
+                bench.restart_transfer(size)
             else:
                 bench.update(size)
             if packet_count(size) <= _SENT_WHOLE_PACKETS:
                 bench.packets(bench.random.randbytes(size))
-    bench.begin_anew(len(bench.good_image))
+    bench.restart_transfer(len(bench.good_image))
     bench.finish(bench.good_image)
 
 
@@ -87,7 +87,7 @@ def without_reset(bench: Bench) -> None:
     image = bench.good_image
     choice = bench.choice("up_03")
     for step, frames in bench.encoder.upgrade_messages(len(image)).items():
-        with bench.step(step), bench.tester.hearing_feedback():
+        with bench.step(step), bench.tester.collecting_feedback():
             bench.send(frames)
             _check_answer(
                 bench, bench.collect(bench.limit("silence_s")), MessageKind.FEEDBACK, choice

@@ -37,8 +37,8 @@ _MAGIC: Final = b"FLASHERA"
 _HEAD: Final = Struct("<II8sI")
 _STACK: Final = 0x2000_1000
 _ENTRY: Final = AREA_START + 0x101
-_TIMES_OVER: Final = 16
-"""A call that reads, erases, writes and logs more than all flash so many times does not return."""
+_FLASH_PASSES_MAX: Final = 16
+"""A call may read, erase, write and log this many times the size of the flash."""
 
 
 def application_image(version: str, size_bytes: int) -> bytes:
@@ -49,7 +49,7 @@ def application_image(version: str, size_bytes: int) -> bytes:
     return with_checksum(body, size_bytes)
 
 
-def _is_torn(area: bytes) -> bool:
+def _is_incomplete(area: bytes) -> bool:
     """True for nothing at all, and for an image of `application_image` that is not whole."""
     if len(area) < _HEAD.size:
         return False
@@ -117,11 +117,11 @@ class CompiledDevice(Machine):
         if is_deaf or frame.is_error or len(self._received) >= self.facts.receive_frames:
             return
         self._received.append(CanFrame(*frame[:4]))
-        self._work(now)
+        self._call_when_free(now)
 
     def tick(self, now: float) -> None:
         super().tick(now)
-        self._work(now)
+        self._call_when_free(now)
 
     def deadline(self) -> float | None:
         wanted = [inf if (found := super().deadline()) is None else found]
@@ -154,12 +154,12 @@ class CompiledDevice(Machine):
 
     def power_cut(self, now: float) -> None:
         self._has_power = False
-        self._begin_anew(POWER_ON, inf)
+        self._restart(POWER_ON, inf)
 
     def power_on(self, now: float) -> None:
         if not self._has_power:
             self._has_power = True
-            self._begin_anew(POWER_ON, now)
+            self._restart(POWER_ON, now)
 
     def set_cut(self, operation: int, share: float, off_s: float) -> None:
         """Cut the power when `share` (0 to 1) of the flash operation number `operation` from now
@@ -183,7 +183,7 @@ class CompiledDevice(Machine):
         """The application area."""
         return self.flash.read(AREA_START, self.facts.application_bytes)
 
-    def _begin_anew(self, cause: int, at: float) -> None:
+    def _restart(self, cause: int, at: float) -> None:
         """RAM and all that was under way are lost; the bootloader starts at that time."""
         self._process.kill()
         if self._runs_application:
@@ -201,7 +201,7 @@ class CompiledDevice(Machine):
         """The time to start has come: after a reset, or as the power is there."""
         self._due_at = inf
         if self._runs_application:
-            self._begin_anew(RESET, now)
+            self._restart(RESET, now)
             self._due_at = inf
         self._has_power = True
         self._process.start()
@@ -222,10 +222,10 @@ class CompiledDevice(Machine):
 
     def _start_application(self, now: float) -> None:
         area = self.readback()
-        if _is_torn(area):
-            self._begin_anew(POWER_ON, inf)  # whatever it does, nobody can rely on it
+        if _is_incomplete(area):
+            self._restart(POWER_ON, inf)  # whatever it does, nobody can rely on it
             raise FlasherError("the bootloader started an application that is not whole")
-        self._begin_anew(RESET, inf)
+        self._restart(RESET, inf)
         self._runs_application = True
         self.application.start(find_firmware_version(area.rstrip(b"\xff")) or "unknown", now)
 
@@ -235,7 +235,7 @@ class CompiledDevice(Machine):
     def _next_turn_at(self) -> float:
         return max(self._tick_at, self._busy_until)
 
-    def _work(self, now: float) -> None:
+    def _call_when_free(self, now: float) -> None:
         """Hand over what was received, and give it its turn, unless it is busy."""
         while self._process.is_running and self._received and now >= self._busy_until:
             frame = pipes.pack_frame(self._received.popleft())
@@ -253,7 +253,7 @@ class CompiledDevice(Machine):
                 kind, pipes.TURN.pack(round(now * _US), number), frame, during=self._hardware
             )
         except FlasherError as error:
-            self._begin_anew(RESET, now + _RESTART_S)
+            self._restart(RESET, now + _RESTART_S)
             if isinstance(error, BootloaderError) and self._log:
                 said = "; ".join(self._log)
                 raise BootloaderError(
@@ -266,7 +266,7 @@ class CompiledDevice(Machine):
         if how is PipeMessage.APPLICATION:
             self._start_application(now)
         elif how is PipeMessage.RESET:
-            self._begin_anew(RESET, now + _RESTART_S)
+            self._restart(RESET, now + _RESTART_S)
         else:
             left_us, wanted_us = pipes.DONE.unpack_from(data)
             self._busy_until = max(now, left_us / _US)
@@ -283,11 +283,11 @@ class CompiledDevice(Machine):
     def _hardware(self, asked: PipeMessage, data: bytes) -> bytes | None:
         """What a function of the hardware gives; None for no answer."""
         if asked is PipeMessage.LOG:
-            self._count(pipes.HEADER.size + len(data))
+            self._count_bytes(pipes.HEADER.size + len(data))
             self._log.append(data.decode(errors="replace"))
             return None
         try:
-            return self._in_flash(asked, data)
+            return self._flash_operation(asked, data)
         except FlashError as error:
             row = pipes.RANGE if asked is PipeMessage.FLASH_READ else pipes.PLACE
             offset = row.unpack_from(data)[asked is not PipeMessage.FLASH_READ]
@@ -295,11 +295,11 @@ class CompiledDevice(Machine):
                 f"{asked.name.lower()} at offset 0x{offset:X}: {error.what}", where=error.where
             ) from error
 
-    def _in_flash(self, asked: PipeMessage, data: bytes) -> bytes | None:
+    def _flash_operation(self, asked: PipeMessage, data: bytes) -> bytes | None:
         """Read, erase or write; None when the power was cut."""
         if asked is PipeMessage.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
-            self._count(size_bytes)
+            self._count_bytes(size_bytes)
             return self.flash.read(self.flash.start + offset, size_bytes)
         now_us, offset = pipes.PLACE.unpack_from(data)
         content = None if asked is PipeMessage.FLASH_ERASE else data[pipes.PLACE.size :]
@@ -308,7 +308,7 @@ class CompiledDevice(Machine):
         if content is not None:
             takes_us = len(content) // self.facts.write_bytes * self.facts.write_us
             size_bytes = len(content)
-        self._count(size_bytes)
+        self._count_bytes(size_bytes)
         self._operations += 1
         if self._cut is not None and self._operations == self._cut[0] + 1:
             (_, share, off_s), self._cut = self._cut, None
@@ -319,10 +319,10 @@ class CompiledDevice(Machine):
         self.flash.carry_out(operation)
         return pipes.TIME.pack(now_us + takes_us)
 
-    def _count(self, size_bytes: int) -> None:
+    def _count_bytes(self, size_bytes: int) -> None:
         self._handled_bytes += size_bytes
-        if self._handled_bytes > _TIMES_OVER * self.facts.flash_bytes:
+        if self._handled_bytes > _FLASH_PASSES_MAX * self.facts.flash_bytes:
             raise BootloaderError(
-                "the bootloader read, erased, wrote and logged as much as all its flash "
-                f"{_TIMES_OVER} times over in one call, and was ended: it does not seem to return"
+                "the bootloader read, erased, wrote and logged more than "
+                f"{_FLASH_PASSES_MAX} times its flash in one call and was ended: it does not return"
             )

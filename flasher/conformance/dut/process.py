@@ -19,8 +19,8 @@ from flasher.errors import FlasherError, UsageError, printable
 WATCHDOG_S: Final = 5.0
 """A call that takes longer on the computer does not return."""
 _WAIT_S: Final = 0.01
-_SAID_SIZE: Final = 4096
-_DUMP: Final = "Shadow bytes around"
+_OUTPUT_SIZE: Final = 4096
+_DUMP_MARK: Final = "Shadow bytes around"
 """Behind what AddressSanitizer says for people."""
 _STDIN, _STDOUT, _STDERR = range(3)
 _LIBRARY: Final = frozenset((".so", ".dylib"))
@@ -81,7 +81,7 @@ class BootloaderProcess:
         if not self._process:
             os.close(read_fd)
             os.close(write_fd)
-            self._be_bootloader(its_read_fd, its_write_fd)
+            self._become_bootloader(its_read_fd, its_write_fd)
         os.close(its_read_fd)
         os.close(its_write_fd)
         self._pipe = Pipe(read_fd, write_fd)
@@ -93,7 +93,9 @@ class BootloaderProcess:
             return pipes.unpack_facts(data)
         except ValueError as error:
             self.kill()
-            raise self.refused(f"is no bootloader for the suite: {error}", self.said()) from error
+            raise self.unusable(
+                f"is no bootloader for the suite: {error}", self.output()
+            ) from error
 
     def call(
         self, kind: PipeMessage, *parts: bytes, during: Callable[[PipeMessage, bytes], bytes | None]
@@ -134,7 +136,7 @@ class BootloaderProcess:
         os.kill(process, signal.SIGKILL)  # until it is waited for, its number is its own
         return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
-    def refused(self, why: str, cause: str) -> UsageError:
+    def unusable(self, why: str, cause: str) -> UsageError:
         """That it cannot be tested."""
         return UsageError(
             f"{printable(self.subject)} {why}.",
@@ -150,16 +152,16 @@ class BootloaderProcess:
         self.kill()
         self._stderr.close()
 
-    def said(self) -> str:
+    def output(self) -> str:
         """What the process printed, the report of a sanitizer for instance, without its dump of
         memory; "" for nothing.
         """
         self._stderr.seek(0)
-        lines = self._stderr.read(_SAID_SIZE).decode(errors="replace").splitlines()
-        said = takewhile(lambda line: not line.startswith(_DUMP), lines)
+        lines = self._stderr.read(_OUTPUT_SIZE).decode(errors="replace").splitlines()
+        said = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)
         return " | ".join(printable(line) for line in said if line.strip(" ="))
 
-    def _be_bootloader(self, read_fd: int, write_fd: int) -> Never:
+    def _become_bootloader(self, read_fd: int, write_fd: int) -> Never:
         """In the process of the bootloader: become it."""
         try:
             # Ctrl-C and what ends a group of processes are for the suite, which ends this one.
@@ -205,4 +207,4 @@ class BootloaderProcess:
             select.select([], [], [], _WAIT_S)
         status = self.kill() or 0
         how = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
-        return BootloaderError(f"the bootloader ended {how} in {doing}", cause=self.said())
+        return BootloaderError(f"the bootloader ended {how} in {doing}", cause=self.output())

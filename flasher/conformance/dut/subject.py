@@ -66,7 +66,7 @@ def open_subject(
                 process, target, good_image=good_image, second_image=second_image
             )
         except BootloaderError as error:
-            raise process.refused(f"does not start: {error.what}", error.cause) from error
+            raise process.unusable(f"does not start: {error.what}", error.cause) from error
         profile = profile or ConformanceProfile()
         size_bytes = subject.device.facts.application_bytes
         area_bytes = profile.given.get("device.application_bytes", size_bytes)

@@ -60,7 +60,7 @@ class ExploreResult:
     stopped: str = ""
 
     @property
-    def never(self) -> list[tuple[str, str]]:
+    def not_covered(self) -> list[tuple[str, str]]:
         """Pairs of phase and step that no walk met."""
         return [(phase, step) for phase, step, count in self.coverage if not count]
 
@@ -89,9 +89,9 @@ class Explorer:
     def explore(self, steps: int) -> ExploreResult:
         """Walk until so many steps were taken, or something is found. Raises BusError."""
         try:
-            trouble = self._restored()
+            trouble = self._restore()
             if trouble:
-                return self._explored(_first_trouble(trouble))
+                return self._result(_bring_up_finding(trouble))
             while self._steps < steps and not self._stopped():
                 chance = random.Random(f"{self._seed}/{self._walks}")  # noqa: S311  by the seed
                 length = min(chance.randint(3, WALK_STEPS), steps - self._steps)
@@ -99,26 +99,26 @@ class Explorer:
                 found = self._walk([None] * length, taken, chance)
                 self._progress(self._steps)
                 if found is not None:
-                    finding = self._shrunk(found, taken)
-                    return self._explored(finding, self._stop() if self._stopped() else "")
+                    finding = self._shrink(found, taken)
+                    return self._result(finding, self._stop_reason() if self._stopped() else "")
         except RunStopped:
-            return self._explored(stopped=self._stop())
-        return self._explored(stopped="it was stopped" if self._steps < steps else "")
+            return self._result(stopped=self._stop_reason())
+        return self._result(stopped="it was stopped" if self._steps < steps else "")
 
     def replay(self, texts: Sequence[str]) -> ExploreResult:
         """Take these steps, as a finding tells them. Raises UsageError, BusError."""
         steps = [parse_step(text) for text in texts]
         taken: list[WalkStep] = []
         try:
-            trouble = self._restored()
+            trouble = self._restore()
             if trouble:
-                return self._explored(_first_trouble(trouble))
+                return self._result(_bring_up_finding(trouble))
             found = self._walk(steps, taken)
         except RunStopped:
-            return self._explored(stopped=self._stop())
+            return self._result(stopped=self._stop_reason())
         if found is None:
-            return self._explored()
-        return self._explored(self._finding(found, taken, taken), self._put_back())
+            return self._result()
+        return self._result(self._finding(found, taken, taken), self._restore_at_end())
 
     # -- one walk ----------------------------------------------------------------------------------
 
@@ -133,7 +133,7 @@ class Explorer:
         """
         self._walks += 1
         bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
-        bench.tester.hears_feedback = True
+        bench.tester.collects_feedback = True
         walk = Walk(bench)
         try:
             for given in steps:
@@ -142,9 +142,9 @@ class Explorer:
                 self._steps += 1
                 self._met[walk.phase, step.name] += 1
                 walk.take(*step)
-            if not walk.was_requested:
+            if not walk.update_accepted:
                 walk.check_application()
-            trouble = self._restored()
+            trouble = self._restore()
             if trouble:
                 raise Violation("upgrade", f"no good upgrade afterwards: {trouble}")  # noqa: TRY301
             walk.check_stored(bench.good_image)
@@ -158,7 +158,7 @@ class Explorer:
             return Violation("time", str(reached)), bench
         return None
 
-    def _restored(self) -> str:
+    def _restore(self) -> str:
         """Flash the good image, by the protocol alone; returns what went wrong, or ""."""
         done = restore(self._subject, self._profile, flash=True, stopped=self._stopped)
         if not done.ok:
@@ -167,11 +167,11 @@ class Explorer:
             return "not by the protocol; a power cycle brought it back"
         return ""
 
-    def _stop(self) -> str:
+    def _stop_reason(self) -> str:
         """Why it ended early, once the good image is put back or cannot be."""
-        return "; ".join(filter(None, ("it was stopped", self._put_back())))
+        return "; ".join(filter(None, ("it was stopped", self._restore_at_end())))
 
-    def _put_back(self) -> str:
+    def _restore_at_end(self) -> str:
         """Let the good image run, whoever wants to stop; returns what went wrong, or ""."""
         try:
             why = restore(self._subject, self._profile, flash=False).reason
@@ -181,14 +181,14 @@ class Explorer:
 
     # -- shrinking ---------------------------------------------------------------------------------
 
-    def _shrunk(self, found: tuple[Violation, Bench], taken: list[WalkStep]) -> WalkFinding:
+    def _shrink(self, found: tuple[Violation, Bench], taken: list[WalkStep]) -> WalkFinding:
         """The shortest walk, by leaving steps out, that ends with the same rule; the shortest until
         then when somebody stops it, or the adapter fails.
         """
         best, rule = list(taken), found[0].rule
         size, tries = max(len(best) // 2, 1), 0
         with suppress(RunStopped, BusError):
-            while size and tries < SHRINK_TRIES and not self._is_lost():
+            while size and tries < SHRINK_TRIES and not self._cannot_restore():
                 start, was_shorter = 0, False
                 while start < len(best) and tries < SHRINK_TRIES:
                     shorter = best[:start] + best[start + size :]
@@ -199,13 +199,13 @@ class Explorer:
                         best, found, was_shorter = again_taken, again, True
                     else:
                         start += size
-                    if again is not None and self._is_lost():
+                    if again is not None and self._cannot_restore():
                         break
                 if not was_shorter:
                     size //= 2
         return self._finding(found, best, taken)
 
-    def _is_lost(self) -> bool:
+    def _cannot_restore(self) -> bool:
         """Bring the device back for the next walk; True when that is not possible."""
         try:
             return not restore(self._subject, self._profile, flash=True, stopped=self._stopped).ok
@@ -224,7 +224,7 @@ class Explorer:
             bench.tester.trace,
         )
 
-    def _explored(self, finding: WalkFinding | None = None, stopped: str = "") -> ExploreResult:
+    def _result(self, finding: WalkFinding | None = None, stopped: str = "") -> ExploreResult:
         coverage = tuple(
             (phase.value, name, self._met[phase, name]) for phase, name in reachable_pairs()
         )
@@ -233,5 +233,5 @@ class Explorer:
         )
 
 
-def _first_trouble(trouble: str) -> WalkFinding:
+def _bring_up_finding(trouble: str) -> WalkFinding:
     return WalkFinding("upgrade", f"the good image could not be flashed: {trouble}", (), ())

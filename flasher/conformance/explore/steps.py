@@ -14,7 +14,7 @@ from flasher.errors import UsageError, did_you_mean
 
 _NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
-_OPEN: Final = "packet-open"
+_PACKET_OPEN: Final = "packet-open"
 """Any of the forms that the profile decides about."""
 _WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
     DevicePhase.APPLICATION: {
@@ -53,7 +53,7 @@ _WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
         **dict.fromkeys(("packet-slow", "packet-behind", "packet-between"), 1),
         **dict.fromkeys(("end", "reset", "wait=0.3", "power", "query"), 1),
         "wait=pause": 0.7,
-        _OPEN: 1.4,
+        _PACKET_OPEN: 1.4,
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
     },
@@ -73,7 +73,7 @@ _WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
         "update=300": 1,
         **dict.fromkeys(("packet-slow", "packet-behind", "packet-between", "reset", "power"), 1),
         "wait=pause": 0.7,
-        _OPEN: 1.4,
+        _PACKET_OPEN: 1.4,
         **dict.fromkeys(("wait=0.3", "query"), 0.5),
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
@@ -126,7 +126,7 @@ _ARGUMENTS: Final = {
 def parse_step(text: str) -> WalkStep:
     """A step as it is written. Raises UsageError for one that does not exist."""
     name, _, argument = text.partition("=")
-    known = set(_forms()) if name == _OPEN else _ARGUMENTS.get(name, set())
+    known = set(_form_arguments()) if name == _PACKET_OPEN else _ARGUMENTS.get(name, set())
     is_number = _NUMBER.fullmatch(argument) and any(map(_NUMBER.fullmatch, known))
     if argument not in known and not is_number:
         hint = did_you_mean(text, ALL_STEPS).rstrip()
@@ -144,10 +144,14 @@ def next_step(walk: Walk, chance: random.Random) -> WalkStep:
     }
     texts = [text for text in weights if not lacks.get(text.partition("=")[0])]
     (text,) = chance.choices(texts, [weights[text] for text in texts])
-    return WalkStep(_OPEN, chance.choice(_forms())) if text == _OPEN else parse_step(text)
+    return (
+        WalkStep(_PACKET_OPEN, chance.choice(_form_arguments()))
+        if text == _PACKET_OPEN
+        else parse_step(text)
+    )
 
 
-def _forms() -> list[str]:
+def _form_arguments() -> list[str]:
     """The arguments of `packet-open`."""
     found = forms(Encoder("bms")).items()
     return [f"{key}-{index}" for key, each in found for index in range(len(each))]

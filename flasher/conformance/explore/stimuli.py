@@ -145,7 +145,7 @@ def _small_update(
     return build(place.encoder.to_device, mode, UPDATE, data)
 
 
-def _for_others(place: TransferPosition) -> list[RawFrame]:
+def _update_other_targets(place: TransferPosition) -> list[RawFrame]:
     """Update command and packet 1 to the other targets."""
     packet = (1, packet_count(_SMALL_BYTES), bytes(PACKET_BYTES))
     return [
@@ -170,7 +170,7 @@ UPDATES: Final[dict[str, Maker]] = {
     ),
     "update-long": lambda place: _small_update(place, more=b"\0"),
     "update-read": lambda place: _small_update(place, mode=READ),
-    "update-others": _for_others,
+    "update-others": _update_other_targets,
 }
 ENDS: Final[dict[str, Maker]] = {
     "end-mark": lambda place: place.encoder.message(WRITE, END, b"\x05"),
@@ -187,7 +187,7 @@ def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Maker:
     )
 
 
-def _resets_of_nodes(place: TransferPosition) -> list[RawFrame]:
+def _resets_from_other_nodes(place: TransferPosition) -> list[RawFrame]:
     """Resets to this target, but not by the tool: from every other node."""
     encoder, digit = place.encoder, place.encoder.to_device & 0xF
     ids = [0x700 | sender << 4 | digit for sender in (1, 2, 3, 4) if sender != digit]
@@ -205,7 +205,7 @@ NO_CONCERN: Final[dict[str, Maker]] = {
     "reset-read": _reset(READ, lambda encoder: encoder.reset_data),
     "reset-text": _reset(WRITE, lambda encoder: bytes(len(encoder.reset_data))),
     "reset-text-end": _reset(WRITE, lambda encoder: encoder.reset_data[:-1] + b"?"),
-    "reset-nodes": _resets_of_nodes,
+    "reset-nodes": _resets_from_other_nodes,
     "reset-others": lambda place: [
         frame for other in place.encoder.others() for frame in other.reset()
     ],
@@ -225,7 +225,7 @@ NO_CONCERN: Final[dict[str, Maker]] = {
 REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
 
 
-def make(name: str, place: TransferPosition) -> Stimulus:
+def make_stimulus(name: str, place: TransferPosition) -> Stimulus:
     """What is sent in the step of that name."""
     made = REFUSED[name](place)
     frames = place.encoder.frames(made) if isinstance(made, bytes) else made

@@ -18,20 +18,26 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.fr import forms
-from flasher.conformance.explore.stimuli import PACKETS, REFUSED, UPDATES, TransferPosition, make
+from flasher.conformance.explore.stimuli import (
+    PACKETS,
+    REFUSED,
+    UPDATES,
+    TransferPosition,
+    make_stimulus,
+)
 from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
-from flasher.conformance.profile import words
+from flasher.conformance.profile import choice_words
 from flasher.conformance.wire import (
     PACKET_BYTES,
     MessageKind,
     RawFrame,
     Received,
     describe,
-    filled_up,
     inverted,
     joined,
     packet_count,
     packet_payload,
+    padded_to_frame,
     version_in,
 )
 
@@ -88,15 +94,15 @@ class Walk:
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
         self.phase = DevicePhase.APPLICATION
-        self.is_whole: bool | None = True
+        self.has_application: bool | None = True
         """There is an application to start; None where that is not certain."""
-        self.was_requested = False
+        self.update_accepted = False
         """An update command was accepted in this walk."""
-        self.running = bench.good_image
+        self.running_image = bench.good_image
         """The image of that application."""
         self._image = filler(3 * PACKET_BYTES)
-        self._end_is = EndOutcome.NEVER_ENDED
-        self._offered = (self._image, self._end_is)
+        self._expected_end = EndOutcome.NEVER_ENDED
+        self._update_image = (self._image, self._expected_end)
         """What the last update command was about."""
         self._stored = 0
         self._updates_unanswered = 0
@@ -106,20 +112,20 @@ class Walk:
         self._feedback_due = 0
         self._may_restart = False
         self._may_complete = False
-        self._may_break_off = False
+        self._may_send_partial = False
         """Its message under way may have been cut: the next thing that is heard may be the half."""
         self._nodes_asked: frozenset[int] = frozenset()
         """Ids by which the device may answer other nodes, in whose name something was sent."""
         self._requested_at = -inf
         self._version_at = -inf
-        self._useful_at = bench.now
+        self._answered_at = bench.now
         """When the device had something to answer, from which a pause counts."""
 
     def take(self, name: str, argument: str = "") -> None:
         """Take a step: one of `STEPS`, or a message that is refused. Raises Violation, and what
         the bench raises.
         """
-        self._settle()
+        self._apply_elapsed_time()
         if name in REFUSED:
             self._send_refused(name)
         else:
@@ -130,7 +136,7 @@ class Walk:
         bench = self.bench
         if self.phase is not DevicePhase.APPLICATION and bench.encoder.has_version_query:
             bench.wait(bench.host.burst_s)
-        wanted = version_in(self.running)
+        wanted = version_in(self.running_image)
         if wanted is None or not bench.encoder.has_version_query:
             found, wanted = ("answers" if bench.application_runs() else "no answer"), "answers"
         else:
@@ -149,16 +155,16 @@ class Walk:
 
     # -- what is heard -----------------------------------------------------------------------------
 
-    def _settle(self) -> None:
+    def _apply_elapsed_time(self) -> None:
         """What time alone has changed since the last step."""
         bench = self.bench
         silent_s = bench.now - self._version_at
         if self.phase is DevicePhase.ANNOUNCING and silent_s > bench.host.burst_s:
-            if self.is_whole:
+            if self.has_application:
                 self._await_start()
-            elif self.is_whole is None:
+            elif self.has_application is None:
                 self.phase, self._may_restart = DevicePhase.UNCLEAR, True
-        pause_s = bench.now - self._useful_at
+        pause_s = bench.now - self._answered_at
         may_end = bench.choice("tx_12") != "waits" and pause_s > 0.8 * bench.limit("pause_s")
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
@@ -196,9 +202,9 @@ class Walk:
         if heard is None:
             named = kind.value if number is None else f"{kind.value} {number}"
             raise Violation(f"no {kind.value}", f"no {named} within {within_s:g} s after {after}")
-        self._useful_at = self.bench.now
+        self._answered_at = self.bench.now
 
-    def _quiet(self) -> None:
+    def _listen_for_answers(self) -> None:
         """Listen for as long as an answer may take, and a broken message is kept."""
         bench = self.bench
         broken_s = 2 * bench.limit("inter_frame_s")
@@ -228,8 +234,8 @@ class Walk:
                     raise Violation("complete", "complete without all packets and a valid end")
             case MessageKind.OTHER if heard.can_id in self._nodes_asked:
                 pass
-            case MessageKind.DAMAGED if self._may_break_off:
-                self._may_break_off = False
+            case MessageKind.DAMAGED if self._may_send_partial:
+                self._may_send_partial = False
             case MessageKind.OTHER | MessageKind.DAMAGED:
                 raise Violation("form", f"{heard}: no message that a device sends")
 
@@ -263,10 +269,10 @@ class Walk:
 
     def _begin_transfer(self, at: float) -> None:
         self.phase = DevicePhase.BEGUN
-        self._image, self._end_is = self._offered
-        self.is_whole, self.was_requested = False, True
+        self._image, self._expected_end = self._update_image
+        self.has_application, self.update_accepted = False, True
         self._stored = 0
-        self._requested_at = self._useful_at = at
+        self._requested_at = self._answered_at = at
         self._acks_due.clear()
         self._may_restart = self._may_complete = False
 
@@ -291,12 +297,12 @@ class Walk:
                 raise Violation("no feedback", "no general feedback to a reset of the application")
             return
         choice = bench.choice("tx_13") if before in _IN_TRANSFER else ""
-        self._may_restart = self._may_break_off = choice != "ignored"
+        self._may_restart = self._may_send_partial = choice != "ignored"
         bench.send(bench.encoder.reset())
         if choice == "restarts":
             self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
         else:
-            self._quiet()
+            self._listen_for_answers()
             if choice not in ("", "ignored") and self.phase is before:
                 self.phase = DevicePhase.UNCLEAR
 
@@ -343,7 +349,7 @@ class Walk:
         bench.power_cycle(float(argument or 0.5))
         self._acks_due.clear()
         self._updates_unanswered = self._naks_due = self._feedback_due = 0
-        self._may_restart = self._may_break_off = True
+        self._may_restart = self._may_send_partial = True
         self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
         self._may_restart = False
 
@@ -369,7 +375,7 @@ class Walk:
     def _bus_off(self, _: str) -> None:
         bench = self.bench
         bench.subject.bus_off(_BUS_OFF_S)
-        self._may_break_off = True
+        self._may_send_partial = True
         self._listen(4 * _BUS_OFF_S + bench.limit("inter_frame_s"))
 
     def _query(self, _: str) -> None:
@@ -377,39 +383,39 @@ class Walk:
             self.check_application()
         else:
             self.bench.send(self.bench.encoder.query_version())
-            self._quiet()
+            self._listen_for_answers()
 
     # -- update command ----------------------------------------------------------------------------
 
-    def _at_version(self) -> None:
+    def _await_version(self) -> None:
         """Where it announces itself, wait for the moment at which it takes an update command."""
         if self.phase is not DevicePhase.ANNOUNCING:
             return
         bench = self.bench
         within_s = 4 * bench.limit("version_spacing_s")
-        if self.is_whole is False:  # it may restart just now
+        if self.has_application is False:  # it may restart just now
             within_s = bench.limit("first_version_s")
         heard = self._listen(within_s, lambda one: one.kind is MessageKind.BOOT_VERSION)
-        if heard is None and self.is_whole:  # its window is over, or nearly
+        if heard is None and self.has_application:  # its window is over, or nearly
             self._await_start()
-        elif heard is None and self.is_whole is None:
+        elif heard is None and self.has_application is None:
             self.phase = DevicePhase.UNCLEAR
 
     def _update(self, argument: str) -> None:
         bench = self.bench
-        image, outcome = self._named_image(argument)
+        image, outcome = self._image_of(argument)
         frames = bench.encoder.update(len(image))
-        self._at_version()
+        self._await_version()
         self._feedback_due += 1
         if self.phase is DevicePhase.APPLICATION:
             bench.send(frames)
-            self._quiet()
+            self._listen_for_answers()
             return
         is_same = self.phase is DevicePhase.BEGUN and len(image) == len(self._image)
         if self.phase in _IN_TRANSFER and not is_same:
             self._update_in_transfer(frames, image, outcome)
             return
-        self._offered = image, outcome
+        self._update_image = image, outcome
         if is_same or self.phase is DevicePhase.UNCLEAR:
             self._updates_unanswered += 1
             self._naks_due, self._nak_numbers = 1, None
@@ -444,9 +450,9 @@ class Walk:
         self._naks_due, self._nak_numbers = 1, None
         if choice == "rejected":
             bench.send(frames)
-            self._quiet()
+            self._listen_for_answers()
             return
-        self._offered = image, outcome
+        self._update_image = image, outcome
         self._updates_unanswered += 1
         bench.send(frames)
         if choice == "starts_over":
@@ -461,11 +467,11 @@ class Walk:
     def _update_reset(self, _: str) -> None:
         """An update command, and a reset right behind it: while it erases."""
         bench = self.bench
-        self._at_version()
+        self._await_version()
         if self.phase is not DevicePhase.ANNOUNCING:
             self._reset("")
             return
-        self._offered = self._named_image("good")
+        self._update_image = self._image_of("good")
         self._updates_unanswered += 1
         self._feedback_due += 2
         self._may_restart = True
@@ -476,31 +482,31 @@ class Walk:
         )
         if heard is None:
             raise Violation("no request", "nothing after an update command and a reset behind it")
-        self.phase, self.is_whole, self.was_requested = DevicePhase.UNCLEAR, None, True
+        self.phase, self.has_application, self.update_accepted = DevicePhase.UNCLEAR, None, True
         self._may_restart = True
-        self._quiet()
+        self._listen_for_answers()
 
     def _cut(self, argument: str) -> None:
         """Cut the power half-way through a flash operation: of the erasing that an update command
         begins, or, when all packets are stored, of what the end of transfer writes.
         """
         bench, is_end = self.bench, self.phase is DevicePhase.STORED
-        if is_end and self._end_is is not EndOutcome.RUNS:
+        if is_end and self._expected_end is not EndOutcome.RUNS:
             return
         if not is_end:
-            self._at_version()
+            self._await_version()
             if self.phase is not DevicePhase.ANNOUNCING:
                 return
-        before = self.running if self.is_whole else None
+        before = self.running_image if self.has_application else None
         after = self._image if is_end else None
-        self._may_restart = self._may_break_off = self._may_complete = True
+        self._may_restart = self._may_send_partial = self._may_complete = True
         self._updates_unanswered += 1
         self._feedback_due += 1
-        self.was_requested, self.phase = True, DevicePhase.UNCLEAR
+        self.update_accepted, self.phase = True, DevicePhase.UNCLEAR
         bench.subject.cut_in_operation(int(argument), 0.5, _GAP_S)
         bench.send(bench.encoder.end() if is_end else bench.encoder.update(len(bench.good_image)))
         if not is_end:
-            self._offered = self._named_image("good")
+            self._update_image = self._image_of("good")
         within_s = bench.limit("erase_s") + bench.limit("first_version_s")
         ends = (MessageKind.BOOT_VERSION, MessageKind.REQUEST, MessageKind.COMPLETE)
         heard = self._listen(within_s, lambda one: one.kind in ends)
@@ -517,7 +523,7 @@ class Walk:
         """What runs after a power cut is one of the images, whole, or nothing."""
         bench = self.bench
         self.phase = DevicePhase.UNCLEAR
-        self.is_whole = None
+        self.has_application = None
         if not bench.encoder.has_version_query:
             return
         found = bench.application_version()
@@ -528,9 +534,9 @@ class Walk:
         if whole is None:
             raise Violation("mixed", f"application {found!a} runs after a power cut")
         self.check_stored(whole)
-        self.running, self.is_whole, self.phase = whole, True, DevicePhase.APPLICATION
+        self.running_image, self.has_application, self.phase = whole, True, DevicePhase.APPLICATION
 
-    def _named_image(self, argument: str) -> tuple[bytes, EndOutcome]:
+    def _image_of(self, argument: str) -> tuple[bytes, EndOutcome]:
         """The image of a step, and what comes of it."""
         bench = self.bench
         if argument in ("", "good"):
@@ -576,7 +582,7 @@ class Walk:
         else:
             if self.phase is DevicePhase.STORED:  # the last packet again
                 self._acks_due[number] += 1
-            self._quiet()
+            self._listen_for_answers()
 
     def _packets(self, argument: str) -> None:
         left = self.total - self._stored
@@ -603,19 +609,19 @@ class Walk:
         payload = inverted(payload) if has_other_data else payload
         choice = self.bench.choice("tx_03" if is_older else "tx_02")
         is_open = choice != "ack" and (is_older or self.phase is DevicePhase.STORED)
-        right = [f"ACK {number}"] if is_older else self.bench.right_to_repetition(number)
+        right = [f"ACK {number}"] if is_older else self.bench.repetition_answers(number)
         self._feedback_due += 1
         self._acks_due[number] += is_open or f"ACK {number}" in right
         self._naks_due, self._nak_numbers = 1, frozenset((number, self.wanted, number + 1))
         self.bench.send(self.bench.encoder.packet(number, self.total, payload))
         within_s = self.bench.limit("ack_s")
         if is_open or (is_older and has_other_data):
-            self._quiet()
+            self._listen_for_answers()
         elif self._listen(within_s, lambda one: str(one) in right) is None:
             named = f"no {' or '.join(right)} within {within_s:g} s"
             raise Violation("no ACK", f"{named} after packet {number} again")
         self._acks_due[number] = 0
-        self._useful_at = self.bench.now
+        self._answered_at = self.bench.now
 
     def _packet_between(self, _: str) -> None:
         """Frames without payload between those of the packet."""
@@ -638,7 +644,7 @@ class Walk:
         form = forms(bench.encoder)[key][int(index)]
         raw = form.before + self._place.next_packet
         frames = bench.encoder.frames(raw, form.frame_bytes)
-        taken, not_taken = words(key)
+        taken, not_taken = choice_words(key)
         if not bench.profile.allows(key, not_taken):
             self._packet("", frames)
             return
@@ -648,7 +654,7 @@ class Walk:
         self._naks_due, self._nak_numbers = 4, None
         self._feedback_due += 1
         bench.send(frames)
-        self._quiet()
+        self._listen_for_answers()
         self._acks_due.clear()
 
     def _packet_filler(self, _: str) -> None:
@@ -672,18 +678,18 @@ class Walk:
             if self.phase is DevicePhase.UNCLEAR and self._stored == self.total:
                 return  # perhaps it is complete
             bench.send(bench.encoder.end())
-            self._quiet()
+            self._listen_for_answers()
             if was_in_transfer and self.phase in _IN_TRANSFER:
                 self.phase = DevicePhase.UNCLEAR
             return
-        if self._end_is is EndOutcome.NEVER_ENDED:
+        if self._expected_end is EndOutcome.NEVER_ENDED:
             return
-        refused = self._end_is is EndOutcome.REFUSED
+        refused = self._expected_end is EndOutcome.REFUSED
         self._naks_due, self._nak_numbers = int(refused), None
         self._may_complete = not refused
         frames = bench.encoder.end()
         if argument == "padded" and bench.choice("fr_07") == "ignored":
-            frames = filled_up(frames)
+            frames = padded_to_frame(frames)
         bench.send(frames)
         if refused:
             self._may_restart = True
@@ -702,17 +708,17 @@ class Walk:
 
     def _completed(self) -> None:
         """The image is complete: its application runs."""
-        self.running, self.is_whole = self._image, True
+        self.running_image, self.has_application = self._image, True
         self.check_application()
         self._may_restart = self._may_complete = False
-        self.check_stored(self.running)
+        self.check_stored(self.running_image)
 
     # -- what is refused, or no concern of the device ----------------------------------------------
 
     def _send_refused(self, name: str) -> None:
         if name in UPDATES:
-            self._at_version()
-        refused = make(name, self._place)
+            self._await_version()
+        refused = make_stimulus(name, self._place)
         self._feedback_due += refused.is_intact_write
         self._naks_due, self._nak_numbers = 1 if name in UPDATES else 2, None
         if name == "reset-nodes":  # each of them is answered by general feedback
@@ -724,7 +730,7 @@ class Walk:
                 named = int.from_bytes(joined(refused.frames)[7:9], "little")
                 self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
         self.bench.send(refused.frames)
-        self._quiet()
+        self._listen_for_answers()
 
 
 def _answers_update(heard: Received, not_before: float) -> bool:

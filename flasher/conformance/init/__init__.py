@@ -12,7 +12,7 @@ from functools import partial
 from typing import Final
 
 from flasher.conformance.init import entry_questions, transfer_questions
-from flasher.conformance.init.answers import Findings, KeyAnswer, Trial, decided, limit
+from flasher.conformance.init.answers import Findings, KeyAnswer, Trial, decide, limit_answer
 from flasher.conformance.init.session import InitSession
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
@@ -118,12 +118,12 @@ class InitResult:
         )
 
     @property
-    def open(self) -> dict[str, str]:
+    def open_keys(self) -> dict[str, str]:
         """The keys that stay open, with the reason."""
         return {one.key: one.seen for one in self.answers if one.value is None}
 
 
-def ask(
+def ask_device(
     subject: Subject,
     start: ConformanceProfile,
     *,
@@ -133,7 +133,7 @@ def ask(
     """Ask a device everything. Raises BusError. The good image runs before and after it; of
     `start` is believed what no question answers.
     """
-    return _Interview(subject, start, stopped).go(progress)
+    return _Interview(subject, start, stopped).run(progress)
 
 
 class _Interview:
@@ -146,40 +146,40 @@ class _Interview:
         self._answers: dict[str, KeyAnswer] = {}
         self._measured: dict[str, list[float]] = {}
 
-    def go(self, progress: Callable[[int, int], None]) -> InitResult:
+    def run(self, progress: Callable[[int, int], None]) -> InitResult:
         was_brought_up = True
         try:
-            trouble = self._restored("before the first question", flash=True)
+            trouble = self._restore("before the first question", flash=True)
             was_brought_up = not trouble
             for done, (question, keys) in enumerate(QUESTIONS):
                 if trouble:
                     break
                 progress(done, len(QUESTIONS))
-                self._put(question, keys)
-                trouble = self._restored(f"after {keys[0]} was asked", flash=False)
+                self._ask(question, keys)
+                trouble = self._restore(f"after {keys[0]} was asked", flash=False)
             if not trouble:
-                trouble = self._restored("at the end", flash=True)
+                trouble = self._restore("at the end", flash=True)
         except RunStopped as ended:
             self._stopped = lambda: False
-            lost = self._restored("when it was stopped", flash=True)
-            return self._asked(lost or str(ended))
-        return self._asked(trouble, was_brought_up=was_brought_up)
+            lost = self._restore("when it was stopped", flash=True)
+            return self._result(lost or str(ended))
+        return self._result(trouble, was_brought_up=was_brought_up)
 
-    def _put(self, question: Question, keys: tuple[str, ...]) -> None:
+    def _ask(self, question: Question, keys: tuple[str, ...]) -> None:
         """Ask, and once more when the device did something else: a frame may have been late."""
-        why = self._tried(question, keys)
-        if why and not self._restored("before it was asked again", flash=False):
-            why = self._tried(question, keys) or "nothing was seen"
+        why = self._try(question, keys)
+        if why and not self._restore("before it was asked again", flash=False):
+            why = self._try(question, keys) or "nothing was seen"
         for key in keys:
             self._answers.setdefault(key, KeyAnswer(key, None, why))
 
-    def _tried(self, question: Question, keys: tuple[str, ...]) -> str:
+    def _try(self, question: Question, keys: tuple[str, ...]) -> str:
         """Ask; returns what the device did else, or ""."""
-        it = InitSession(self._subject, self._profile(), self._stopped)
+        session = InitSession(self._subject, self._profile(), self._stopped)
         why, trials = "", list[Trial]()
         try:
-            it.settle()
-            for found in question(it):
+            session.settle()
+            for found in question(session):
                 if isinstance(found, Trial):
                     trials.append(found)
                 elif isinstance(found, KeyAnswer):
@@ -188,22 +188,24 @@ class _Interview:
                     self._answers |= {key: KeyAnswer(key, None, found) for key in keys}
             if trials:
                 choice = next(key for key in keys if "." not in key)
-                self._answers[choice] = decided(choice, trials)
+                self._answers[choice] = decide(choice, trials)
         except RunStopped:
             raise
         except CaseEnded as ended:
-            failed = [check for check in it.bench.judge.checks if check.outcome.value == "fail"]
+            failed = [
+                check for check in session.bench.judge.checks if check.outcome.value == "fail"
+            ]
             why = f"the device did something else: {failed[-1]}" if failed else str(ended)
-        if it.bench.is_off:
-            it.bench.power_on()
-        for one in it.bench.judge.measurements:
+        if session.bench.is_off:
+            session.bench.power_on()
+        for one in session.bench.judge.measurements:
             self._measured.setdefault(one.name, []).append(one.value_s)
         return why
 
     def _limits(self) -> Iterator[KeyAnswer]:
         for key, (least_s, names) in LIMITS.items():
             values_s = [value_s for name in names for value_s in self._measured.get(name, ())]
-            yield limit(key, values_s, least_s, self._subject.port.uncertainty_s)
+            yield limit_answer(key, values_s, least_s, self._subject.port.uncertainty_s)
 
     def _profile(self) -> ConformanceProfile:
         """All that is known by now; where nothing is, with patience."""
@@ -211,7 +213,7 @@ class _Interview:
         given = {one.key: one.value for one in found if one.value is not None}
         return ConformanceProfile({**_PATIENCE, **self._start.given, **given})
 
-    def _restored(self, when: str, *, flash: bool) -> str:
+    def _restore(self, when: str, *, flash: bool) -> str:
         """Let the good image run; returns what went wrong, or ""."""
         done = restore(self._subject, self._profile(), flash=flash, stopped=self._stopped)
         if done.ok:
@@ -219,7 +221,7 @@ class _Interview:
         said = "; ".join((done.reason, *done.diagnosis))
         return f"{when}, the device could not be brought back: {said}"
 
-    def _asked(self, stopped: str, *, was_brought_up: bool = True) -> InitResult:
+    def _result(self, stopped: str, *, was_brought_up: bool = True) -> InitResult:
         self._answers |= {one.key: one for one in self._limits()}
         found = [
             self._answers.get(key) or KeyAnswer(key, None, NOT_ASKED.get(key, "it was not asked"))

@@ -48,9 +48,9 @@ Findings = Iterator[KeyAnswer | Trial | str]
 """What a question finds: answers, trials for its choice, or why all of its keys stay open."""
 
 
-def decided(key: str, trials: Sequence[Trial]) -> KeyAnswer:
+def decide(key: str, trials: Sequence[Trial]) -> KeyAnswer:
     """The value that all trials agree in; where they differ, `either` if the key has it."""
-    seen, values = _told(trials), {trial.value for trial in trials}
+    seen, values = _summary(trials), {trial.value for trial in trials}
     allowed = profile_keys()[key].choices
     if not values <= set(allowed):
         return KeyAnswer(key, None, f"no value describes this: {seen}")
@@ -61,7 +61,7 @@ def decided(key: str, trials: Sequence[Trial]) -> KeyAnswer:
     return KeyAnswer(key, None, f"it differs: {seen}")
 
 
-def _told(trials: Sequence[Trial]) -> str:
+def _summary(trials: Sequence[Trial]) -> str:
     """Every answer to every stimulus, with how often it came."""
     total = Counter(trial.stimulus for trial in trials)
     counts = Counter((str(trial), trial.stimulus) for trial in trials)
@@ -76,7 +76,7 @@ def _told(trials: Sequence[Trial]) -> str:
     return f"{summed}: {'; '.join(found[:_SHOWN])}; and {more} more"
 
 
-def limit(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> KeyAnswer:
+def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> KeyAnswer:
     """A limit from what was measured: with a margin, so never shorter than what it took."""
     if not values_s:
         return KeyAnswer(key, None, "it was never measured")

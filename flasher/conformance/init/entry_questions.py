@@ -8,7 +8,7 @@ from statistics import median
 from typing import Final
 
 from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
-from flasher.conformance.init.session import REPEATS, InitSession, told
+from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import Times
 from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
@@ -35,9 +35,9 @@ _UNKNOWN: Final = 0x7704
 """A command that nobody has."""
 
 
-def burst(it: InitSession) -> Findings:
+def burst(session: InitSession) -> Findings:
     """The announcements after a reset, and after power-up."""
-    bench = it.bench
+    bench = session.bench
     counts: list[int] = []
     gaps_s: list[float] = []
     turns = [*("reset",) * REPEATS, *("power",) * (REPEATS if bench.subject.has_power else 0)]
@@ -48,11 +48,11 @@ def burst(it: InitSession) -> Findings:
             first = bench.await_message(MessageKind.BOOT_VERSION)
             bench.measure(Times.POWERED, first.at - on_at)
         else:
-            first = it.enter()
-        versions = [first, *it.more_versions()]
+            first = session.enter()
+        versions = [first, *session.more_versions()]
         counts.append(len(versions))
         gaps_s += [after.at - before.at for before, after in pairwise(versions)]
-        it.await_application()
+        session.await_application()
     command = f"{bench.encoder.reset_command:04X}"
     yield KeyAnswer(
         "device.reset_command",
@@ -75,7 +75,7 @@ def burst(it: InitSession) -> Findings:
     spacing_s = round(median(gaps_s), 3)
     seen = f"{len(gaps_s)} times, from {min(gaps_s) * 1000:.1f} to {max(gaps_s) * 1000:.1f} ms"
     off_s = max(abs(gap_s - spacing_s) for gap_s in gaps_s)
-    tolerance_s = max(_TOLERANCE_S, _up(2 * off_s + 2 * bench.port.uncertainty_s))
+    tolerance_s = max(_TOLERANCE_S, _rounded_up(2 * off_s + 2 * bench.port.uncertainty_s))
     yield KeyAnswer("limits.version_spacing_s", spacing_s, f"measured {seen}; the median")
     yield KeyAnswer(
         "limits.version_spacing_tolerance_s",
@@ -84,28 +84,28 @@ def burst(it: InitSession) -> Findings:
     )
 
 
-def upgrade(it: InitSession) -> Findings:
+def upgrade(session: InitSession) -> Findings:
     """Plain upgrades, for their times and for what follows complete."""
-    bench = it.bench
+    bench = session.bench
     for _ in range(REPEATS):
-        it.begin()
-        it.packets()
+        session.begin()
+        session.packets()
         bench.end_transfer()
         complete_at = bench.now
-        heard = _first_sign(it)
+        heard = _first_sign(session)
         if heard is not None and heard.kind is MessageKind.BOOT_VERSION:
             bench.measure(Times.RESTARTED, heard.at - complete_at)
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
             yield Trial("starts", "no boot version", "complete", "after")
-        it.await_application(Times.START, complete_at)
-        last = it.enter(bench.number("versions"))
-        it.await_application(Times.START_AGAIN, last.at)
+        session.await_application(Times.START, complete_at)
+        last = session.enter(bench.number("versions"))
+        session.await_application(Times.START_AGAIN, last.at)
 
 
-def _first_sign(it: InitSession) -> Received | None:
+def _first_sign(session: InitSession) -> Received | None:
     """The first boot version after complete, or the first answer of the application."""
-    bench = it.bench
+    bench = session.bench
     if not bench.encoder.has_version_query:
         within_s = max(bench.limit("first_version_s"), _RESTART_S)
         return bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
@@ -122,32 +122,32 @@ def _first_sign(it: InitSession) -> Received | None:
 # -- the window -----------------------------------------------------------------------------------
 
 
-def in_burst(it: InitSession) -> Findings:
+def in_burst(session: InitSession) -> Findings:
     """Update command between the announcements."""
-    bench = it.bench
+    bench = session.bench
     count = bench.number("versions")
     if count < 2:
         yield "the burst is a single boot version"
     for version in range(1, count):
         for _ in range(REPEATS):
-            it.enter(version)
-            taken = it.offer_update(bench.encoder.update(len(it.image)))
+            session.enter(version)
+            taken = session.offer_update(bench.encoder.update(len(session.image)))
             answer = "request transfer" if taken else "no request transfer"
             stimulus = f"update command at boot version {version} of {count}"
             yield Trial("accepted" if taken else "rejected", answer, stimulus)
-            it.finish() if taken else it.await_application()
+            session.finish() if taken else session.await_application()
 
 
-def window(it: InitSession) -> Findings:
+def window(session: InitSession) -> Findings:
     """The window's end behind the last announcement, by bisection."""
-    bench = it.bench
-    at_s, taken = _offer_at(it, 0.0)
+    bench = session.bench
+    at_s, taken = _offer_at(session, 0.0)
     if not taken:
         yield "an update command at the last boot version is not taken"
         return
     low_s, high_s = at_s, max(0.1, 2 * at_s)
     while True:
-        at_s, taken = _offer_at(it, high_s)
+        at_s, taken = _offer_at(session, high_s)
         if not taken:
             high_s = at_s
             break
@@ -157,13 +157,13 @@ def window(it: InitSession) -> Findings:
             return
     resolution_s = max(_RESOLUTION_S, bench.port.uncertainty_s)
     while high_s - low_s > resolution_s:
-        at_s, taken = _offer_at(it, (low_s + high_s) / 2)
+        at_s, taken = _offer_at(session, (low_s + high_s) / 2)
         if low_s < at_s < high_s:
             low_s, high_s = (at_s, high_s) if taken else (low_s, at_s)
         else:  # the bus is not more exact
             break
-    inside = [_offer_at(it, low_s - resolution_s) for _ in range(REPEATS)]
-    outside = [_offer_at(it, high_s + resolution_s) for _ in range(REPEATS)]
+    inside = [_offer_at(session, low_s - resolution_s) for _ in range(REPEATS)]
+    outside = [_offer_at(session, high_s + resolution_s) for _ in range(REPEATS)]
     off_s = max(
         [low_s - at_s for at_s, taken in inside if not taken]
         + [at_s - high_s for at_s, taken in outside if taken],
@@ -175,7 +175,9 @@ def window(it: InitSession) -> Findings:
         f"{high_s * 1000:.1f} ms on, by bisection"
     )
     yield KeyAnswer("limits.window_s", window_s, f"{seen}; the middle")
-    half_s = _up((high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2)
+    half_s = _rounded_up(
+        (high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2
+    )
     yield KeyAnswer(
         "limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure"
     )
@@ -187,89 +189,89 @@ def window(it: InitSession) -> Findings:
         yield Trial("accepted" if taken else "rejected", answer, stimulus)
 
 
-def _offer_at(it: InitSession, offset_s: float) -> tuple[float, bool]:
+def _offer_at(session: InitSession, offset_s: float) -> tuple[float, bool]:
     """Update command so long behind the last boot version; when it was there, and if it is taken.
     The good image runs again afterwards.
     """
-    bench = it.bench
-    frames = bench.encoder.update(len(it.image))
+    bench = session.bench
+    frames = bench.encoder.update(len(session.image))
     wire_s = bench.tester.wire_s(frames)
-    last = it.enter(bench.number("versions"))
+    last = session.enter(bench.number("versions"))
     sent = bench.send(frames, at=last.at + max(offset_s - wire_s, 0.0))
     heard = bench.wait_for(MessageKind.REQUEST)
     if heard is None:
-        it.await_application()
+        session.await_application()
     else:
         bench.measure(Times.REQUEST, heard.at - sent.left_at)
-        it.stored = 0
-        it.finish()
+        session.stored = 0
+        session.finish()
     return sent.left_at - last.at, heard is not None
 
 
 # -- what is not taken ----------------------------------------------------------------------------
 
 
-def reset_in_bootloader(it: InitSession) -> Findings:
+def reset_in_bootloader(session: InitSession) -> Findings:
     """Reset between the announcements."""
-    bench = it.bench
+    bench = session.bench
     count = bench.number("versions")
     place = min(2, count)
     for _ in range(REPEATS):
-        it.enter(place)
+        session.enter(place)
         bench.send(bench.encoder.reset())
-        more = len(it.more_versions())
+        more = len(session.more_versions())
         value = {count - place: "ignored", count: "restarts"}.get(more, "")
         stimulus = f"reset after boot version {place} of {count}"
         yield Trial(value, f"{more} boot versions more", stimulus, "after")
-        it.await_application()
+        session.await_application()
 
 
-def rejected_update(it: InitSession) -> Findings:
+def rejected_update(session: InitSession) -> Findings:
     """Update commands that no bootloader takes."""
-    bench = it.bench
+    bench = session.bench
     other = next(iter(bench.encoder.others()))
     stimuli = {
         "update command for 0 bytes": bench.encoder.update(0),
         "update command for 2^32 - 1 bytes": bench.encoder.update(0xFFFF_FFFF),
         f"update command with the name {other.update_text.decode()}": bench.encoder.update(
-            len(it.image), other.update_text
+            len(session.image), other.update_text
         ),
     }
     for stimulus, frames in stimuli.items():
         for _ in range(REPEATS):
-            it.enter()
+            session.enter()
             bench.send(frames)
             heard = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
             answers = [one for one in heard if one.kind is not MessageKind.BOOT_VERSION]
-            yield Trial(_word(answers), told(answers), stimulus)
-            it.await_application()
+            yield Trial(_choice_for(answers), answer_text(answers), stimulus)
+            session.await_application()
 
 
-def feedback(it: InitSession) -> Findings:
+def feedback(session: InitSession) -> Findings:
     """General feedback of the bootloader, to an unknown write and to those of an upgrade."""
-    bench = it.bench
+    bench = session.bench
     unknown = bench.encoder.message(WRITE, _UNKNOWN, bytes(_UNKNOWN & 0xFF))
     for _ in range(REPEATS):
-        first = it.enter()
+        first = session.enter()
         bench.send(unknown)
-        it.update()
-        it.packets(1)
+        session.update()
+        session.packets(1)
         bench.send(unknown)
         bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
-        it.packets()
-        count = it.feedback_since(first.at)
+        session.packets()
+        count = session.feedback_since(first.at)
         answer = f"general feedback {count} times" if count else "no general feedback"
         stimulus = "an unknown write, update command and packets"
         yield Trial("either" if count else "silence", answer, stimulus)
-        it.finish()
+        session.finish()
 
 
-def update_twice(it: InitSession) -> Findings:
+def update_twice(session: InitSession) -> Findings:
     """Two update commands in a row."""
-    bench = it.bench
-    update = bench.encoder.update(len(it.image))
+    bench = session.bench
+    update = bench.encoder.update(len(session.image))
     for _ in range(REPEATS):
-        it.enter()
+        session.enter()
         bench.wait_for_window()
         bench.send(update + update)
         first = bench.wait_for(MessageKind.REQUEST)
@@ -278,24 +280,24 @@ def update_twice(it: InitSession) -> Findings:
         value = {1: "once", 2: "each"}.get(count, "")
         answer = f"request transfer {count} times"
         yield Trial(value, answer, "two update commands in a row")
-        it.stored = 0
-        it.finish() if count else it.await_application()
+        session.stored = 0
+        session.finish() if count else session.await_application()
 
 
-def application(it: InitSession) -> Findings:
+def application(session: InitSession) -> Findings:
     """Messages of the upgrade to the running application."""
-    bench = it.bench
-    for stimulus, frames in bench.encoder.upgrade_messages(len(it.image)).items():
+    bench = session.bench
+    for stimulus, frames in bench.encoder.upgrade_messages(len(session.image)).items():
         for _ in range(REPEATS):
             bench.forget()
-            with bench.tester.hearing_feedback():
+            with bench.tester.collecting_feedback():
                 bench.send(frames)
                 heard = bench.collect(bench.limit("silence_s"))
-            yield Trial(_word(heard), told(heard), f"{stimulus} to the application")
-    it.await_application()
+            yield Trial(_choice_for(heard), answer_text(heard), f"{stimulus} to the application")
+    session.await_application()
 
 
-def _word(heard: list[Received]) -> str:
+def _choice_for(heard: list[Received]) -> str:
     """The value for one answer, or none."""
     if not heard:
         return "silence"
@@ -306,26 +308,28 @@ def _word(heard: list[Received]) -> str:
 # -- without an application -----------------------------------------------------------------------
 
 
-def _way_out(it: InitSession) -> str:
+def _why_no_exit(session: InitSession) -> str:
     """Why nothing ends a transfer of this device; empty when something does."""
-    if needs_power(it.bench.profile) and not it.bench.subject.has_power:
+    if needs_power(session.bench.profile) and not session.bench.subject.has_power:
         return "only power would end a transfer, and none is controlled"
-    can_leave = it.bench.choice("tx_13") == "restarts" or it.bench.choice("tx_12") == "announces"
-    if not (can_leave or it.bench.subject.has_power):
+    can_leave = (
+        session.bench.choice("tx_13") == "restarts" or session.bench.choice("tx_12") == "announces"
+    )
+    if not (can_leave or session.bench.subject.has_power):
         return "neither a reset nor a pause ends a transfer, and no power is controlled"
     return ""
 
 
-def without_application(it: InitSession) -> Findings:
+def without_application(session: InitSession) -> Findings:
     """A bootloader that has nothing to start."""
-    bench = it.bench
-    why = _way_out(it)
+    bench = session.bench
+    why = _why_no_exit(session)
     if why:
         yield why
         return
     count = bench.number("versions")
     for _ in range(REPEATS):
-        it.begin()
+        session.begin()
         bench.leave_transfer()
         more, last_at = 0, bench.now
         while more < 2 * count:
@@ -338,32 +342,32 @@ def without_application(it: InitSession) -> Findings:
         answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
         stimulus = "the first one, without an application"
         yield Trial(value, answer, stimulus, "after")
-        it.update()
-        it.finish()
+        session.update()
+        session.finish()
 
 
-def largest_image(it: InitSession) -> Findings:
+def largest_image(session: InitSession) -> Findings:
     """The largest size that an update command is taken with."""
-    bench = it.bench
+    bench = session.bench
     restarts_at_once = bench.choice("up_08") == "starts_over"
-    why = "" if restarts_at_once else _way_out(it)
+    why = "" if restarts_at_once else _why_no_exit(session)
     if why:
         yield why
         return
-    it.begin()
+    session.begin()
     if not restarts_at_once:
         bench.leave_transfer()
     erase_s = max(one.value_s for one in bench.judge.measurements if one.name == Times.REQUEST)
 
     def is_taken(size_bytes: int) -> bool:
-        share = packet_count(size_bytes) / it.total
+        share = packet_count(size_bytes) / session.total
         within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
-        taken = _is_size_taken(it, bench.encoder.update(size_bytes), within_s)
+        taken = _is_size_taken(session, bench.encoder.update(size_bytes), within_s)
         if taken and not restarts_at_once:
             bench.leave_transfer()
         return taken
 
-    low, high = len(it.image), 0
+    low, high = len(session.image), 0
     while not high and low < IMAGE_BYTES_MAX:
         size = min(2 * low, IMAGE_BYTES_MAX)
         if is_taken(size):
@@ -373,17 +377,17 @@ def largest_image(it: InitSession) -> Findings:
     while high - low > 1:
         size = (low + high) // 2
         low, high = (size, high) if is_taken(size) else (low, size)
-    it.update()
-    it.finish()
+    session.update()
+    session.finish()
     said = f"update command for {low} bytes is taken"
     if high:
         said += f", and for {high} bytes not, by bisection"
     yield KeyAnswer("device.largest_image_bytes", low, said)
 
 
-def _is_size_taken(it: InitSession, frames: list[RawFrame], within_s: float) -> bool:
+def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float) -> bool:
     """True for request transfer. A NAK, or a bootloader that announces itself on, says no."""
-    bench = it.bench
+    bench = session.bench
     bench.forget()
     sent = bench.send(frames)
     deadline, versions = sent.left_at + within_s, 0
@@ -399,6 +403,6 @@ def _is_size_taken(it: InitSession, frames: list[RawFrame], within_s: float) -> 
     return False
 
 
-def _up(value_s: float) -> float:
+def _rounded_up(value_s: float) -> float:
     """To tenths of a millisecond, never less."""
     return ceil(value_s * 10_000 - 1e-6) / 10_000

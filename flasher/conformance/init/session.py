@@ -146,18 +146,18 @@ class InitSession(PacketTransfer):
         """Send frames that hold the next packet; True when it is acknowledged. It is stored
         afterwards, one way or the other.
         """
-        taken = any(map(self.is_taken, self.answers(frames, gap_s=gap_s, gaps=gaps)))
+        taken = any(map(self.is_accepted, self.answers(frames, gap_s=gap_s, gaps=gaps)))
         if taken:
             self.stored += 1
         else:
-            self.insist()
+            self.deliver_packet()
         return taken
 
-    def insist(self) -> None:
+    def deliver_packet(self) -> None:
         """The next packet as it should be, more than once if need be."""
         bench = self.bench
         bench.forget()
-        trouble = bench.host.insist_on_packet(self.image, self.stored + 1, bench.now)
+        trouble = bench.host.deliver_packet(self.image, self.stored + 1, bench.now)
         bench.require(not trouble, f"ACK {self.stored + 1}", trouble or "ACK")
         self.stored += 1
 
@@ -173,6 +173,6 @@ class InitSession(PacketTransfer):
         )
 
 
-def told(heard: Sequence[Received]) -> str:
+def answer_text(heard: Sequence[Received]) -> str:
     """Some answers in words."""
     return describe(heard) if heard else "silence"

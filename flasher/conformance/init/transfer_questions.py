@@ -8,16 +8,16 @@ from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
 from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
-from flasher.conformance.init.session import REPEATS, InitSession, told
+from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import Times
-from flasher.conformance.profile import words
+from flasher.conformance.profile import choice_words
 from flasher.conformance.wire import (
     PACKET_BYTES,
     MessageKind,
     RawFrame,
-    filled_up,
     joined,
     packet_payload,
+    padded_to_frame,
 )
 
 _LOST_FRAMES: Final = (1, 9, 17)
@@ -39,67 +39,75 @@ _PACKETS_READ_BACK: Final = 33
 # -- repetitions and bad packets ------------------------------------------------------------------
 
 
-def _asked(
-    it: InitSession, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
+def _repeat_trial(
+    session: InitSession, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
 ) -> Iterator[Trial]:
-    """Send that some times. `words` are those for the answers, "NAK" for any other NAK."""
+    """Send that some times. `choice_words` are those for the answers, "NAK" for any other NAK."""
     for _ in range(REPEATS):
-        it.bench.forget()
-        it.bench.send(frames)
-        heard = it.bench.answers()
+        session.bench.forget()
+        session.bench.send(frames)
+        heard = session.bench.answers()
         is_nak = [one.kind for one in heard] == [MessageKind.NAK]
-        value = words.get(told(heard)) or words.get(MessageKind.NAK.value if is_nak else "", "")
-        yield Trial(value, told(heard), stimulus)
+        value = words.get(answer_text(heard)) or words.get(
+            MessageKind.NAK.value if is_nak else "", ""
+        )
+        yield Trial(value, answer_text(heard), stimulus)
 
 
-def repeated_packet(it: InitSession) -> Findings:
+def repeated_packet(session: InitSession) -> Findings:
     """The packet stored last, again."""
-    it.begin()
+    session.begin()
     for stored in (1, 2):
-        it.reach(stored, 1)
+        session.reach(stored, 1)
         words = {f"ACK {stored}": "ack", f"NAK {stored + 1}": "nak_next"}
-        yield from _asked(it, f"packet {stored} again", it.packet(stored), words)
-    it.finish()
+        yield from _repeat_trial(session, f"packet {stored} again", session.packet(stored), words)
+    session.finish()
 
 
-def older_packet(it: InitSession) -> Findings:
+def older_packet(session: InitSession) -> Findings:
     """A packet before the one stored last."""
-    it.begin()
-    it.reach(3, 1)
+    session.begin()
+    session.reach(3, 1)
     for number in (1, 2):
         words = {f"ACK {number}": "ack", "silence": "silence", "NAK": "nak"}
-        stimulus = f"packet {number} after packet {it.stored}"
-        yield from _asked(it, stimulus, it.packet(number), words)
-    it.finish()
+        stimulus = f"packet {number} after packet {session.stored}"
+        yield from _repeat_trial(session, stimulus, session.packet(number), words)
+    session.finish()
 
 
-def bad_packet(it: InitSession) -> Findings:
+def bad_packet(session: InitSession) -> Findings:
     """Packets that are damaged, or make no sense."""
     trials = list[Trial]()
-    it.begin()
-    it.reach(2, 3)
-    wanted, after, encoder = it.stored + 1, it.stored + 2, it.bench.encoder
-    payload = packet_payload(it.image, wanted)
+    session.begin()
+    session.reach(2, 3)
+    wanted, after, encoder = session.stored + 1, session.stored + 2, session.bench.encoder
+    payload = packet_payload(session.image, wanted)
     stimuli = {
-        f"packet {wanted} with a wrong CRC": (wanted, encoder.damaged_packet_of(it.image, wanted)),
-        f"packet {after} with a wrong CRC": (after, encoder.damaged_packet_of(it.image, after)),
-        f"packet {after} in the place of {wanted}": (after, it.packet(after)),
-        f"packet {wanted} of {it.total + 1}": (
+        f"packet {wanted} with a wrong CRC": (
             wanted,
-            encoder.packet(wanted, it.total + 1, payload),
+            encoder.damaged_packet_of(session.image, wanted),
+        ),
+        f"packet {after} with a wrong CRC": (
+            after,
+            encoder.damaged_packet_of(session.image, after),
+        ),
+        f"packet {after} in the place of {wanted}": (after, session.packet(after)),
+        f"packet {wanted} of {session.total + 1}": (
+            wanted,
+            encoder.packet(wanted, session.total + 1, payload),
         ),
         f"packet {wanted} with the start byte 02": (
             wanted,
-            encoder.packet(wanted, it.total, payload, start=2),
+            encoder.packet(wanted, session.total, payload, start=2),
         ),
     }
     for stimulus, (named, frames) in stimuli.items():
         words = {f"NAK {named}": "nak_received", f"NAK {wanted}": "nak_expected"}
         if wanted == named:
             words = {f"NAK {named}": "nak"}
-        trials += _asked(it, stimulus, frames, {**words, "silence": "silence"})
-    it.insist()
-    it.finish()
+        trials += _repeat_trial(session, stimulus, frames, {**words, "silence": "silence"})
+    session.deliver_packet()
+    session.finish()
     # A NAK with the one number that both ways give says only that there is a NAK.
     telling = {trial.value for trial in trials} - {"nak"}
     if len(telling) == 1:
@@ -113,15 +121,15 @@ def bad_packet(it: InitSession) -> Findings:
     yield from (trial._replace(value=word) for trial in trials)
 
 
-def lost_frame(it: InitSession) -> Findings:
+def lost_frame(session: InitSession) -> Findings:
     """Packets of which a frame is lost."""
-    bench = it.bench
-    it.begin()
+    bench = session.bench
+    session.begin()
     for index in _LOST_FRAMES:
         for _ in range(REPEATS):
-            it.reach(1, 2)
+            session.reach(1, 2)
             bench.forget()
-            frames = it.frames()
+            frames = session.frames()
             bench.send(frames[:index] + frames[index + 1 :])
             heard = bench.answers()
             late = bench.collect(_LATER_S)
@@ -131,147 +139,156 @@ def lost_frame(it: InitSession) -> Findings:
                 value = ""
             elif late:
                 value = "either"
-            answer = told([*heard, *late]) + (", late" if late else "")
+            answer = answer_text([*heard, *late]) + (", late" if late else "")
             stimulus = f"a packet without its frame {index + 1}"
-            yield Trial(value, answer.replace(f" {it.stored + 1}", ""), stimulus)
-            it.insist()
-    it.finish()
+            yield Trial(value, answer.replace(f" {session.stored + 1}", ""), stimulus)
+            session.deliver_packet()
+    session.finish()
 
 
-def filler(it: InitSession) -> Findings:
+def filler(session: InitSession) -> Findings:
     """Other bytes than FF behind the end of the image, in the last packet."""
-    bench = it.bench
-    rest = it.image[(it.total - 1) * PACKET_BYTES :]
+    bench = session.bench
+    rest = session.image[(session.total - 1) * PACKET_BYTES :]
     if len(rest) == PACKET_BYTES:
         yield "the good image is a whole number of packets"
         return
     for _ in range(REPEATS):
-        it.begin()
-        it.packets(it.total - 1)
-        other = bench.encoder.packet(it.total, it.total, rest.ljust(PACKET_BYTES, b"\0"))
+        session.begin()
+        session.packets(session.total - 1)
+        other = bench.encoder.packet(session.total, session.total, rest.ljust(PACKET_BYTES, b"\0"))
         bench.send(other)
-        heard = told(bench.answers())
-        taken = heard == f"ACK {it.total}"
+        heard = answer_text(bench.answers())
+        taken = heard == f"ACK {session.total}"
         value = "ignored" if taken else "rejected"
-        yield Trial(value, heard, f"packet {it.total}, filled with 00")
+        yield Trial(value, heard, f"packet {session.total}, filled with 00")
         if taken:
-            it.stored = it.total
-        it.finish()
+            session.stored = session.total
+        session.finish()
 
 
 # -- framing --------------------------------------------------------------------------------------
 
 
-def splits(it: InitSession) -> Findings:
+def splits(session: InitSession) -> Findings:
     """Messages in frames of other sizes."""
-    bench = it.bench
+    bench = session.bench
     for _ in range(REPEATS):
-        it.enter()
-        bench.wait_to_be_heard()
-        update = joined(bench.encoder.update(len(it.image)))
-        taken = it.offer_update(bench.encoder.frames(update, 5))
-        yield _taken(taken, "update command in frames of 5 bytes")
+        session.enter()
+        bench.wait_until_listening()
+        update = joined(bench.encoder.update(len(session.image)))
+        taken = session.offer_update(bench.encoder.frames(update, 5))
+        yield _accepted_trial(taken, "update command in frames of 5 bytes")
         if not taken:  # the window is over by now
-            it.await_application()
-            it.begin()
+            session.await_application()
+            session.begin()
         for form in forms(bench.encoder)["fr_01"]:
-            yield _offered(it, form, "fr_01")
+            yield _offer_form(session, form, "fr_01")
         for _ in range(_RANDOM_SPLITS):
-            it.reach(0, 1)
-            taken = it.offer(bench.encoder.frames_by_chance(it.raw(), bench.random))
-            yield _taken(taken, "a packet in frames of 1 to 8 bytes")
-        it.finish()
+            session.reach(0, 1)
+            taken = session.offer(bench.encoder.frames_by_chance(session.raw(), bench.random))
+            yield _accepted_trial(taken, "a packet in frames of 1 to 8 bytes")
+        session.finish()
 
 
-def in_forms(it: InitSession, key: str) -> Findings:
+def in_forms(session: InitSession, key: str) -> Findings:
     """Packets in the forms that one key of the profile decides about."""
-    it.begin()
-    for form in forms(it.bench.encoder)[key]:
+    session.begin()
+    for form in forms(session.bench.encoder)[key]:
         for _ in range(REPEATS):
-            yield _offered(it, form, key)
-    it.finish()
+            yield _offer_form(session, form, key)
+    session.finish()
 
 
-def _offered(it: InitSession, form: PacketForm, key: str) -> Trial:
-    it.reach(0, 1)
-    taken = it.offer(it.bench.encoder.frames(form.before + it.raw(), form.frame_bytes))
-    return _taken(taken, form.asked, *words(key))
+def _offer_form(session: InitSession, form: PacketForm, key: str) -> Trial:
+    session.reach(0, 1)
+    taken = session.offer(
+        session.bench.encoder.frames(form.before + session.raw(), form.frame_bytes)
+    )
+    return _accepted_trial(taken, form.asked, *choice_words(key))
 
 
-def padded(it: InitSession) -> Findings:
+def padded(session: InitSession) -> Findings:
     """Update command and end of transfer, their last frames filled up."""
-    bench = it.bench
+    bench = session.bench
     within_s = bench.limit("complete_s")
     if bench.choice("tx_12") == "announces":  # while the transfer still lasts
         within_s = min(within_s, bench.limit("pause_s") / 2)
     for byte in PADDINGS:
-        it.enter()
-        bench.wait_to_be_heard()
-        taken = it.offer_update(filled_up(bench.encoder.update(len(it.image)), byte))
+        session.enter()
+        bench.wait_until_listening()
+        taken = session.offer_update(
+            padded_to_frame(bench.encoder.update(len(session.image)), byte)
+        )
         said = f"padded with {byte:02X}"
-        yield _taken(taken, f"update command {said}", "ignored", "rejected")
+        yield _accepted_trial(taken, f"update command {said}", "ignored", "rejected")
         if not taken:  # the window is over by now
-            it.await_application()
-            it.begin()
-        it.packets()
+            session.await_application()
+            session.begin()
+        session.packets()
         bench.forget()
-        sent = bench.send(filled_up(bench.encoder.end(), byte))
+        sent = bench.send(padded_to_frame(bench.encoder.end(), byte))
         heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
-        yield _taken(heard is not None, f"end {said}", "ignored", "rejected")
+        yield _accepted_trial(heard is not None, f"end {said}", "ignored", "rejected")
         if heard is None:
             bench.forget()
             bench.end_transfer()
         else:
             bench.measure(Times.COMPLETE, heard.at - sent.left_at)
-        it.await_application()
+        session.await_application()
 
 
-def gaps(it: InitSession) -> Findings:
+def gaps(session: InitSession) -> Findings:
     """Packets with gaps between their frames."""
-    it.begin()
-    for gap_s, count in it.bench.gaps(it.frames(), _SHARES):
+    session.begin()
+    for gap_s, count in session.bench.gaps(session.frames(), _SHARES):
         for _ in range(REPEATS):
-            it.reach(0, 1)
-            taken = it.offer(it.frames(), gap_s=gap_s, gaps=count)
+            session.reach(0, 1)
+            taken = session.offer(session.frames(), gap_s=gap_s, gaps=count)
             stimulus = f"a packet with {gap_s * 1000:.1f} ms between its frames"
-            yield _taken(taken, stimulus, "accepted", "either")
-    it.finish()
+            yield _accepted_trial(taken, stimulus, "accepted", "either")
+    session.finish()
 
 
-def _taken(taken: bool, stimulus: str, yes: str = "accepted", no: str = "rejected") -> Trial:  # noqa: FBT001
+def _accepted_trial(
+    taken: bool,  # noqa: FBT001
+    stimulus: str,
+    yes: str = "accepted",
+    no: str = "rejected",
+) -> Trial:
     return Trial(yes if taken else no, "taken" if taken else "not taken", stimulus, "")
 
 
 # -- update command, pause and reset in a transfer ------------------------------------------------
 
 
-def update_again(it: InitSession) -> Findings:
+def update_again(session: InitSession) -> Findings:
     """Update command after packet 3, for the same size and for another one."""
-    bench = it.bench
+    bench = session.bench
     for _ in range(REPEATS):
-        it.begin()
+        session.begin()
         for step, size in (("the same size", 0), ("one packet less", PACKET_BYTES)):
-            it.reach(3, 1)
-            stored = it.stored
+            session.reach(3, 1)
+            stored = session.stored
             bench.forget()
-            taken = it.offer_update(bench.encoder.update(len(it.image) - size))
+            taken = session.offer_update(bench.encoder.update(len(session.image) - size))
             answer = "request transfer" if taken else "no request transfer"
             stimulus = f"update command for {step} after packet {stored}"
             yield Trial("starts_over" if taken else "rejected", answer, stimulus)
             if taken and size:
-                it.update()
+                session.update()
             elif not taken:
-                it.insist()
-        it.finish()
+                session.deliver_packet()
+        session.finish()
 
 
-def pause(it: InitSession) -> Findings:
+def pause(session: InitSession) -> Findings:
     """Pauses in the transfer."""
-    bench = it.bench
-    places, found_s = (1, 0, it.total), list[float]()
+    bench = session.bench
+    places, found_s = (1, 0, session.total), list[float]()
     for stored in places:
-        it.begin()
-        it.packets(stored)
+        session.begin()
+        session.packets(stored)
         began_at = bench.now
         heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=_PAUSE_WATCHED_S)
         stimulus = f"a pause after packet {stored}" if stored else "a pause before packet 1"
@@ -281,8 +298,8 @@ def pause(it: InitSession) -> Findings:
         else:
             found_s.append(heard.at - began_at)
             yield Trial("announces", "boot version", stimulus, "after")
-            it.update()
-        it.finish()
+            session.update()
+        session.finish()
     if len(found_s) < len(places):
         why = f"no boot version in a pause of {_PAUSE_WATCHED_S:g} s; the default stands"
         yield KeyAnswer("limits.pause_s", None, why)
@@ -295,16 +312,16 @@ def pause(it: InitSession) -> Findings:
     yield KeyAnswer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
 
 
-def reset_again(it: InitSession) -> Findings:
+def reset_again(session: InitSession) -> Findings:
     """Reset before packet 1, amid the packets and before the end."""
-    bench = it.bench
+    bench = session.bench
     within_s = bench.limit("first_version_s")
     if bench.choice("tx_12") == "announces":
         # Later than that, it is the pause that ends the transfer.
         within_s = min(within_s, _BEFORE_PAUSE * bench.limit("pause_s"))
-    for stored in (0, 1, it.total):
-        it.begin()
-        it.packets(stored)
+    for stored in (0, 1, session.total):
+        session.begin()
+        session.packets(stored)
         bench.forget()
         bench.send(bench.encoder.reset())
         heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
@@ -312,21 +329,21 @@ def reset_again(it: InitSession) -> Findings:
         value, answer = ("restarts", "boot version") if heard else ("ignored", "no boot version")
         yield Trial(value, answer, stimulus, "after")
         if heard is not None:
-            it.update()
-        it.finish()
+            session.update()
+        session.finish()
 
 
 # -- the end, and what is stored ------------------------------------------------------------------
 
 
-def end_again(it: InitSession) -> Findings:
+def end_again(session: InitSession) -> Findings:
     """End of transfer once more, right after complete."""
-    bench = it.bench
+    bench = session.bench
     for _ in range(REPEATS):
-        it.begin()
-        it.packets()
+        session.begin()
+        session.packets()
         bench.end_transfer()
-        with bench.tester.hearing_feedback():
+        with bench.tester.collecting_feedback():
             bench.send(bench.encoder.end())
             heard = bench.collect(bench.limit("ack_s"))
         heard = [one for one in heard if one.kind in _END_ANSWERS]
@@ -337,24 +354,24 @@ def end_again(it: InitSession) -> Findings:
             (MessageKind.FEEDBACK,): "silence",
             (MessageKind.COMPLETE,): "same_answer",
         }
-        yield Trial(words.get(tuple(kinds), ""), told(heard), "end of transfer again")
-        it.await_application()
+        yield Trial(words.get(tuple(kinds), ""), answer_text(heard), "end of transfer again")
+        session.await_application()
 
 
-def buffer(it: InitSession) -> Findings:
+def buffer(session: InitSession) -> Findings:
     """What is acknowledged and not yet in the flash."""
-    bench = it.bench
+    bench = session.bench
     if not bench.subject.has_readback:
         yield "the bench has no readback"
         return
-    lacking, count = 0, min(it.total - 1, _PACKETS_READ_BACK)
-    it.begin()
+    lacking, count = 0, min(session.total - 1, _PACKETS_READ_BACK)
+    session.begin()
     for number in range(1, count + 1):
-        it.packets(number)
-        wanted = it.image[: number * PACKET_BYTES]
+        session.packets(number)
+        wanted = session.image[: number * PACKET_BYTES]
         same = bench.difference(wanted)
         lacking = max(lacking, 0 if same is None else len(wanted) - same)
-    it.finish()
+    session.finish()
     # The last packet may be on its way into the flash when its ACK comes (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
     seen = f"after ACK 1 to {count} at most {lacking} bytes were not in the flash"
