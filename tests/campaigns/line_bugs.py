@@ -1,30 +1,30 @@
 """Plants mistakes in the station, and has the campaign of the line find each of them:
 `python -m tests.campaigns.line_bugs`, or with the names of some.
 
-The mistakes are in `line_bugs.toml`. Each is planted in a copy of the package, on which a process
-of its own draws stories (`tests.campaigns.line_world`) until one ends in a violation that the
-package without the mistake does not have, for at most a minute of computing time; that story is
-shrunk. Prints what was found how, and after how long; fails when a mistake is not found.
+The mistakes are in `line_bugs.toml`, each with a story that it spoils. One is planted by giving the
+functions that it changes their other code; with it stories are drawn (`tests.campaigns.line_world`)
+until one ends in a violation that the station without the mistake does not have, for at most a
+minute of computing time; that story is shrunk. Prints what was found how, and after how long;
+fails when a mistake is not found.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import inspect
 import os
-import shutil
 import statistics
-import subprocess
 import sys
-import tempfile
-import threading
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Final
 
 from tests.campaigns.line_world.play import draw, play, shrink
@@ -36,7 +36,7 @@ ACTS: Final = 60
 """Of one story."""
 LIMIT_S: Final = 60.0
 _BUGS: Final = Path(__file__).with_suffix(".toml")
-_YES: Final = "yes"
+Codes = dict[FunctionType, CodeType]
 
 
 # -- the mistakes ---------------------------------------------------------------------------------
@@ -55,6 +55,9 @@ class Bug:
     name: str
     breaks: str
     """Which promise, and how."""
+    kind: str
+    """Of the violation with which its story ends."""
+    story: str
     edits: Sequence[Edit]
 
     def modules(self) -> dict[str, str]:
@@ -70,58 +73,79 @@ class Bug:
             changed[edit.file] = text.replace(edit.old, edit.new)
         return changed
 
+    def codes(self) -> Codes:
+        """The code of each function that it changes."""
+        changed: Codes = {}
+        for file, text in self.modules().items():
+            module = import_module(file.removesuffix(".py").replace("/", "."))
+            for name, code in _codes_in(compile(text, module.__file__ or file, "exec")):
+                function = _function(vars(module), name)
+                if function is not None and _differ(function.__code__, code):
+                    changed[function] = code
+        return changed
+
+
+def _codes_in(code: CodeType) -> Iterator[tuple[str, CodeType]]:
+    """The functions of a module or a class, by their qualified names."""
+    for each in code.co_consts:
+        if isinstance(each, CodeType):
+            if each.co_flags & inspect.CO_OPTIMIZED:
+                yield each.co_qualname, each
+            else:
+                yield from _codes_in(each)
+
+
+def _function(names: Mapping[str, object], name: str) -> FunctionType | None:
+    *classes, last = name.split(".")
+    for each in classes:
+        names = vars(names.get(each, object))
+    found = names.get(last)
+    found = found.fget if isinstance(found, property) else found
+    found = inspect.unwrap(getattr(found, "__func__", found))  # type: ignore[arg-type]
+    return found if isinstance(found, FunctionType) else None
+
+
+def _differ(one: CodeType, other: CodeType) -> bool:
+    """Compares what they do, not where they are."""
+    mine, theirs = one.co_consts, other.co_consts
+    if (one.co_code, one.co_names, len(mine)) != (other.co_code, other.co_names, len(theirs)):
+        return True
+    return any(
+        _differ(a, b) if isinstance(a, CodeType) and isinstance(b, CodeType) else a != b
+        for a, b in zip(mine, theirs, strict=True)
+    )
+
+
+@contextmanager
+def swapped(codes: Codes) -> Iterator[None]:
+    """Functions have this code, or, in a story with it, their own again."""
+    _swap(codes)
+    try:
+        yield
+    finally:
+        _swap(codes)
+
+
+def _swap(codes: Codes) -> None:
+    for function, code in codes.items():
+        codes[function], function.__code__ = function.__code__, code
+
 
 def read_bugs() -> list[Bug]:
     tables = tomllib.loads(_BUGS.read_text("utf-8"))["bug"]
     return [
-        Bug(table["name"], table["breaks"], [Edit(**edit) for edit in table["edit"]])
+        Bug(
+            table["name"],
+            table["breaks"],
+            table["kind"],
+            " ".join(table["story"].split()),
+            [Edit(**edit) for edit in table["edit"]],
+        )
         for table in tables
     ]
 
 
-def plant(bug: Bug, folder: Path) -> None:
-    """Copy the package into a folder, with the mistake."""
-    shutil.copytree(CHECKOUT / "flasher", folder / "flasher")
-    for file, text in bug.modules().items():
-        (folder / file).write_text(text, "utf-8")
-
-
-# -- the process that has the mistake -------------------------------------------------------------
-
-
-def hunt(seed: int, limit_s: float, *, shrinks: bool) -> None:
-    """Find a story, shrink it, and print it. What is found is asked about on standard input: it
-    counts only when the package without the mistake takes it well.
-    """
-    steps = 0
-
-    def is_ours(story: Story) -> bool:
-        _print(story=str(story), kind=found.kind)
-        return sys.stdin.readline().strip() == _YES
-
-    while time.process_time() < limit_s:
-        found = draw(seed, ACTS)
-        seed, steps = seed + 1, steps + len(found.done)
-        if found.kind and is_ours(found.story):
-            took_s = time.process_time()
-            shrunk = shrink(found, is_ours) if shrinks else found
-            _print(
-                kind=shrunk.kind,
-                text=shrunk.text,
-                seconds=took_s,
-                steps=steps,
-                end=str(shrunk.story),
-            )
-            return
-    _print(kind="", text="", seconds=time.process_time(), steps=steps, end="")
-
-
-def _print(**what: object) -> None:
-    sys.stdout.write(json.dumps(what) + "\n")
-    sys.stdout.flush()
-
-
-# -- who starts it, and knows the package as it is ------------------------------------------------
+# -- the search -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -155,51 +179,29 @@ class Found:
             yield f"    ({self.not_ours} stories that end so without the mistake were left out)"
 
 
-_playing = threading.Lock()
-
-
 def find(bug: Bug, seed: int, limit_s: float, *, shrinks: bool) -> Found:
-    with tempfile.TemporaryDirectory() as name:
-        plant(bug, Path(name))
-        command = [sys.executable, "-m", "tests.campaigns.line_bugs", "--hunt"]
-        command += ["--seed", str(seed), "--seconds", str(limit_s)]
-        command += [] if shrinks else ["--no-shrink"]
-        # The working directory comes first: its package is the one with the mistake.
-        environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-        with subprocess.Popen(
-            command,
-            cwd=name,
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as process:
-            return _converse(process, bug)
+    """Draw stories with a mistake. What is found counts only when the station without it takes it
+    well.
+    """
+    codes = bug.codes()
+    steps = not_ours = 0
+    began_at = time.process_time()
 
+    def is_ours(story: Story) -> bool:
+        with swapped(codes):
+            return not play(story, goes_home=found.kind == STUCK).kind
 
-def _converse(process: subprocess.Popen[str], bug: Bug) -> Found:
-    assert process.stdin is not None
-    assert process.stdout is not None
-    not_ours = 0
-    for line in process.stdout:
-        told = json.loads(line)
-        if "end" in told:
-            return Found(
-                bug,
-                told["kind"],
-                told["text"],
-                told["seconds"],
-                told["steps"],
-                told["end"],
-                not_ours,
-            )
-        with _playing:
-            story = Story.parse(told["story"])
-            is_ours = not play(story, goes_home=told["kind"] == STUCK).kind
-        not_ours += not is_ours
-        process.stdin.write(f"{_YES if is_ours else 'no'}\n")
-        process.stdin.flush()
-    return Found(bug, "", f"Its process ended with code {process.wait()}.", 0.0, 0, "", not_ours)
+    with swapped(codes):
+        while (took_s := time.process_time() - began_at) < limit_s:
+            found = draw(seed, ACTS)
+            seed, steps = seed + 1, steps + len(found.done)
+            if found.kind and is_ours(found.story):
+                took_s = time.process_time() - began_at
+                shrunk = shrink(found, is_ours) if shrinks else found
+                story = str(shrunk.story)
+                return Found(bug, shrunk.kind, shrunk.text, took_s, steps, story, not_ours)
+            not_ours += bool(found.kind)
+    return Found(bug, "", "", took_s, steps, "", not_ours)
 
 
 def _say(line: str) -> None:
@@ -218,16 +220,12 @@ def main() -> int:
         "--seconds", type=float, default=LIMIT_S, help="computing time for each, without shrinking"
     )
     parser.add_argument("--no-shrink", action="store_true")
-    parser.add_argument("--hunt", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
-    if chosen.hunt:
-        hunt(chosen.seed, chosen.seconds, shrinks=not chosen.no_shrink)
-        return 0
     bugs = [bug for bug in read_bugs() if bug.name.startswith(tuple(chosen.bugs) or "")]
     if not bugs:
         parser.error(f"no mistake has such a name: {', '.join(chosen.bugs)}")
     found: list[Found] = []
-    with ThreadPoolExecutor(chosen.jobs) as pool:
+    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
         search = partial(
             find, seed=chosen.seed, limit_s=chosen.seconds, shrinks=not chosen.no_shrink
         )

@@ -6,7 +6,7 @@ was done is the story.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -31,8 +31,8 @@ def setup_of(chance: random.Random) -> Story:
     bare = chance.choice((0.1, 0.1, 0.5))
     units = []
     for label in range(1, sockets + chance.choice((1, 2)) + 1):
-        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 1.5, 4, 2, 0.5))[0]
-        firmware = "new" if chance.random() < 0.3 else "old"
+        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 0.5))[0]
+        firmware = "new" if chance.random() < 0.4 else "old"
         units.append(
             stories.UnitSetup(
                 label=label,
@@ -42,9 +42,9 @@ def setup_of(chance: random.Random) -> Story:
                 answers=chance.random() > 0.04,
             )
         )
-    people = []
+    people, pages = [], chance.choice((4, 4, 12))
     for name in ("jo", "al", "mo")[: chance.choice((1, 1, 2, 2, 3))]:
-        source = chance.choices(("page", name, "mounted"), (4, 4, 1))[0]
+        source = chance.choices(("page", name, "mounted"), (pages, 4, 1))[0]
         people.append(stories.Person(name=name, source=source))
     recipe = chance.choices(list(_RECIPES), list(_RECIPES.values()))[0]
     line = stories.LineSetup(sockets=sockets, recipe=recipe)  # type: ignore[arg-type]
@@ -108,8 +108,12 @@ class Teller:
             self._serve: 8.0,
             self._exchange: 3.0,
             self._exchange_in_step: 3.0,
+            self._exchange_complete: 2.0,
             self._swap: 2.0,
             self._clear: 5.0,
+            self._take_out_again: 1.5,
+            self._scan_at_once: 2.0,
+            self._be_interrupted: 1.0,
             self._cancel: 0.6,
             self._free: 0.4,
             self._abort: 0.3,
@@ -178,13 +182,13 @@ class Teller:
     def _trouble(self, name: str, unit: int) -> Iterator[Step]:
         """Between the card of a unit and its label."""
         bay = self.world.where(unit)
-        if bay is not None and self.chance.random() < 0.3:
-            yield self._pause(), stories.KillWorker(socket=bay.name)
-        if bay is None or bay.unit is None or self.chance.random() < 0.5:
+        if bay is None or bay.unit is None or self.chance.random() < 0.4:
             yield from self._swap(name)
-        else:
-            yield from self._put_another(bay)
-            yield self.chance.uniform(0.0, 0.15), stories.Label(by=name, unit=unit)
+            return
+        yield from self._put_another(bay)
+        # Before the other one announces itself, or before anybody reads that the card was dropped.
+        wait = self.chance.choice((self.chance.uniform(0.0, 0.15), self.chance.uniform(0.1, 0.9)))
+        yield wait, stories.Label(by=name, unit=unit)
 
     def _exchange_in_step(self, _name: str) -> Iterator[Step]:
         """Another unit into a socket, at a certain step of its run."""
@@ -193,15 +197,82 @@ class Teller:
         step = StepName.FLASH
         if not is_at_its_end:
             step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
-        give_up_at = self.world.now + 10.0
-        while not (bay.is_working and bay.step is step and bay.is_complete >= is_at_its_end):
-            if self.world.now > give_up_at:
-                return
-            yield 0.1, None
+        if not (yield from self._await(bay, step, is_complete=is_at_its_end)):
+            return
         # The step began up to 0.1 s ago.
         yield self.chance.choice((0.0, self.chance.uniform(0.0, 0.3))), None
         if bay.unit is not None:
             yield from self._put_another(bay, is_new=is_at_its_end)
+
+    def _await(self, bay: Bay, step: StepName, *, is_complete: bool) -> Generator[Step, None, bool]:
+        """Wait for a step of a socket's run; False when it does not come."""
+        give_up_at = self.world.now + 10.0
+        while not (bay.is_working and bay.step is step and bay.is_complete >= is_complete):
+            if self.world.now > give_up_at:
+                return False
+            yield 0.1, None
+        return True
+
+    def _exchange_complete(self, _name: str) -> Iterator[Step]:
+        """A unit whose image is complete, for one that runs that firmware already."""
+        bay = self.chance.choice(list(self.world.bays.values()))
+        if not (yield from self._await(bay, StepName.FLASH, is_complete=True)):
+            return
+        unit = None if bay.unit is None else self._setup(self._number(bay))
+        others = [self._setup(each) for each in self._on_table()]
+        others = [e for e in others if e.application == "new"]
+        if unit is not None and others:
+            other = self.chance.choice([e for e in others if e.number != unit.number] or others)
+            yield 0.0, stories.Pull(unit=unit.label)
+            yield self.chance.choice(_GAPS_S), stories.Put(unit=other.label, socket=bay.name)
+
+    def _take_out_again(self, name: str) -> Iterator[Step]:
+        """Scan a unit, and take it out as its run begins."""
+        bays = self._bays(full=True, working=False)
+        if bays:
+            bay = self.chance.choice(bays)
+            unit = self._number(bay)
+            yield self._pause(), stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
+            yield self.chance.uniform(0.0, 0.6), stories.Pull(unit=unit)
+            yield 4.0, stories.Put(unit=unit, socket=bay.name)
+
+    def _scan_at_once(self, name: str) -> Iterator[Step]:
+        """Two people at one page scan at once, each a unit of their own."""
+        bays, people = self._bays(full=True, working=False), self.world.people
+        others = [
+            each.name
+            for each in people.values()
+            if each.name != name and each.source == people[name].source
+        ]
+        if len(bays) > 1 and others and people[name].source != "mounted":
+            both = list(zip((name, self.chance.choice(others)), self._two_of(bays), strict=True))
+            for scan in (stories.Card, stories.Label):
+                for by, unit in both:
+                    yield self.chance.uniform(0.0, 1.0), scan(by=by, unit=unit)
+
+    def _two_of(self, bays: list[Bay]) -> list[int]:
+        return [self._number(each) for each in self.chance.sample(bays, 2)]
+
+    def _be_interrupted(self, name: str) -> Iterator[Step]:
+        """The socket of a card that waits works no more for a moment, and its unit is exchanged."""
+        bays = self._bays(full=True, working=False)
+        others = self._on_table()
+        if not (bays and others):
+            return
+        bay, other = self.chance.choice(bays), self.chance.choice(others)
+        unit = self._number(bay)
+        yield self._pause(), stories.Card(by=name, unit=unit)
+        if self.chance.random() < 0.6:
+            yield self._pause(), stories.KillWorker(socket=bay.name)
+        else:
+            yield self._pause(), stories.Unplug(socket=bay.name, seconds=2.0)
+        yield self.chance.uniform(0.0, 0.3), stories.Pull(unit=unit)
+        yield self.chance.choice((HAND_S, 0.3, 0.5)), stories.Put(unit=other, socket=bay.name)
+        yield self.chance.uniform(0.1, 3.0), stories.Label(by=name, unit=unit)
+
+    def _setup(self, number: int) -> stories.UnitSetup:
+        return next(each for each in self.world.setup.units if each.label == number)
 
     def _exchange(self, _name: str) -> Iterator[Step]:
         """Another unit into a socket that works."""
