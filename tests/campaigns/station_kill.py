@@ -205,8 +205,10 @@ class Campaign:
         problems = said["verify"]["problems"]
         for each in problems:
             self._wrong(Fault.RECORDS, f"{each['where']}: {each['what']}")
-        self.problems += self.operator.strange_units(said["report"]["runs"])
-        self.problems += self.operator.false_passes(said["report"]["runs"])
+        found = self.operator.strange_units(said["report"]["runs"])
+        found += self.operator.false_passes(said["report"]["runs"])
+        # What was done to a unit is found again after each kill.
+        self.problems += [each for each in found if each not in self.problems]
         runs = {run["run_id"]: run for run in said["report"]["runs"]}
         for event in self.operator.shown:
             run = runs.get(event["run_id"])

@@ -44,6 +44,8 @@ _JUST_S: Final = 1.0
 """What was done so short a time ago may have crossed what the station shows."""
 _GAPS_S: Final = (0.0, 0.3, 0.8)
 """How long a socket is empty while its unit is exchanged."""
+_SEEN_S: Final = 0.3
+"""The same where a process listens, which may not detect a faster hand (`station_run`)."""
 _NAMED: Final = re.compile(r"\binto socket ([0-9]+)\b")
 _FREE: Final = re.compile(r"If it is out, scan FREE ([0-9]+)")
 _CARD: Final = re.compile(r"\bscan (the card|SOCKET)\b", re.IGNORECASE)
@@ -455,6 +457,7 @@ class Operator:
             case Change.PLACES if others:
                 other = self.random.choice(others)
                 after, other.before = other.unit, other.unit
+                gap_s = max(gap_s, _SEEN_S) if self._is_there() else gap_s
                 self._pull(place)
                 self._pull(other)
                 self._pause(gap_s)
