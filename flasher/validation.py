@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 if TYPE_CHECKING:
     from pydantic_core import CoreSchema
+
+_Type = TypeVar("_Type", bound=type)
 
 
 @dataclass(frozen=True)
@@ -76,3 +78,35 @@ class LowerCaseInJson:
             lambda member: member.name.lower(), return_schema=words
         )
         return {**schema, "serialization": written}
+
+
+def json_keys(keys: str) -> Callable[[_Type], _Type]:
+    """Declares what JSON has of a dataclass, in this order: names of fields and of properties,
+    separated by blanks; `key=name` gives one another key. It is for writing only.
+    """
+    names = {key: name or key for key, _, name in (each.partition("=") for each in keys.split())}
+
+    def declare(kind: _Type) -> _Type:
+        def written(source: Any, handler: Any) -> CoreSchema:
+            from pydantic import Field  # noqa: PLC0415
+            from pydantic_core import core_schema  # noqa: PLC0415
+
+            schema: CoreSchema = handler(source)
+            whole: Any = handler.resolve_ref_schema(schema)
+            fields = {field["name"]: field for field in whole["schema"]["fields"]}
+            for name in names.values() - fields.keys():
+                read = getattr(kind, name)
+                read = getattr(read, "func", None) or read.fget  # cached_property, property
+                hint = get_type_hints(read, include_extras=True).pop("return")
+                value = handler.generate_schema(Annotated[hint, Field(description=read.__doc__)])
+                fields[name] = core_schema.dataclass_field(name, value)
+            whole["schema"]["fields"] = [
+                {**fields[name], "serialization_alias": key} for key, name in names.items()
+            ]
+            whole["fields"] = list(names.values())
+            return schema
+
+        kind.__get_pydantic_core_schema__ = staticmethod(written)  # type: ignore[attr-defined]
+        return kind
+
+    return declare

@@ -13,10 +13,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from flasher.errors import ErrorCode, ExitCode, Fault
-from flasher.events import Phase, QueryAnswered
-from flasher.host.outcome import DeviceLeft, Statistics
-from flasher.host.table import Ending
+from flasher.events import QueryAnswered
 from flasher.image.cortexm import VectorTable
+from flasher.image.image import AddressSpan
 from flasher.protocol.fields import Content
 
 if TYPE_CHECKING:
@@ -120,14 +119,6 @@ class ErrorDocument:
 
 
 @dataclass(frozen=True)
-class SegmentDocument:
-    """A run of bytes of the file."""
-
-    start: int
-    size_bytes: int
-
-
-@dataclass(frozen=True)
 class ImageDocument:
     """What is in the file, and of it the bytes to be sent."""
 
@@ -136,7 +127,7 @@ class ImageDocument:
     size_bytes: int
     base: int | None
     """Address of the first byte; null for a raw binary without --base."""
-    segments: list[SegmentDocument]
+    segments: tuple[AddressSpan, ...]
     filled_bytes: int
     version: str | None
     """The firmware version found inside."""
@@ -161,26 +152,6 @@ class PlanDocument:
     wire_s: float
     gaps_s: float
     """Silence between frames and before packets, on top of `wire_s`."""
-
-
-# -- upgrades --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class OutcomeDocument:
-    """How an upgrade ended."""
-
-    ending: Ending
-    phase: Phase
-    packet: int | None
-    device_left: DeviceLeft
-    boot_version: str | None
-    running_version: str | None
-    detail: str
-    statistics: Statistics
-    sent_into_silence: bool
-    """The device answered nothing, and got an update command: it might sit in a session that an
-    earlier upgrade had left open (R26)."""
 
 
 # -- surveys ---------------------------------------------------------------------------------------

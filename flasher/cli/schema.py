@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from pydantic import TypeAdapter
-from pydantic.json_schema import GenerateJsonSchema
+from pydantic.json_schema import CoreRef, DefsRef, GenerateJsonSchema, JsonSchemaMode
 from pydantic_core import core_schema
 
 from flasher import events
@@ -24,8 +24,25 @@ _REFERENCE: Final = re.compile(r'"#/\$defs/([^"]+)"')
 Schema = dict[str, Any]
 
 
+_PUBLISHED: Final = {
+    "flasher.conformance.results.WalkFinding": "FindingDocument",
+    "flasher.conformance.results.StepCoverage": "CoverageDocument",
+    "flasher.host.outcome.Outcome": "OutcomeDocument",
+    "flasher.host.write.FieldChange": "ChangeDocument",
+    "flasher.image.image.AddressSpan": "SegmentDocument",
+    "flasher.mock.variants.base.Variant": "VariantDocument",
+}
+"""Types whose definitions were published under another name than their own."""
+
+
 class _Generator(GenerateJsonSchema):
     """Every field of a document is there, and no other."""
+
+    def get_defs_ref(self, core_mode_ref: tuple[CoreRef, JsonSchemaMode]) -> DefsRef:
+        ref, mode = core_mode_ref
+        path, _, identity = ref.partition(":")
+        ref = CoreRef(f"{_PUBLISHED.get(path, path)}:{identity}")
+        return super().get_defs_ref((ref, mode))
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False

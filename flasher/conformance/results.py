@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 from flasher.conformance.wire import RawFrame
+from flasher.validation import json_keys
 
 FINAL_IMAGE_OK: Final = "verified"
 
@@ -360,3 +361,47 @@ class DeviceCrashed(CaseEnded):
 
 class RunStopped(CaseEnded):
     """The run was asked to end."""
+
+
+@json_keys("rule text steps first_steps replay")
+@dataclass(frozen=True)
+class WalkFinding:
+    """What a walk found."""
+
+    rule: str
+    """Which rule was broken: short, and the same from version to version."""
+    text: str
+    steps: tuple[str, ...]
+    """The shortest walk that finds it."""
+    first_steps: tuple[str, ...]  # those of the walk that found it first
+    trace: tuple[TraceEntry, ...] = ()
+    replay: str = ""  # the command that takes `steps` again
+
+
+@dataclass(frozen=True)
+class StepCoverage:
+    """How often a step was taken in a phase of the device."""
+
+    phase: str
+    step: str
+    count: int
+
+
+@json_keys("subject seed walks steps finding stopped coverage")
+@dataclass(frozen=True)
+class ExploreResult:
+    """What came of the walks."""
+
+    subject: str
+    seed: str
+    walks: int
+    steps: int
+    coverage: tuple[StepCoverage, ...]  # every pair of phase and step that a walk may meet
+    finding: WalkFinding | None = None
+    stopped: str = ""
+    """Why it ended before its number of steps; empty when it did not."""
+
+    @property
+    def not_covered(self) -> list[tuple[str, str]]:
+        """Pairs of phase and step that no walk met."""
+        return [(each.phase, each.step) for each in self.coverage if not each.count]

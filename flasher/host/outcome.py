@@ -30,6 +30,7 @@ from flasher.i18n import Text, text
 from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
 from flasher.protocol.spec import Target
+from flasher.validation import json_keys
 from flasher.wording import wording
 
 
@@ -78,29 +79,33 @@ def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int)
     )
 
 
+@json_keys(
+    "ending phase packet device_left boot_version running_version detail statistics"
+    " sent_into_silence"
+)
 @dataclass(frozen=True)
 class Outcome:
-    """The typed result of an upgrade."""
+    """How an upgrade ended."""
 
     ending: Ending
     phase: Phase
     device_left: DeviceLeft
     target: Target
     total_packets: int
+    # The packet that was in work, 1-based; None outside of the transfer.
     packet: int | None
-    """The packet that was in work, 1-based; None outside of the transfer."""
+    # Name and version as the bootloader announced them, escaped; None when it never did.
     boot_version: str | None
-    """Name and version as the bootloader announced them, escaped; None when it never did."""
+    # What the application answered, escaped; None when it was not asked or did not answer.
     running_version: str | None
-    """What the application answered, escaped; None when it was not asked or did not answer."""
     statistics: Statistics
+    # What was seen, where the ending alone does not say it.
     detail: str = ""
-    """What was seen, where the ending alone does not say it."""
     waiver: str = ""
     """The check that refused, where a person may waive it and the ending alone does not say it."""
     sent_into_silence: bool = False
-    """An update command was sent to a device that answered neither reset nor anything else, as it
-    might sit in a session that was left open (R26)."""
+    """The device answered nothing, and got an update command: it might sit in a session that an
+    earlier upgrade had left open (R26)."""
 
     @property
     def ok(self) -> bool:

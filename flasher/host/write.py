@@ -12,16 +12,17 @@ from flasher.errors import ErrorCode, FlasherError, UsageError, VerificationErro
 from flasher.host.items import Writable, find_item, make_content, meaningful_fields, writable
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
+from flasher.validation import json_keys
 
 
+@json_keys("old new read_back")
 @dataclass(frozen=True)
 class FieldChange:
-    """One field of a write: name and unit, and its value before, as wanted and as read back, each
-    safe to show; None where it is not known.
-    """
+    """A field of a write; null where a value is not known."""
 
     name: str
     unit: str
+    # Its value before, as wanted and as read back, each safe to show.
     old: str | None
     new: str
     read_back: str | None

@@ -17,13 +17,14 @@ ADDRESS_SPACE: Final = 1 << 32
 
 @dataclass(frozen=True)
 class AddressSpan:
-    """A stretch of addresses without gaps; `end` is one past the last."""
+    """A run of bytes of the file."""
 
     start: int
     size_bytes: int
 
     @property
     def end(self) -> int:
+        """One past the last address."""
         return self.start + self.size_bytes
 
     def __str__(self) -> str:

@@ -12,7 +12,7 @@ from pydantic import PydanticUserError
 
 from flasher.cli.documents import as_json
 from flasher.cli.schema import schema_of
-from flasher.validation import LowerCaseInJson
+from flasher.validation import LowerCaseInJson, json_keys
 
 
 class Colour(Enum):
@@ -100,3 +100,38 @@ class Opaque:
 def test_a_type_without_a_schema_is_refused() -> None:
     with pytest.raises(PydanticUserError, match="Opaque"):
         schema_of(Opaque)
+
+
+@json_keys("area_m2 long=length_m")
+@dataclass(frozen=True)
+class Field:
+    """A field."""
+
+    length_m: float
+    """From end to end."""
+    width_m: float = 1.0
+
+    @property
+    def area_m2(self) -> float:
+        """Of its ground."""
+        return self.length_m * self.width_m
+
+
+def test_a_type_names_its_keys_which_are_fields_and_properties_in_any_order() -> None:
+    assert list(as_json(Field(2.0, 3.0)).items()) == [("area_m2", 6.0), ("long", 2.0)]
+    schema = schema_of(Field)
+    assert schema["required"] == list(schema["properties"]) == ["area_m2", "long"]
+    assert schema["properties"]["area_m2"] == {"description": "Of its ground.", "type": "number"}
+    assert schema["properties"]["long"]["description"] == "From end to end."
+
+
+def test_a_type_that_names_its_keys_has_them_inside_of_another_too() -> None:
+    @dataclass(frozen=True)
+    class Farm:
+        fields: tuple[Field, ...]
+        best: Field | None = None
+
+    assert as_json(Farm((Field(1.0),), Field(2.0))) == {
+        "fields": [{"area_m2": 1.0, "long": 1.0}],
+        "best": {"area_m2": 2.0, "long": 2.0},
+    }

@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from flasher.conformance.explore import Explorer, ExploreResult
+from flasher.conformance.explore import Explorer
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
 from flasher.conformance.explore.stimuli import REFUSED, TransferPosition, make_stimulus
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.restore import BY_NOTHING, restore
+from flasher.conformance.results import ExploreResult
 from flasher.conformance.wire import Encoder, joined
 from flasher.errors import UsageError
 from tests.cli.conftest import Flasher
@@ -91,7 +92,7 @@ def test_a_device_that_takes_no_upgrade_is_a_finding_before_the_first_step() -> 
 
 def test_pairs_of_phase_and_step_that_were_never_met_are_told() -> None:
     explored = _explorer().explore(5)
-    met = {(phase, step) for phase, step, count in explored.coverage if count}
+    met = {(each.phase, each.step) for each in explored.coverage if each.count}
     assert met
     assert met.isdisjoint(explored.not_covered)
     assert len(met) + len(explored.not_covered) == len(reachable_pairs())

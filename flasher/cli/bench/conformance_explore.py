@@ -5,10 +5,10 @@ something.
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import click
 
@@ -21,16 +21,13 @@ from flasher.cli.bench.conformance_bench import (
     confirm_wear,
     opened,
 )
-from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
+from flasher.conformance.results import ExploreResult
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
-
-if TYPE_CHECKING:
-    from flasher.conformance.explore import ExploreResult
 
 _EXAMPLES: Final = """\
 examples:
@@ -51,43 +48,7 @@ _REPLACED: Final = frozenset(
 )
 
 
-@dataclass(frozen=True)
-class FindingDocument:
-    """What a walk found."""
-
-    rule: str
-    """Which rule was broken: short, and the same from version to version."""
-    text: str
-    steps: list[str]
-    """The shortest walk that finds it."""
-    first_steps: list[str]
-    replay: str
-
-
-@dataclass(frozen=True)
-class CoverageDocument:
-    """How often a step was taken in a phase of the device."""
-
-    phase: str
-    step: str
-    count: int
-
-
-@dataclass(frozen=True)
-class ExploreDocument:
-    """What came of the walks."""
-
-    subject: str
-    seed: str
-    walks: int
-    steps: int
-    finding: FindingDocument | None
-    stopped: str
-    """Why it ended before its number of steps; empty when it did not."""
-    coverage: list[CoverageDocument]
-
-
-DOCUMENTS: Final = (ExploreDocument,)
+DOCUMENTS: Final = (ExploreResult,)
 
 
 _what = partial(option, panel="what is run, and how")
@@ -156,7 +117,7 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
     ctx, finding = click.get_current_context(), explored.finding
     words = ["flasher", *rebuild_command_line(ctx, "conformance", without=_REPLACED.__contains__)]
     words.insert(words.index("conformance") + 1, "explore")
-    met = sum(bool(count) for _, _, count in explored.coverage)
+    met = sum(bool(each.count) for each in explored.coverage)
     output.result(
         f"{printable(explored.subject)}: {explored.walks} walks, {explored.steps} steps, seed "
         f"{printable(explored.seed)}"
@@ -166,11 +127,9 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
         for phase in dict.fromkeys(phase for phase, _ in explored.not_covered):
             names = [name for its, name in explored.not_covered if its == phase]
             output.result(f"  never in the phase {phase}: {', '.join(names)}")
-    found = None
     if finding is not None:
         replay = shlex.join([*words, "--replay", " ".join(finding.steps)])
-        steps, first_steps = list(finding.steps), list(finding.first_steps)
-        found = FindingDocument(finding.rule, finding.text, steps, first_steps, replay)
+        explored = replace(explored, finding=replace(finding, replay=replay))
         output.result(f"FOUND {finding.rule}: {printable(finding.text)}")
         output.result(f"  steps: {' '.join(finding.steps) or 'none: the good image is flashed'}")
         output.result(f"  replay: {printable(replay)}")
@@ -183,6 +142,4 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
             output.result(printable(explored.stopped))
     else:
         output.result(explored.stopped or "nothing was found")
-    coverage = [CoverageDocument(*each) for each in explored.coverage]
-    document = document_of(ExploreDocument, explored, finding=found, coverage=coverage)
-    return output.document(document, exit_code=code)
+    return output.document(explored, exit_code=code)

@@ -11,7 +11,7 @@ from typing import Final
 from flasher import api, events
 from flasher.api import Connection
 from flasher.cli import values
-from flasher.cli.documents import document_of, to_json
+from flasher.cli.documents import to_json
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, bus_options, target_option
@@ -24,6 +24,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
 from flasher.mock.variants import VARIANTS, find, make
+from flasher.mock.variants.base import Variant
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect, Target
@@ -64,24 +65,10 @@ class MockDocument:
 
 
 @dataclass(frozen=True)
-class VariantDocument:
-    """A deliberately wrong device model."""
-
-    name: str
-    clause: str
-    """The case that it fails."""
-    also: list[str]
-    """Other cases that it may fail."""
-    summary: str
-    upgrade_works: bool
-    """False when not even an undisturbed upgrade to an ordinary image ends well."""
-
-
-@dataclass(frozen=True)
 class VariantsDocument:
     """What --variant takes."""
 
-    variants: list[VariantDocument]
+    variants: list[Variant]
 
 
 DOCUMENTS: Final = (MockDocument, VariantsDocument)
@@ -145,10 +132,7 @@ def mock(
     """
     if list_variants:
         output.table((each.name, each.clause, each.summary) for each in VARIANTS.values())
-        documents = [
-            document_of(VariantDocument, each, also=list(each.also)) for each in VARIANTS.values()
-        ]
-        return output.document(VariantsDocument(variants=documents))
+        return output.document(VariantsDocument(variants=list(VARIANTS.values())))
     if target is None:
         raise UsageError(
             "flasher mock: -t/--target is required.", remedy="Write -t wmc, bms or obc."

@@ -18,7 +18,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.cli.terminal import agrees, can_ask
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.items import writable
-from flasher.host.write import WriteResult, field_changes, plan_write
+from flasher.host.write import FieldChange, WriteResult, field_changes, plan_write
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
@@ -36,15 +36,6 @@ code 10 when the write is not confirmed or reads back differently, 5 when the de
 
 
 @dataclass(frozen=True)
-class ChangeDocument:
-    """A field of a write; null where a value is not known."""
-
-    old: str | None
-    new: str
-    read_back: str | None
-
-
-@dataclass(frozen=True)
 class WrittenDocument:
     """How a write ended."""
 
@@ -52,7 +43,7 @@ class WrittenDocument:
     item: str
     confirmed: bool
     """True when the device acknowledged the write."""
-    fields: dict[str, ChangeDocument]
+    fields: dict[str, FieldChange]
 
 
 @dataclass(frozen=True)
@@ -177,10 +168,7 @@ def _document(written: WriteResult) -> WrittenDocument:
         target=written.plan.target.name,
         item=written.plan.writable.name,
         confirmed=written.is_confirmed,
-        fields={
-            each.name.replace(" ", "_"): ChangeDocument(each.old, each.new, each.read_back)
-            for each in written.changes
-        },
+        fields={each.name.replace(" ", "_"): each for each in written.changes},
     )
 
 

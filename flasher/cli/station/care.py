@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 from flasher.cli.bar import Bar
-from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.station.commands import RecordsOptions
@@ -18,7 +17,6 @@ from flasher.cli.station.documents import (
     RoleDocument,
     SigningKeyDocument,
     StationRolesDocument,
-    VerifiedRecordsDocument,
 )
 from flasher.cli.station.place import open_to_read, operator_of, records_of, the_station
 from flasher.errors import ExitCode, UsageError
@@ -73,7 +71,7 @@ def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
     else:
         _say_what_was_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
-    return output.document(document_of(VerifiedRecordsDocument, found), exit_code=code)
+    return output.document(found, exit_code=code)
 
 
 def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> int:

@@ -10,9 +10,8 @@ from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
 from flasher.station.records.model import (
     Backup,
+    Examination,
     Figures,
-    KeptHeads,
-    Problem,
     RunKind,
     RunState,
     UnitLife,
@@ -184,28 +183,6 @@ class StationRolesDocument:
 
 
 @dataclass(frozen=True)
-class VerifiedRecordsDocument:
-    """What was found in the records, and what they could be compared with."""
-
-    problems: tuple[Problem, ...]
-    remarks: tuple[str, ...]
-    kept: tuple[KeptHeads, ...]
-    unkept: tuple[str, ...]
-    """Stations of which no heads are kept elsewhere than beside their key: records made anew with
-    key and heads would look the same."""
-    unreached: tuple[str, ...]
-    """Places of heads that could not be reached, each with why."""
-    since: str | None
-    """When everything before was examined, where only what came after that was now; null:
-    everything was."""
-    traces: int
-    """Runs that passed and were compared with their own traces."""
-    is_checked_elsewhere: bool
-    """Every audit trail was compared, from its first row to its last, with heads that are kept in
-    another place than beside the key."""
-
-
-@dataclass(frozen=True)
 class SigningKeyDocument:
     """The key that signs a station's audit trail."""
 
@@ -243,7 +220,7 @@ DOCUMENTS: Final = (
     StationReportDocument,
     UnitDocument,
     Backup,
-    VerifiedRecordsDocument,
+    Examination,
     CheckedCertificate,
     StationRolesDocument,
     SigningKeyDocument,

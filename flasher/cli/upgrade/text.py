@@ -8,16 +8,14 @@ from typing import Final
 
 from flasher.cli.documents import (
     ImageDocument,
-    OutcomeDocument,
     PlanDocument,
-    SegmentDocument,
     document_of,
 )
 from flasher.cli.output import ClosingLine, byte_count, counted, duration, spread_ms
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
 from flasher.host.options import UpgradeOptions, gaps_s
-from flasher.host.outcome import DeviceLeft
+from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verdict, Verification, possible_levels
@@ -43,7 +41,7 @@ class UpgradeDocument:
     image: ImageDocument
     plan: PlanDocument
     checks: list[CheckMade]
-    outcome: OutcomeDocument
+    outcome: Outcome
     verification: Verification
     previous_version: str | None
     """What ran before; null where it could not be asked."""
@@ -244,7 +242,6 @@ def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
     return document_of(
         ImageDocument,
         image,
-        segments=[document_of(SegmentDocument, s) for s in image.segments],
         named_targets=sorted(target.name for target in image.named_targets),
         vector_table=table,
     )
@@ -276,7 +273,7 @@ def upgrade_document(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),
         checks=list(checks),
-        outcome=document_of(OutcomeDocument, result.outcome),
+        outcome=result.outcome,
         verification=replace(result.verification, running_version=result.running_version),
         previous_version=result.previous_version,
         shutdown_heard=result.shutdown_heard,

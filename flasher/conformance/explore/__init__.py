@@ -8,7 +8,6 @@ import random
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -19,9 +18,11 @@ from flasher.conformance.restore import BY_POWER, may_need_power, restore
 from flasher.conformance.results import (
     CaseLimitReached,
     DeviceCrashed,
+    ExploreResult,
     RunStopped,
-    TraceEntry,
+    StepCoverage,
     Unsupported,
+    WalkFinding,
 )
 from flasher.conformance.subject import Subject
 from flasher.errors import BusError
@@ -31,38 +32,6 @@ WALK_STEPS: Final = 24
 SHRINK_TRIES: Final = 60
 _LIMIT_S: Final = 900.0
 _NO_CHANCE: Final = random.Random(0)  # noqa: S311  all steps are given
-
-
-@dataclass(frozen=True)
-class WalkFinding:
-    """What a walk found, and the shortest one that finds it."""
-
-    rule: str
-    text: str
-    steps: tuple[str, ...]
-    first_steps: tuple[str, ...]
-    """Those of the walk that found it first."""
-    trace: tuple[TraceEntry, ...] = ()
-
-
-@dataclass(frozen=True)
-class ExploreResult:
-    """Walks from the first to the last. `coverage` has every pair of phase and step that a walk may
-    meet, with how often it was met.
-    """
-
-    subject: str
-    seed: str
-    walks: int
-    steps: int
-    coverage: tuple[tuple[str, str, int], ...]
-    finding: WalkFinding | None = None
-    stopped: str = ""
-
-    @property
-    def not_covered(self) -> list[tuple[str, str]]:
-        """Pairs of phase and step that no walk met."""
-        return [(phase, step) for phase, step, count in self.coverage if not count]
 
 
 class Explorer:
@@ -226,7 +195,8 @@ class Explorer:
 
     def _result(self, finding: WalkFinding | None = None, stopped: str = "") -> ExploreResult:
         coverage = tuple(
-            (phase.value, name, self._met[phase, name]) for phase, name in reachable_pairs()
+            StepCoverage(phase.value, name, self._met[phase, name])
+            for phase, name in reachable_pairs()
         )
         return ExploreResult(
             self._subject.name, self._seed, self._walks, self._steps, coverage, finding, stopped

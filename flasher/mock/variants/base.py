@@ -14,6 +14,7 @@ from flasher.mock.table import BootloaderEvent
 from flasher.protocol.messages import Malformed
 from flasher.protocol.spec import Command, Mode
 from flasher.protocol.wire import Message
+from flasher.validation import json_keys
 
 _ANY: Final = "*"
 _SENTENCE_END: Final = re.compile(r"\.\s+(?=[A-Z])")
@@ -28,28 +29,29 @@ def bad_write(row: AnyRow, command: Command) -> Message | None:
     return message if (message.command, message.mode) == (command, Mode.WRITE) else None
 
 
+@json_keys("name clause also summary upgrade_works")
 @dataclass(frozen=True)
 class Variant:
-    """A device model that violates one clause, and is right in everything else."""
+    """A deliberately wrong device model."""
 
-    name: str
-    """In lower case, parted by hyphens."""
+    # It violates one clause, and is right in everything else.
+
+    name: str  # in lower case, parted by hyphens
     clause: str
-    """The case of the catalogue that it fails."""
-    summary: str
-    """What it does, in a line."""
+    """The case that it fails."""
+    summary: str  # what it does, in a line
     device_type: type[MockDevice] = MockDevice
     also: tuple[str, ...] = ()
-    """Other cases that it may fail: what it does wrong is part of their stimulus too. Where no
-    upgrade works, any case that needs a transfer may fail as well.
-    """
+    """Other cases that it may fail."""
+    # What it does wrong is part of their stimulus too. Where no upgrade works, any case that needs
+    # a transfer may fail as well.
     everywhere: bool = False
     """True when every transfer meets the fault, so that any case that has one may fail."""
     unseen: str = ""
     """Why no case sees it on a bench."""
     upgrade_works: bool = True
-    """False when not even an undisturbed upgrade to an ordinary image (of some 1000 bytes, no
-    multiple of 128) ends with that image running."""
+    """False when not even an undisturbed upgrade to an ordinary image ends well."""
+    # Ordinary: of some 1000 bytes, no multiple of 128. Well: with that image running.
     profile: Mapping[str, object] = field(default_factory=dict)
     """Choices of the device profile with which it shows; they are set when it is made."""
     timings: Mapping[str, float] = field(default_factory=dict)

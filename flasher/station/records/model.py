@@ -9,7 +9,7 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Final, NewType, Protocol
 
-from flasher.validation import LowerCaseInJson
+from flasher.validation import LowerCaseInJson, json_keys
 
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
@@ -414,27 +414,29 @@ class KeptHeads:
         return self.first == 1 and self.last >= self.rows
 
 
+@json_keys("problems remarks kept unkept unreached since traces is_checked_elsewhere")
 @dataclass(frozen=True)
 class Examination:
-    """What was found in the records, and what could be looked at."""
+    """What was found in the records, and what they could be compared with."""
 
     problems: tuple[Problem, ...]
-    remarks: tuple[str, ...]
-    """What a person should know, though nothing is wrong with it."""
+    remarks: tuple[str, ...]  # what a person should know, though nothing is wrong with it
     kept: tuple[KeptHeads, ...]
     unkept: tuple[str, ...]
-    """Stations whose chains could not be compared with heads that are kept elsewhere."""
+    """Stations of which no heads are kept elsewhere than beside their key: records made anew with
+    key and heads would look the same."""
     traces: int
-    """PASS runs that were compared with their own traces."""
+    """Runs that passed and were compared with their own traces."""
     unreached: tuple[str, ...] = ()
     """Places of heads that could not be reached, each with why."""
     since: str | None = None
-    """When all before was examined, where only what came after that was; None: everything was."""
+    """When everything before was examined, where only what came after that was now; null:
+    everything was."""
 
     @property
     def is_checked_elsewhere(self) -> bool:
-        """True when every chain was compared, from its first row to its last, with heads that are
-        kept in another place than beside the key of its station.
+        """Every audit trail was compared, from its first row to its last, with heads that are kept
+        in another place than beside the key.
         """
         stations = {each.station for each in self.kept}
         return (
