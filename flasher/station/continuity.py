@@ -8,7 +8,8 @@ uninterrupted unit:
   image;
 - it announces itself in the middle of a transfer, or an application answers, which is erased then;
 - before the run has sent anything that restarts it, the watcher counts another power-up of what it
-  had heard, also in the time before the run;
+  had heard, also in the time before the run; or the first one, where nothing had been heard for
+  some time when the run began;
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
   in something that the run has not written.
 
@@ -79,6 +80,7 @@ class Continuity:
         goes_on: bool = False,
         was_exchanged: bool = False,
         was_missed: bool = False,
+        was_silent: bool = False,
     ) -> None:
         timings = loaded.profile.timings
         self.watcher = watcher
@@ -93,8 +95,8 @@ class Continuity:
         self.is_told_to_update = False
         """An update command has left, and no application has answered since."""
         self.power_cycles = 0
-        self._goes_on = goes_on
-        """A restart is no evidence."""
+        self._goes_on, self._was_silent = goes_on, was_silent and not goes_on
+        """A restart is no evidence; nothing was heard when the run began, and a start is some."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -218,8 +220,8 @@ class Continuity:
         was_heard, power_ups = watcher.is_known, watcher.power_ups
         completions = watcher.completions
         watcher(frame, sent=False, now=now)
-        if was_heard and watcher.power_ups > power_ups:
-            self._take_power_up(now)
+        if watcher.power_ups > power_ups and (was_heard or self._was_silent):
+            self._take_power_up(now, was_heard=was_heard)
         if watcher.heard_at == now:
             if self._listened_s - self._heard_s > _EXCHANGE_S:
                 self._returned_s = self._listened_s
@@ -291,11 +293,13 @@ class Continuity:
         # However late: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
 
-    def _take_power_up(self, now: float) -> None:
-        """Its power came, and it was heard before."""
+    def _take_power_up(self, now: float, *, was_heard: bool) -> None:
+        """Its power came, and it was heard before, or had been silent."""
         if self._has_acted or now <= self._supplied_until:
             return
-        if self.watcher.is_in_bootloader:
+        if not was_heard:
+            self._lose("was silent when the run began, and announces its bootloader now")
+        elif self.watcher.is_in_bootloader:
             self._lose_by_restart("although this run had not restarted it")
         elif not self._goes_on:
             self._lose("only announced its bootloader before, and runs an application now")

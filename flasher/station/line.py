@@ -73,7 +73,7 @@ SCAN_LIMIT_S: Final = 120.0
 CARD_LIMIT_S: Final = 15.0
 """The label has to follow the card of its socket within this time."""
 SHORT_OUTAGE_S: Final = 3.0
-"""A restart of the process takes less; a unit cannot be swapped in this time."""
+"""A restart of the process takes less: so long a socket shows its last verdict."""
 REACH_S: Final = 2.0
 """A unit that is heard sooner after the prompt was in the socket before."""
 IDENTIFY_S: Final = 3.0
@@ -86,6 +86,11 @@ _PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
 _AGAIN: Final = text("Scan it again.")
 _NOTHING: Final = text("Nothing to do.")
+_CHANGED: Final = (
+    codes.UNIT_CHANGED.name,
+    text("The unit was exchanged, or had no power."),
+    text("See which unit it is, then scan again."),
+)
 
 
 # -- inputs and effects ---------------------------------------------------------------------------
@@ -256,7 +261,9 @@ class Line:
         if socket.can_work:
             return  # an adapter that was opened anew between two looks at it
         was_short = now - socket.out_since_s < SHORT_OUTAGE_S
-        socket.is_last_there = socket.is_last_there and was_short
+        # A unit can be exchanged in a moment: one that has passed has to report its number anew.
+        has_passed = socket.last is not None and socket.last.outcome is RunState.PASS
+        socket.is_last_there = socket.is_last_there and was_short and not has_passed
         socket.out_of_service, socket.sees_units = None, what.sees_units
         if not what.sees_units:
             socket.occupancy = Occupancy.SILENT
@@ -281,12 +288,14 @@ class Line:
             self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
-            code, reason = codes.UNIT_CHANGED, text("The unit was exchanged, or had no power.")
+            code, reason, remedy = _CHANGED
             if what.was_missed and not what.is_power_up:
-                code = codes.NOT_OBSERVED
+                code = codes.NOT_OBSERVED.name
                 reason = text("This computer stood still, and did not see whether the unit stayed.")
-            remedy = text("See which unit it is, then scan again.")
-            self._silent(socket, now, code.name, reason, remedy, is_certain=False)
+            self._silent(socket, now, code, reason, remedy, is_certain=False)
+        elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
+            # It may have come after its card or label was scanned, in place of a silent one.
+            self._drop_for(socket, now, *_CHANGED, keeps_label=socket.binding is Binding.NAMED)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
@@ -328,7 +337,20 @@ class Line:
         self._tell(UnitRemoved(socket.name))
         if awaits:
             socket.begin_at_s = None
-        if self._drop_scans(socket, code, reason, remedy, keeps_label=awaits):
+        self._drop_for(socket, now, code, reason, remedy, keeps_label=awaits)
+
+    def _drop_for(
+        self,
+        socket: Socket,
+        now: float,
+        code: str,
+        reason: str,
+        remedy: str,
+        *,
+        keeps_label: bool,
+    ) -> None:
+        """Drop what was scanned for a unit; its socket shows for a while that it was."""
+        if self._drop_scans(socket, code, reason, remedy, keeps_label=keeps_label):
             socket.note = text("{reason} {remedy}", reason=reason, remedy=remedy)
             socket.note_until_s = now + NOTE_S
 

@@ -215,6 +215,14 @@ class Socket:
         """
         before, self.occupancy = self.occupancy, Occupancy.THERE
         self.is_in_bootloader = what.is_in_bootloader
+        has_passed = self.last is not None and self.last.outcome is RunState.PASS
+        if (
+            before is Occupancy.UNKNOWN
+            and has_passed
+            and (what.is_power_up or what.is_in_bootloader)
+        ):
+            # One that has passed runs its application: another one was put in, and nobody listened.
+            before = Occupancy.SILENT
         if what.serial is not None:
             self.own, self.is_own_known = what.serial, is_serial
         is_new = self._is_new(before) or bool(what.label)
@@ -232,11 +240,7 @@ class Socket:
             self.is_last_there = True
             return False
         says_other = self.own is not None and (last.has_said or self.is_own_known)
-        # One that has passed runs its application: what only announces itself after an outage, in
-        # which nobody listened, is another one.
-        has_application = last.outcome is RunState.PASS
-        was_unheard = before is Occupancy.UNKNOWN and self.is_in_bootloader and has_application
-        if says_other or was_unheard or before in (Occupancy.SILENT, Occupancy.EMPTY):
+        if says_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
             # Another unit; or one that was silent for a while, and does not say who it is.
             was_last, self.is_last_there = self.is_last_there, False
             return was_last or before is not Occupancy.THERE
@@ -297,7 +301,9 @@ class Socket:
         is_free = self.can_work and self.phase is Phase.REST and not self.is_chosen
         if not (self.label and is_free) or self.is_unidentified:
             return False
-        is_time = self.begin_at_s is not None and now >= self.begin_at_s
+        # While it is not known whether a unit is there, nothing begins.
+        is_known = self.occupancy is not Occupancy.UNKNOWN
+        is_time = self.begin_at_s is not None and now >= self.begin_at_s and is_known
         if self.binding is Binding.NAMED:
             # It has arrived, and said who it is or has had the time for it.
             has_arrived = self.is_there and self.begin_at_s is not None
@@ -379,8 +385,8 @@ class Socket:
         if last is None or last.outcome is None:
             return text("Scan the label of the unit{card}.", card=card)
         return text(
-            "After {state} of {serial} it was silent or without power. If this is another unit,"
-            " scan its label{card}.",
+            "After {state} of {serial} it was silent, without power, or could not be heard. If this"
+            " is another unit, scan its label{card}.",
             state=_state_after(last.outcome).value,
             serial=printable(last.serial),
             card=card,

@@ -75,7 +75,8 @@ class UnitRun:
 
     `watchers` know what was heard of the unit before the run, one for each target; the run goes on
     with them. `was_exchanged`: another unit may have come since the label was bound to the socket;
-    `was_missed`: nobody has listened for a while since then.
+    `was_missed`: nobody has listened for a while since then; `was_silent`: somebody has listened,
+    and nothing is heard.
     """
 
     def __init__(  # noqa: PLR0913  what a run is made of
@@ -92,6 +93,7 @@ class UnitRun:
         watchers: Sequence[TargetWatcher] | None = None,
         was_exchanged: bool = False,
         was_missed: bool = False,
+        was_silent: bool = False,
     ) -> None:
         self._order = order
         self._recipe = recipe
@@ -112,6 +114,7 @@ class UnitRun:
                 goes_on=goes_on,
                 was_exchanged=was_exchanged,
                 was_missed=was_missed,
+                was_silent=was_silent,
             )
             for each, watcher in zip(recipe.targets, watchers, strict=True)
         }

@@ -299,7 +299,7 @@ class Worker:
         try:
             with Recorder(begin.trace) as recorder:
                 recorder.channel = self._connection.channel
-                watchers, was_exchanged, was_missed = None, False, False
+                watchers, was_exchanged, was_missed, was_silent = None, False, False, False
                 if self._virtual is None:
                     self._listened()
                     presence = self._presence
@@ -308,6 +308,7 @@ class Worker:
                     watchers = presence.watchers
                     was_exchanged = presence.exchanged_number > begin.presence
                     was_missed = presence.missed_number > begin.presence
+                    was_silent = presence.sees_units and presence.is_there is False
                 run = UnitRun(
                     begin.order,
                     self._recipe,
@@ -320,6 +321,7 @@ class Worker:
                     watchers=watchers,
                     was_exchanged=was_exchanged,
                     was_missed=was_missed,
+                    was_silent=was_silent,
                 )
                 self._pipe.meanwhile = run.listen_meanwhile
                 result = run.run()

@@ -26,13 +26,15 @@ ANNOUNCEMENT = BootVersion("BMS", "V1.0.0")
 
 
 class Watched:
-    """A battery of a run, identified at 1.0 s."""
+    """A battery of a run that begins at 1.0 s."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **known: bool) -> None:
         loaded = UnitBench(folder).recipe.targets[0]
         self.watcher = TargetWatcher(loaded)
-        self.continuity = Continuity(loaded, self.watcher, blind_s=BLIND_S)
+        self.continuity = Continuity(loaded, self.watcher, blind_s=BLIND_S, **known)
         self.now = 1.0
+
+    def identify(self) -> None:
         for frame in version_answer("NONE"):
             self.continuity(frame, sent=False, now=self.now)
         self.continuity.begin(self.watcher.answer)
@@ -62,6 +64,7 @@ def test_a_second_burst_after_the_complete_image_is_of_another_unit(
 ) -> None:
     """A small image is stored before the burst that preceded it could be over."""
     run = Watched(tmp_path)
+    run.identify()
     run.send(1.1, ResetCommand())
     run.hear(1.11, GeneralFeedbackMessage())
     run.announce(1.2, 1)
@@ -73,3 +76,31 @@ def test_a_second_burst_after_the_complete_image_is_of_another_unit(
     assert not run.continuity.lost, "it may start by its bootloader"
     run.announce(1.6 + silence_s)
     assert "announced its bootloader" in run.continuity.lost
+
+
+def test_what_announces_itself_in_a_silent_socket_came_after_the_run_began(tmp_path: Path) -> None:
+    run = Watched(tmp_path, was_silent=True)
+    run.announce(1.5, 1)
+    assert "was silent when the run began" in run.continuity.lost
+
+
+def test_a_silent_unit_may_answer_and_restart_when_it_is_told_to(tmp_path: Path) -> None:
+    run = Watched(tmp_path, was_silent=True)
+    run.identify()
+    run.send(1.1, ResetCommand())
+    run.hear(1.11, GeneralFeedbackMessage())
+    run.announce(1.2)
+    assert not run.continuity.lost
+
+
+def test_a_silent_unit_may_be_reset_without_an_answer(tmp_path: Path) -> None:
+    run = Watched(tmp_path, was_silent=True)
+    run.send(1.1, ResetCommand())
+    run.announce(1.2)
+    assert not run.continuity.lost
+
+
+def test_a_held_unit_may_be_switched_on_after_its_run_began(tmp_path: Path) -> None:
+    run = Watched(tmp_path, was_silent=True, goes_on=True)
+    run.announce(1.5)
+    assert not run.continuity.lost

@@ -13,7 +13,7 @@ import pytest
 from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
-from flasher.station.messages import PresenceChanged
+from flasher.station.messages import PresenceChanged, Ready
 from flasher.station.records.model import RunState
 from flasher.station.socket import Binding, Occupancy, Phase, Socket, Source
 from tests.loops import each
@@ -95,7 +95,13 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
         self.occupancy = Occupancy.EMPTY
         return was_there
 
+    def ready(self: Line, socket: Socket, what: Ready, now: float) -> None:
+        was_last_there = socket.is_last_there  # else its unit has to say who it is, which helps
+        Line._ready(self, socket, what, now)
+        socket.is_last_there = was_last_there
+
     patch.setattr(Socket, "fall_silent", fall_silent)
+    handle(patch, Phase.REST, Ready, ready)
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:

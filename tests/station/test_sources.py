@@ -127,6 +127,13 @@ class Floor:
         self.line.feed(name, line.Saved(outcome, "Take it out."), self.now)
         self.carry_out()
 
+    def fail(self, name: str, outage_s: float) -> None:
+        """The process of a socket ends, and another one begins."""
+        self.line.feed(name, AdapterDown("its process ended"), self.now)
+        self.go_on(outage_s)
+        self.presences[name].begin()
+        self.line.feed(name, Ready("a bus", sees_units=True), self.now)
+
     def scan(self, text: str, source: Source = ONE) -> None:
         self.line.scan(text, self.now, source)
         self.carry_out()
@@ -373,7 +380,7 @@ def test_green_goes_with_its_unit_however_fast_the_next_one_is(recipe: LoadedRec
     assert floor.state("A") is SocketState.PASS
     floor.change_places(0.3)
     assert floor.state("A") is SocketState.SCAN
-    assert floor.text("A").startswith("After PASS of W1 it was silent or without power.")
+    assert floor.text("A").startswith("After PASS of W1 it was silent, without power, or could")
 
 
 def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> None:
@@ -395,6 +402,68 @@ def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> No
     floor.put(unit, "A")
     floor.go_on(3.0)
     assert floor.state("A") is SocketState.PASS, "it is back, and says who it is"
+
+
+@each("outage_s", [0.1, 1.0, 2.9])
+@each("own", ["", "W1"])
+def test_green_outlives_an_outage_only_with_a_unit_that_says_who_it_is(
+    recipe: LoadedRecipe, own: str, outage_s: float
+) -> None:
+    """However short: another one may be there, whose announcement nobody heard."""
+    floor = Floor(recipe)
+    floor.put_all(*pair((own, "")))
+    floor.scan("SOCKET A")
+    floor.scan("W1")
+    floor.end_run("A")
+    floor.go_on(2.0)
+    assert floor.state("A") is SocketState.PASS
+    floor.fail("A", outage_s)
+    floor.go_on(3.0)
+    if own:
+        assert floor.state("A") is SocketState.PASS
+    else:
+        assert floor.state("A") is SocketState.SCAN
+        assert floor.text("A").startswith("After PASS of W1")
+
+
+@each("put_after_s", [0.1, 1.0, 1.9])
+@each("outcome", [RunState.ERROR, RunState.FAIL])
+def test_a_card_is_not_for_a_unit_that_comes_before_anything_was_heard(
+    recipe: LoadedRecipe, outcome: RunState, put_after_s: float
+) -> None:
+    """The unit of the last run waits for packets, and says nothing."""
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.scan("W1")
+    floor.units.pop("A")
+    floor.end_run("A", outcome)
+    floor.fail("A", 1.0)
+    floor.scan("SOCKET A")
+    floor.go_on(put_after_s - 0.2)
+    floor.put(Unit("W3"), "A")
+    floor.go_on(0.3)
+    floor.scan("W1")
+    assert floor.runs == [("W1", "A")], "of the first run"
+    assert floor.refused()[0].code == "UNIT_CHANGED"
+    floor.scan("FREE A")
+    floor.scan("SOCKET A")
+    floor.scan("W3")
+    assert floor.runs[1:] == [("W3", "A")]
+
+
+def test_nothing_begins_before_it_is_known_whether_a_unit_is_there(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe, "A")
+    floor.put_all(Unit("W1"))
+    floor.scan("SOCKET A")
+    floor.scan("W1")
+    floor.units.pop("A")
+    floor.end_run("A", RunState.ERROR)
+    for text in ("SOCKET A", "W1"):
+        floor.scan(text)
+    assert len(floor.runs) == 1
+    floor.go_on(2.0)
+    assert len(floor.runs) == 2, "its bootloader may sit there, and say nothing"
 
 
 def test_a_unit_that_is_switched_off_and_on_is_known_by_its_number(recipe: LoadedRecipe) -> None:

@@ -731,7 +731,7 @@ def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBen
     line.bench.clock.go_on(1.5)
     line.turn()
     line.say("A", Ready("a bus", sees_units=True))
-    line.arrive("A")
+    line.arrive("A", SERIAL)
     assert line.state("A") is SocketState.PASS
     assert len(line.of(UnitArrived)) == 1
 

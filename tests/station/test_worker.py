@@ -527,6 +527,40 @@ def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(
     assert socket.other.device.program_count == 0
 
 
+class Empty(RealSocket):
+    """The socket is empty when its label is scanned, and a unit comes later."""
+
+    after_s = 0.0
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.bus.detach(self.bus._devices[0].engine)
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if not isinstance(message, PresenceChanged):
+            super().answer(channel, message)
+        elif not message.is_there and not channel.of(Finished):
+            self.other = Visitor(self.unit("NONE"), self.clock.now() + self.after_s)
+            self.bus.attach(self.other)
+            self.begin()
+
+
+@each("after_s", [0.0, 0.05, 0.3, 0.5, 0.9])
+def test_a_run_is_not_for_the_unit_that_comes_after_it_began(
+    tmp_path: Path, after_s: float
+) -> None:
+    """Its label was scanned for an empty socket, twice."""
+    folder = tmp_path / f"{after_s}"
+    folder.mkdir()
+    socket = Empty(folder)
+    socket.after_s = after_s
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.code == "UNIT_CHANGED", ended.result.text
+    assert "was silent when the run began" in ended.result.text
+    assert socket.other.device.program_count == 0
+
+
 def test_a_slow_start_of_a_run_is_no_pause_of_a_unit_in_its_bootloader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
