@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
 import pytest
-from jsonschema import Draft202012Validator
-from jsonschema.exceptions import ValidationError
 
 from flasher import events
 from flasher.cli.documents import to_json
@@ -28,9 +26,9 @@ OBC = SAMPLES / "obc.bin"
 
 
 def hold(schema: Mapping[str, Any], name: str, instance: object) -> None:
-    """Raises ValidationError where the instance is not what the definition says."""
+    """Fails where the instance is not what the definition describes."""
     chosen = {"$defs": schema["$defs"], "$ref": f"#/$defs/{name}"}
-    Draft202012Validator(chosen).validate(instance)
+    assert not schema_document.mismatches(instance, chosen)
 
 
 def hold_output(schema: Mapping[str, Any], text: str, code: int) -> list[dict[str, Any]]:
@@ -55,6 +53,8 @@ def test_the_file_is_drawn_from_the_code() -> None:
 
 
 def test_it_is_a_json_schema(schema: dict[str, Any]) -> None:
+    from jsonschema import Draft202012Validator  # noqa: PLC0415  as in `mismatches`
+
     Draft202012Validator.check_schema(schema)
     assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
 
@@ -242,7 +242,7 @@ def test_the_schema_refuses_what_is_not_printed(
 ) -> None:
     document = flasher("image-info", OBC, "--json").document
     hold(schema, "document.image-info", document)
-    with pytest.raises(ValidationError):
+    with pytest.raises(AssertionError):
         hold(schema, "document.image-info", {**document, **wrong})
 
 
