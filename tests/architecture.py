@@ -18,7 +18,7 @@ _ROOT: Final = Path(__file__).parents[1]
 PAGE: Final = _ROOT / "docs" / "explanation" / "architecture.md"
 _MARKED: Final = re.compile(r"(<!-- packages -->\n).*?(<!-- end of packages -->)", re.DOTALL)
 _EVERYWHERE: Final = frozenset(
-    {"errors", "events", "wording", "log", "files", "validation", "history"}
+    {"errors", "events", "wording", "log", "files", "validation", "history", "python_can"}
 )
 """Small modules that many import: they would hide the drawing behind arrows."""
 

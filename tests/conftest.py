@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
+import flasher.python_can  # noqa: F401  before a test imports python-can
+
 if TYPE_CHECKING:
     from tests.station.postgres import Server
 

@@ -14,8 +14,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
-import can
-
 from flasher.bus.back_ends import (
     SERIAL_PORTS,
     SILENT_WHEN_GONE,
@@ -48,6 +46,7 @@ from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.spec import FRAME_DATA_SIZE
+from flasher.python_can import can
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
 """Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""

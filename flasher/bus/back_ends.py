@@ -12,10 +12,9 @@ from collections.abc import Iterator, Mapping
 from enum import Enum, auto
 from typing import Final
 
-import can
-
 from flasher.bus.health import BusTrouble, TroubleKind
 from flasher.errors import FlasherError
+from flasher.python_can import can
 
 
 class Meaning(Enum):

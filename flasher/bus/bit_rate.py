@@ -99,7 +99,7 @@ def named_bit_rate(
 
 def _configured_by(fallback: Fallback | None) -> str:
     """The variable or file that names a bit rate where no option does."""
-    import can.util  # noqa: PLC0415  slow, and not needed for a mock
+    from flasher.python_can import can  # noqa: PLC0415  slow, and not needed for a mock
 
     variables = can.util.load_environment_config()
     if any(name in variables for name in _NAMES):

@@ -280,7 +280,7 @@ def say_detected(names: Sequence[str]) -> None:
 def _ask(name: str) -> None:
     answer: dict[str, Any] = {"interface": name, "channels": [], "sees": "", "error": ""}
     try:
-        import can  # noqa: PLC0415  needed in the other process only
+        from flasher.python_can import can  # noqa: PLC0415  needed in the other process only
 
         answer["sees"] = _sees(name)
         answer["channels"] = [_simple(config) for config in can.detect_available_configs(name)]
@@ -292,16 +292,15 @@ def _ask(name: str) -> None:
 
 def _sees(name: str) -> str:
     """Why a back end can list nothing; empty where it can."""
-    from can import BusABC  # noqa: PLC0415
-    from can.interfaces import BACKENDS  # noqa: PLC0415
+    from flasher.python_can import can  # noqa: PLC0415
 
-    place, kind = BACKENDS[name]
+    place, kind = can.interfaces.BACKENDS[name]
     try:
         back_end = getattr(importlib.import_module(place), kind)
     except Exception:  # noqa: BLE001  whatever a vendor's library does
         return _NOT_LOADED
     own = back_end._detect_available_configs  # noqa: SLF001  python-can asks it so
-    return _CANNOT_TELL if own is BusABC._detect_available_configs else ""  # noqa: SLF001
+    return _CANNOT_TELL if own is can.BusABC._detect_available_configs else ""  # noqa: SLF001
 
 
 def _simple(config: Mapping[str, Any]) -> dict[str, Any]:

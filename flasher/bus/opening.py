@@ -8,9 +8,6 @@ import errno
 from collections.abc import Mapping
 from typing import Any, Final
 
-import can
-import can.util
-
 from flasher.bus.back_ends import causes, words_of
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, bus_off_error
@@ -25,6 +22,7 @@ from flasher.bus.inspect_interface import (
 )
 from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
+from flasher.python_can import can
 
 _CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
 _EXTRAS: Final[Mapping[str, tuple[str, str]]] = {

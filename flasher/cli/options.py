@@ -144,7 +144,7 @@ _INVERTED: Final = 0x20000000
 
 def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:
     """python-can's bit timing. Raises click.BadParameter."""
-    import can  # noqa: PLC0415  slow
+    from flasher.python_can import can  # noqa: PLC0415  slow
 
     try:
         given: dict[str, Any] = {key: int(value) for key, value in pairs}
@@ -196,9 +196,9 @@ class Bus:
         if self.can_filters:
             given["can_filters"] = list(self.can_filters)
         if self.bus_kwargs:
-            from can.util import cast_from_string  # noqa: PLC0415  slow
+            from flasher.python_can import can  # noqa: PLC0415  slow
 
-            given |= {key: cast_from_string(value) for key, value in self.bus_kwargs}
+            given |= {key: can.util.cast_from_string(value) for key, value in self.bus_kwargs}
         return given
 
     @cached_property

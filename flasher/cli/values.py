@@ -140,7 +140,7 @@ def node_names(_ctx: click.Context) -> Iterable[str]:
 
 def interface_names(_ctx: click.Context | None = None) -> list[str]:
     """For --interface."""
-    import can  # noqa: PLC0415  slow
+    from flasher.python_can import can  # noqa: PLC0415  slow
 
     return sorted(can.VALID_INTERFACES)
 

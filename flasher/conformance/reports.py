@@ -179,8 +179,7 @@ def is_traced(result: CaseResult) -> bool:
 
 def candump(trace: Iterable[TraceEntry]) -> bytes:
     """Frames as a log; times count from the beginning of the case, what the suite sent is `T`."""
-    import can  # noqa: PLC0415  slow
-
+    from flasher.python_can import can  # noqa: PLC0415  slow
     from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of  # noqa: PLC0415
 
     text = io.StringIO()

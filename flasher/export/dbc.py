@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Final
 
-import can
-
 from flasher.export.names import key
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
@@ -24,6 +22,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import COMMAND_SIZE, PREFIX_SIZE, TARGETS, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler, encode
+from flasher.python_can import can
 from flasher.trace.decoder import ROUTES, TITLES
 
 FD_SIZE: Final = 64

@@ -14,13 +14,13 @@ from __future__ import annotations
 import os
 from typing import Any, Final
 
-import can
 from pydantic import Field, field_validator
 
 from flasher.bus.bit_rate import DECIDING, HIGHEST_BPS, LOWEST_BPS
 from flasher.bus.fallback import Fallback
 from flasher.errors import Fault, did_you_mean
 from flasher.protocol.text import printable
+from flasher.python_can import can
 from flasher.settings.reading import Reader, Table
 
 BUS: Final = "bus"

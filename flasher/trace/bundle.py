@@ -24,10 +24,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-import can
-
 from flasher.files import make_private
 from flasher.protocol.text import printable
+from flasher.python_can import can
 from flasher.trace.decoder import BusEvent, TimedDecoder, bits_of
 from flasher.trace.recorder import message_of
 from flasher.trace.steps import step_of

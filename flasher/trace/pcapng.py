@@ -15,9 +15,8 @@ from pathlib import Path
 from struct import Struct
 from typing import Final
 
-import can
-
 from flasher.protocol.frame import Frame
+from flasher.python_can import can
 from flasher.trace.bounds import Bounds, UnfitError
 
 _LINK_TYPE_CAN: Final = 227

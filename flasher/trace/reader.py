@@ -25,12 +25,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final, TextIO, cast
 
-import can
-
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import opened
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.text import printable
+from flasher.python_can import can, load_mf4
 from flasher.trace.blf import UnpackedBlf
 from flasher.trace.bounds import FILE_MAX_SIZE, Bounds, Lines, UnfitError, check_unpacked
 from flasher.trace.pcapng import frames_of_capture
@@ -145,6 +144,7 @@ def _frames(
 
 def _mf4_reader(whole: bytes) -> can.MF4Reader:
     """Raises UnfitError, and NotImplementedError without the package."""
+    load_mf4()
     # What asammdf leaves of a file that it cannot open complains on stderr when it goes away: that
     # is now, and not when the error has been told.
     with redirect_stderr(StringIO()):

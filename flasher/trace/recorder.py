@@ -11,12 +11,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Protocol, Self
 
-import can
-
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import make_private
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
+from flasher.python_can import can, load_mf4
 from flasher.trace.pcapng import PcapngWriter
 
 _CANDUMP_ERROR: Final = 0x2000_0080
@@ -149,6 +148,8 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
                 return CandumpWriter(path)
             if suffix == ".db":
                 return DatabaseWriter(path)
+            if suffix == ".mf4":
+                load_mf4()
             return can.Logger(path)
     except ValueError as error:
         raise UsageError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sqlite3
+import sys
 import warnings
 from contextlib import closing
 from itertools import pairwise
@@ -184,6 +185,7 @@ def test_a_format_whose_package_is_missing_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("can.io.mf4.asammdf", None)
+    monkeypatch.setitem(sys.modules, "asammdf", None)
     path = tmp_path / "trace.mf4"
     path.write_bytes(b"MDF     4.10")
     with pytest.raises(UsageError, match="needs a package that is not installed"):

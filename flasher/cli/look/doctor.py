@@ -205,9 +205,8 @@ class Examination:
 
     def look_at_adapters(self, stopped: Callable[[], bool]) -> None:
         """The adapters that are there, the chosen one, and its bus."""
-        import can  # noqa: PLC0415  slow, and not needed for a mock
-
         from flasher.bus.opening import bus_config  # noqa: PLC0415
+        from flasher.python_can import can  # noqa: PLC0415  slow, and not needed for a mock
 
         self._note(*findings.setup(self._bus.fallback))
         config: dict[str, Any] | None = None

@@ -79,8 +79,7 @@ _ok, _note, _warning, _problem = (partial(Finding, severity) for severity in Sev
 
 def setup(fallback: Fallback | None) -> Iterator[Finding]:
     """python-can's version, and what configures it besides the command line."""
-    import can  # noqa: PLC0415  slow
-    import can.util  # noqa: PLC0415
+    from flasher.python_can import can  # noqa: PLC0415  slow
 
     yield _ok("python-can", f"python-can {can.__version__}")
     for name in can.util.CONFIG_FILES:

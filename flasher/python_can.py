@@ -1,0 +1,26 @@
+"""python-can, imported without asammdf: that takes 0.5 s, and only .mf4 files need it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from typing import Any
+
+_KEPT_OUT = "can" not in sys.modules and "asammdf" not in sys.modules
+if _KEPT_OUT:
+    sys.modules["asammdf"] = None  # type: ignore[assignment]  # an import of it fails
+try:
+    import can  # noqa: TID251  the one place
+finally:
+    if _KEPT_OUT:
+        del sys.modules["asammdf"]
+
+__all__ = ["can", "load_mf4"]
+
+
+def load_mf4() -> None:
+    """Lets python-can read and write .mf4 files, where asammdf is installed."""
+    module: Any = can.io.mf4
+    if module.asammdf is None:
+        # The classes that python-can has handed out look in their module too.
+        importlib.reload(module)
