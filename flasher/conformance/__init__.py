@@ -1,1 +1,1 @@
-"""The conformance suite: does a bootloader follow the protocol, case by case, and how fast."""
+"""Bootloader conformance suite: cases that check the protocol, bus faults and timing."""

@@ -1,10 +1,9 @@
-"""The bench: what a case, or a test of one's own, works with.
+"""Test bench of one case: the fixture that cases and users' own pytest tests work with.
 
-A bench has four parts, each with one job: `tester` (frames and messages on the bus), `judge`
-(checks and measurements), `host` (a patient host that upgrades a device from any state) and
-`subject` (the device itself: power, readback, faults). The calls of the parts that nearly every
-case makes are bound here under the same names. The methods of the bench itself take an upgrade step
-by step, check what the device answers, and end the case when it is wrong.
+`Bench` combines `tester` (frames and messages on the bus), `judge` (checks and measurements),
+`host` (upgrades the device from any state) and `subject` (power, readback and faults of the
+device). Calls that most cases need are available on the bench itself. Its own methods perform
+single steps of an upgrade, check the answer, and end the case when it is wrong.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from flasher.conformance.wire import (
 )
 
 _PIECES: Final = 64
-"""Of an image, so many pieces are read over the bus at the most, which takes about a second."""
+"""Pieces of a large image that are read over the bus; takes about a second."""
 _EDGE_S: Final = 0.001
 QUIET_S: Final = 0.1
-"""A second answer to one message would come within that time of the first one."""
+"""A second answer to the same message would arrive within this time."""
 _PAUSES: Final = 4
-"""A pause that nobody knows may be so many times as long as limits.pause_s."""
+"""Longest pause to try, in units of limits.pause_s, when the profile does not know the pause."""
 
 
 class Bench:
-    """The bench of one case, which may take `limit_s`."""
+    """The bench of one case, which may take up to `limit_s` on the bench's clock."""
 
     def __init__(
         self,
@@ -64,9 +63,9 @@ class Bench:
         self.host = host = PatientHost(tester)
         self.random = random.Random(seed)  # noqa: S311  chosen by the seed on purpose
         self.upgrades = upgrades
-        """How often a case that wears the device has it upgraded."""
+        """Number of upgrades for a case that wears the flash."""
         self.is_off = False
-        """True while the case has the device's power cut."""
+        """True while the case keeps the device switched off."""
 
         self.choice, self.limit, self.number = profile.choice, profile.limit, profile.number
         self.send, self.disturb = tester.send, tester.disturb
@@ -84,7 +83,6 @@ class Bench:
 
     @property
     def now(self) -> float:
-        """The time, in seconds on the port's clock."""
         return self.port.now()
 
     @property
@@ -93,26 +91,26 @@ class Bench:
         return self.subject.good_image
 
     def second_image(self) -> bytes:
-        """Another image that runs, smaller. Raises Unsupported without one."""
+        """A smaller image that also runs on the device. Raises Unsupported without one."""
         image = self.subject.second_image
         if image is None:
             raise Unsupported("the bench has no second good image")
         return image
 
     def filler(self, packets: int) -> bytes:
-        """Random bytes, by the seed, for a transfer that is never ended."""
+        """Random bytes by the seed, for a transfer that is never ended."""
         return self.random.randbytes(packets * 128)
 
     # -- into a transfer --------------------------------------------------------------------------
 
     def reset_to_bootloader(self) -> Received:
-        """Reset the device; returns the first boot version. General feedback is not judged here."""
+        """Reset the device and return its first boot version; does not judge general feedback."""
         self.forget()
         self.send(self.encoder.reset())
         return self.await_message(MessageKind.BOOT_VERSION)
 
     def reset_measured(self, within_s: float) -> Received:
-        """The same, with the times of general feedback, if it comes, and boot version measured."""
+        """Like `reset_to_bootloader`, and measure general feedback and boot version."""
         self.forget()
         with self.tester.collecting_feedback():
             sent = self.send(self.encoder.reset())
@@ -125,14 +123,14 @@ class Bench:
         return found
 
     def wait_until_listening(self) -> None:
-        """After the first boot version, wait until the device takes the update command: not at all,
-        or until the burst is over (up_04_burst).
+        """After the first boot version, wait until the device accepts an update command: at once,
+        or after the burst (up_04_burst).
         """
         if self.choice("up_04_burst") != "accepted":
             self.wait_for_window()
 
     def wait_for_window(self) -> None:
-        """After the first boot version, wait for the middle of the window behind the last one."""
+        """After the first boot version, wait for the middle of the window after the burst."""
         gaps = self.number("versions") - 1
         spacing_s = self.limit("version_spacing_s") + self.limit("version_spacing_tolerance_s")
         last_at = self.now + gaps * spacing_s
@@ -143,17 +141,15 @@ class Bench:
 
     @property
     def window_edge_s(self) -> float:
-        """Nearer to the window's end nobody can tell whether a message came before or behind it."""
+        """Margin around the window's end within which early and late cannot be told apart."""
         return max(self.limit("window_tolerance_s"), 2 * self.port.uncertainty_s) + _EDGE_S
 
     def next_version(self) -> Received:
-        """The next boot version of the burst."""
+        """Wait for the next boot version of the burst."""
         return self.expect(MessageKind.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
 
     def update(self, size_bytes: int) -> Received:
-        """Get request transfer: the update command now, and at every boot version that follows
-        (R2).
-        """
+        """Send the update command, repeated at every boot version (R2), until request transfer."""
         limit_s = self.limit("erase_s")
         heard: Received | None = None
         for _ in range(UPDATES_MAX):
@@ -168,36 +164,36 @@ class Bench:
         return found
 
     def start_transfer(self, size_bytes: int) -> None:
-        """Reset the running application and get request transfer."""
+        """Reset the running application and send the update command until request transfer."""
         self.reset_to_bootloader()
         self.update(size_bytes)
 
     # -- packets and the end ----------------------------------------------------------------------
 
     def packet(self, image: bytes, number: int) -> None:
-        """Send a packet of `image`; its ACK has to come."""
+        """Send a packet of `image` and require its ACK."""
         sent = self.send_packet(image, number)
         heard = self.expect(MessageKind.ACK, number=number)
         self.measure(Times.ANSWER, heard.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
-        """Packets `first` to `last` (the last one of the image), each one acknowledged."""
+        """Send packets `first` to `last` (default: the last of the image) and require each ACK."""
         final = packet_count(len(image)) if last is None else last
         for number in range(first, final + 1):
             self.packet(image, number)
 
     def check_packet_rejected(self, wanted: int | None, named: int | None = None) -> bool:
-        """The packet just sent was not taken: the answer is as the profile says (tx_01), with the
-        number `wanted` by the device or the one that the packet `named` (None: any). The number 0
-        is not credible, so that both are right.
+        """Check that the packet just sent was rejected as the profile says (tx_01): NAK with the
+        number that the device `wanted`, or with the one that the packet `named` (None: any number).
+        A packet number of 0 allows both.
         """
         choice = self.choice("tx_01")
         numbers = {"nak_expected": [wanted], "either": [wanted, named]}.get(choice, [named])
         return self.check_naks([wanted, 0] if numbers == [0] else numbers, choice)
 
     def check_naks(self, numbers: Collection[int | None], choice: str) -> bool:
-        """A NAK with one of these numbers (None: any), silence, or one of both came, as `choice`
-        says: "silence", "either", or another word for a NAK.
+        """Check for a NAK with one of `numbers` (None: any), for silence, or for either. `choice`
+        is "silence", "either" or a word for a NAK.
         """
         heard = self.answers()
         known = sorted({number for number in numbers if number is not None})
@@ -212,20 +208,21 @@ class Bench:
         return self.check(ok, f"rejected: {' or '.join(wanted.values())}", describe(heard))
 
     def repetition_answers(self, number: int) -> list[str]:
-        """The right answers to a packet that was stored last and is sent again (tx_02)."""
+        """Correct answers when the last stored packet is sent again (tx_02)."""
         words = {"ack": f"ACK {number}", "nak_next": f"NAK {number + 1}"}
         return [answer for word, answer in words.items() if self.profile.allows("tx_02", word)]
 
     def answers(self) -> list[Received]:
-        """The answers to what was just sent: the first one, and those that follow it at once."""
+        """Wait for the first answer and any that follow it immediately."""
         first = self.next_message(self.limit("ack_s") + self.limit("inter_frame_s"))
         return [] if first is None else [first, *self.collect(QUIET_S)]
 
     def gaps(
         self, packet: Sequence[RawFrame], shares: Iterable[float]
     ) -> Iterator[tuple[float, int]]:
-        """Gaps between the frames of a packet, as shares of `limits.inter_frame_s` and just below
-        it; behind how many frames, so that the packet takes less than a pause (TX-12).
+        """Gaps to insert between frames: `shares` of `limits.inter_frame_s`, and just below it,
+        each with the number of frames to apply it to so that the packet stays shorter than a pause
+        (TX-12).
         """
         limit_s, pause_s = self.limit("inter_frame_s"), self.limit("pause_s")
         frame_s = self.tester.wire_s(packet[:1], is_stuffed=True)
@@ -234,20 +231,20 @@ class Bench:
             yield gap_s, min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
 
     def end_transfer(self) -> None:
-        """End of transfer; complete has to come."""
+        """Send end of transfer and require complete."""
         sent = self.send(self.encoder.end())
         heard = self.expect(MessageKind.COMPLETE)
         self.measure(Times.COMPLETE, heard.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
-        """Send the packets from `first` on and the end; the application of the image has to run."""
+        """Send the packets from `first` on and the end of transfer; check that the image runs."""
         self.packets(image, first)
         self.end_transfer()
         self.check_image(image)
 
     def transfer_in_parts(self, image: bytes, stops: Iterable[int]) -> Iterator[int]:
-        """Transfer `image` from the running application on, and yield after each of these packets
-        (0: before the first one); the whole ends with the application of the image.
+        """Transfer `image`, yielding after each packet number in `stops` (0: before packet 1); then
+        finish the transfer and check that the image runs.
         """
         self.start_transfer(len(image))
         done = 0
@@ -258,7 +255,9 @@ class Bench:
         self.finish(image, done + 1)
 
     def check_upgrade(self, image: bytes | None = None) -> None:
-        """The device can be upgraded from where it is: to `image`, or to the good one."""
+        """Check that the device can be upgraded from its current state, to `image` or the good
+        image.
+        """
         chosen = self.good_image if image is None else image
         done = self.upgrade(chosen, blind=self.choice("rs_03") == "either")
         self.require(done.ok, "the device can be upgraded", done.reason or "it was")
@@ -267,13 +266,13 @@ class Bench:
     # -- what the device holds --------------------------------------------------------------------
 
     def check_image(self, image: bytes) -> None:
-        """The application of `image` runs, and the flash holds it."""
+        """Check that the application of `image` runs and that the flash holds it."""
         self._check_runs(image)
         self.check_stored(image, runs=True)
 
     def check_application(self, image: bytes | None = None) -> None:
-        """The application of `image` (the good one) runs. One that tells no version is known by
-        the flash, if it may be another one than before the case.
+        """Check that the application of `image` (default: the good image) runs. Where it reports no
+        version, compare the flash if the case may have changed it.
         """
         chosen = self.good_image if image is None else image
         self._check_runs(chosen)
@@ -294,8 +293,8 @@ class Bench:
             self.check(runs, "the application runs", "it answers" if runs else "no answer")
 
     def check_stored(self, image: bytes, *, runs: bool = False) -> None:
-        """The flash holds exactly `image`, of which the application `runs`; not tried on a bench
-        that cannot compare it.
+        """Check that the flash holds exactly `image`; `runs` says that its application is running.
+        Recorded as unsupported where the bench cannot read the flash.
         """
         expected = "the flash holds the image"
         try:
@@ -314,8 +313,8 @@ class Bench:
         self.check(differs_at is None, expected, got)
 
     def difference(self, image: bytes, *, runs: bool = False) -> int | None:
-        """The offset from which on the flash holds something else than `image`, of which the
-        application `runs`; None without a difference. Raises Unsupported.
+        """Offset of the first byte in flash that differs from `image`, or None. `runs` says that
+        its application is running. Raises Unsupported.
         """
         source = readback_source(self.subject, self.profile)
         if not source:
@@ -327,7 +326,7 @@ class Bench:
             return None if at == len(image) else at
         if not runs:
             raise Unsupported("only a running application tells the memory over the bus")
-        # Of a large image some pieces are asked for, by the seed.
+        # Of a large image, read only some pieces, chosen by the seed.
         total = packet_count(len(image))
         numbers = list(range(total))
         if total > _PIECES:
@@ -345,26 +344,27 @@ class Bench:
     # -- power, and out of a transfer -------------------------------------------------------------
 
     def power_off(self) -> None:
-        """Cut the device's power. Raises Unsupported."""
+        """Switch the device off. Raises Unsupported."""
         self.subject.power(on=False)
         self.is_off = True
 
     def power_on(self) -> None:
-        """Give the device its power back. Raises Unsupported."""
+        """Switch the device on. Raises Unsupported."""
         self.subject.power(on=True)
         self.is_off = False
 
     def power_cycle(self, off_s: float = 0.5) -> None:
-        """Switch off and, after `off_s`, on; earlier messages are discarded. Raises Unsupported."""
+        """Switch off, wait `off_s`, switch on; discards messages received earlier. Raises
+        Unsupported.
+        """
         self.power_off()
         self.wait(off_s)
         self.forget()
         self.power_on()
 
     def restart_transfer(self, size_bytes: int) -> None:
-        """Abandon a transfer and get request transfer for another one: by the update command where
-        the profile says that it starts over (up_08), else as `leave_transfer` does, which raises
-        Unsupported.
+        """Abandon a transfer and start another one: by an update command where the profile allows
+        it (up_08), else by `leave_transfer`, which raises Unsupported.
         """
         if self.choice("up_08") == "either" and not self.subject.has_power:
             sent = self.send(self.encoder.update(size_bytes))
@@ -376,9 +376,8 @@ class Bench:
         self.update(size_bytes)
 
     def leave_transfer(self) -> None:
-        """Abandon a transfer, so that the bootloader announces itself without an application: by
-        reset or by a pause where the profile says that they end a transfer, else by power; without
-        that, by a reset or a pause that may end it.
+        """Abandon a transfer so that the bootloader announces itself without an application: by the
+        reset or pause that the profile documents, else by a power cycle, else by trying both.
 
         Raises Unsupported where none of these is possible.
         """
@@ -406,6 +405,6 @@ class Bench:
             self.await_message(MessageKind.BOOT_VERSION)
 
     def erase_application(self) -> None:
-        """Erase the application, and let the bootloader announce itself."""
+        """Erase the application and wait until the bootloader announces itself."""
         self.start_transfer(len(self.good_image))
         self.leave_transfer()

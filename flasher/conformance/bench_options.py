@@ -1,5 +1,5 @@
-"""From what a user says about his bench to a device under test and the profile that it is judged
-by; the command line and the pytest plugin both come here.
+"""Options of a bench, and `open_bench`, which opens the device under test and its profile. Used by
+the command line and the pytest plugin.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ _ECHO_OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "socketcan": {"receive_own_messages": True},
     "udp_multicast": {},
 }
-"""Back ends that give a frame back once it has left, with what they have to be told for it: answer
-times then begin at the echo. Elsewhere the end of a frame is reckoned from its length."""
+"""Interfaces that echo sent frames, with the arguments that enable it: answer times start at the
+echo. For other interfaces the end of a frame is calculated from its length.
+"""
 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """A bench as a user describes it; files by their names. `bus` and `fallback` are those of
-    `api.connect`, `choices` are KEY=VALUE of the device model.
+    """A bench as the user describes it, with file names. `bus` and `fallback` are arguments of
+    `api.connect`; `choices` are KEY=VALUE options of the device model.
     """
 
     target: str
     is_mock: bool = False
     subject: str | None = None
-    """A bootloader that is compiled for the computer: a program, a library, MODULE:FACTORY."""
+    """A bootloader compiled for this computer: a program, a shared library or MODULE:FACTORY."""
     variant: str | None = None
     choices: Sequence[str] = ()
     profile: str | None = None
@@ -62,15 +63,13 @@ class BenchOptions:
 
     @property
     def is_simulated(self) -> bool:
-        """True for what takes no time and wears nothing: the mock, or a bootloader on the
-        computer.
-        """
+        """True for the device model and for a bootloader that runs on this computer."""
         return self.is_mock or self.subject is not None
 
 
 @contextmanager
 def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProfile]]:
-    """The device under test and its profile. Raises UsageError, ImageError and BusError."""
+    """Open the device under test and its profile. Raises UsageError, ImageError and BusError."""
     check_bench(options)
     profile = None if options.profile is None else load_profile(options.profile)
     images = [_image(path, options) for path in (options.good_image, options.second_image)]
@@ -133,7 +132,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
 
 
 def _image(path: str | None, options: BenchOptions) -> Image | None:
-    """An image file, which a real device has to run."""
+    """Load an image file for a real device."""
     if path is None:
         return None
     image = load(path)
@@ -143,7 +142,7 @@ def _image(path: str | None, options: BenchOptions) -> Image | None:
 
 
 def check_bench(options: BenchOptions) -> None:
-    """Raises UsageError for a bench that makes no sense."""
+    """Raise UsageError for options that contradict each other."""
     if options.is_mock and options.subject is not None:
         raise UsageError("The mock is no bootloader under test: choose one of the two.")
     if options.is_simulated and not (options.power is None and options.readback is None):
@@ -162,7 +161,7 @@ def check_bench(options: BenchOptions) -> None:
 
 
 def device_profile(choices: Sequence[str]) -> DeviceProfile:
-    """The device model with these choices, each KEY=VALUE. Raises UsageError."""
+    """Build the device model's profile from KEY=VALUE choices. Raises UsageError."""
     from flasher.conformance.mock import MOCK_PROFILE  # noqa: PLC0415  only for the mock
 
     return set_options(MOCK_PROFILE, choices)

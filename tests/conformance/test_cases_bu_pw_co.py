@@ -30,11 +30,6 @@ def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseR
     return report.results[0]
 
 
-def not_judged(result: CaseResult) -> list[str]:
-    """What the bench could not do."""
-    return [check.expected for check in result.checks if check.outcome is CheckOutcome.UNSUPPORTED]
-
-
 def test_the_mock_passes() -> None:
     assert MINE == ("BU-01", "BU-02", "BU-06", "PW-01", "PW-02", "CO-01", "CO-02", "CO-04")
     assert not_passed(*(case_id for case_id in MINE if case_id != "PW-01")) == []
@@ -69,16 +64,14 @@ def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
     result = result_of("PW-01", "record-first", has_readback=False)
     assert result.verdict is CaseVerdict.FAIL
     assert result.first_failure is not None
-    assert "whole image" in result.first_failure.expected
+    assert result.first_failure.got.startswith("version ")
 
 
 def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
     result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
     assert result.verdict is CaseVerdict.PASS_IN_PART
-    assert not_judged(result)[:2] == [
-        "power cuts before, in and after every flash operation",
-        "what was acknowledged is stored",
-    ]
+    steps = [one.step for one in result.checks if one.outcome is CheckOutcome.UNSUPPORTED]
+    assert steps[:2] == ["", "after ACK 2"]
 
 
 @each("case_id, power", [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")])

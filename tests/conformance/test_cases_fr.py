@@ -123,8 +123,8 @@ def test_gaps_that_no_product_promises_are_observed_only() -> None:
     done = report("drops-after-20-ms-gap", only=("TM-02",), judged_by={"tm_02": "either"})
     assert failed(done) == []
     infos = done.results[0].infos
-    assert "gap of 10.0 ms: taken" in infos
-    assert "gap of 50.0 ms: not taken" in infos
+    assert "gap of 10.0 ms: accepted" in infos
+    assert "gap of 50.0 ms: rejected" in infos
 
 
 def test_times_are_judged_all_together_and_tell_how_they_are_spread() -> None:

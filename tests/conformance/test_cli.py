@@ -113,7 +113,7 @@ def test_a_repeated_run_has_every_case_several_times(flasher: Flasher) -> None:
 
 def test_verbose_tells_every_case_on_both_streams(flasher: Flasher) -> None:
     run = flasher(*MOCK, "--case", "RS-04", "-v")
-    assert "pass          RS-04  what is no reset" in run.out
+    assert f"pass          RS-04  {CASES['RS-04'].title}" in run.out
     assert "RS-04 pass (0 left)" in run.err
 
 
@@ -122,7 +122,7 @@ def test_a_terminal_shows_which_case_runs_and_what_fails_at_once(
 ) -> None:
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     run = flasher(*WRONG)
-    assert "RS-04 what is no reset" in run.err
+    assert f"RS-04 {CASES['RS-04'].title}" in run.err
     assert "after RS-01" in run.err
     assert "RS-01 fail: expected boot version; got nothing within 0.2 s (1 left)" in run.err
     assert "0/2 " in run.err

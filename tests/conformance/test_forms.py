@@ -43,7 +43,7 @@ def test_a_form_that_is_added_is_sent_by_its_case(own_junk: bytes) -> None:
 
 def test_a_form_that_is_added_is_asked_for_a_profile(own_junk: bytes) -> None:
     session = InitSession(subject(), PROFILE, lambda: False)
-    stimulus = f"a packet behind {own_junk.hex(' ')} in its first frame"
+    stimulus = f"a packet after {own_junk.hex(' ')} in its first frame"
     found = list(in_forms(session, "fr_02"))
     assert Trial("found", "taken", stimulus, "") in found
 

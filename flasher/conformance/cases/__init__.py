@@ -1,15 +1,15 @@
-"""The cases, a file a group; importing this package registers them all in `catalogue.CASES`.
+"""Test cases, one module per group; importing this package registers them in `catalogue.CASES`.
 
 How to write a case
 -------------------
 
     @case(
         "TX-06", "wrong start byte",
-        clause="Welling 5.2, table 8 (A385); R10",       # of `conformance.clauses`
-        stimulus="packets that begin with 00, 02 and FF",   # both texts stand in the reports
-        expectation="not stored; packet 1 is accepted when it comes as it should",
-        requires={DESTRUCTIVE},                          # `Requirement`; what is missing on a
-        choices=("tx_01",),                              # bench makes the case `unsupported`
+        clause="Welling 5.2, table 8 (A385); R10",          # keys of `clauses.CLAUSES`
+        stimulus="packets that begin with 00, 02 and FF",   # stimulus and expectation are
+        expectation="not stored; packet 1 is accepted when it is correct",   # in the reports
+        requires={DESTRUCTIVE},        # `Requirement`: without it the case is `unsupported`
+        choices=("tx_01",),            # profile keys that decide
     )
     def wrong_start_byte(bench: Bench) -> None:
         image = bench.good_image
@@ -20,26 +20,27 @@ How to write a case
                 bench.check_packet_rejected(1)           # by the profile; the case goes on
         bench.finish(image)                              # all packets, end, application, readback
 
-- Before a case the application of `bench.good_image` runs. After it the runner brings the device
-  back to that, whatever state it was left in; a case need not tidy up. One that may erase says
-  DESTRUCTIVE. Only good images are ever ended: a transfer of `bench.filler(n)` is left as it is.
+- The application of `bench.good_image` runs before every case. The runner restores it afterwards,
+  so a case need not clean up. A case that may erase requires DESTRUCTIVE. Only complete good
+  images; a transfer of `bench.filler(n)` stays unfinished.
 - Never import from flasher.protocol, host, image or mock: use `bench.encoder` and
   `conformance.wire` to send and receive. `bench.tester.collects_application` adds the messages of
   the application to other nodes. Faults: `with bench.disturb(LineFault(...))` on the line;
-  `power_cycle`, `subject.bus_off`, `subject.cut_in_operation` at the device, each with its
+  `power_cycle`, `subject.bus_off` and `subject.cut_in_operation` on the device, each with its
   requirement.
-- `check` records and goes on, `require` and `expect` end the case; texts say what is expected and
-  what was got. Judge what the catalogue says and no more: a choice (P) is read with
-  `bench.choice("tx_01")`, a limit with `bench.limit("ack_s")`.
-- A part that this bench cannot do: `bench.unsupported(what, why)`; the whole case: `requires=`.
-- Times: `send` returns when the last frame had left (`left_at`), a `Received` has `first_at` and
-  `at`; `check_time` judges, `measure` records. Waits are `wait`, `collect`, `wait_for`: all
-  bounded, `wait_for` and `expect` by the profile's limit for that message where none is given.
-- Chance comes from `bench.random` only, so that the seed repeats it. No loop without a bound.
-- Parameters are a table at the top of the file. One file a group, added to the imports below; what
-  software cannot do stands in `catalogue.NOT_IMPLEMENTED` with the reason.
-- A form of a packet that the profile decides about is a row of `fr.forms`: its case, `init` and the
-  walks of `explore` send it without further code.
+- `check` records and continues; `require` and `expect` end the case when they fail. Texts give the
+  expected and the actual behaviour. Judge only what the catalogue states: read a choice (P) by
+  `bench.choice("tx_01")` and a limit by `bench.limit("ack_s")`.
+- Record a part that this bench cannot judge by `bench.unsupported(what, why)`; use `requires=` for
+  the whole case.
+- `send` returns when the last frame has left (`left_at`); a `Received` has `first_at` and `at`.
+  `check_time` judges, `measure` only records. `wait`, `collect` and `wait_for` are bounded;
+  `wait_for` and `expect` default to the profile's limit for that message.
+- Take random values only from `bench.random`, so that the seed repeats them. Bound every loop.
+- Put parameters into a table at the top of the module and add a new group to the imports below.
+  Cases that software cannot run are listed in `catalogue.NOT_IMPLEMENTED` with the reason.
+- Add a packet form that the profile decides about to `fr.forms`: its case, `init` and the walks of
+  `explore` then send it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""BR: bring-up, before everything else."""
+"""BR: bring-up. Two plain upgrades before all other cases."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""BU: faults of the bus. One frame after the other is lost, doubled, held up, swapped; the device's
-controller leaves the bus; somebody else uses the device's id.
+"""BU: bus faults. Frames are lost, doubled, delayed and swapped one at a time; the device goes
+bus-off; another node uses the device's id.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ from flasher.conformance.wire import (
 )
 
 _ENTRIES_MAX: Final = 60
-"""Resets and update commands on the way into a transfer; ends a device that never gets there."""
+"""Resets and update commands to try before giving up on entering a transfer."""
 _ANSWER_FRAMES: Final = 2
-"""General feedback, ACK, complete: each one has two frames."""
+"""General feedback, ACK and complete have two frames each."""
 _OFF_BUS_S: Final = 0.2
 _POLL_S: Final = 0.0002
-"""Shorter than a frame, so that an answer can be hit in its middle."""
+"""Shorter than a frame, so that an answer can be interrupted halfway."""
 _REPORTS_AT_ONCE: Final = 4
 
 
-# -- what befalls the messages ---------------------------------------------------------------------
+# -- faults of a message ---------------------------------------------------------------------------
 
 _Sending = Callable[[Bench, Sequence[RawFrame]], AbstractContextManager[Sent]]
 
 
 class _Disturbance(NamedTuple):
-    """A fault during one message: `send` is a context that sends the message; the answer is awaited
-    inside of it.
+    """A fault during one message: `send` is a context manager that sends the message; the answer is
+    awaited inside it.
     """
 
     name: str
     send: _Sending
     hits_answer: bool = False
-    """True when the message itself arrives, so that the device goes on."""
+    """True when the message itself arrives, so that the device continues."""
 
 
 _PendingFaults = dict[str, deque[_Disturbance]]
-"""The faults that each message of the tool has still to meet, in turn."""
+"""Faults still to be applied to each message, in order."""
 
 
 @contextmanager
 def _faulty(
     bench: Bench, frames: Sequence[RawFrame], faults: Sequence[LineFault] = ()
 ) -> Iterator[Sent]:
-    """Send a message while these faults are set for it and its answer."""
+    """Send a message while `faults` apply to it and its answer."""
     with bench.disturb(*faults):
         yield bench.send(frames)
 
@@ -68,7 +68,7 @@ _UNDISTURBED: Final = _Disturbance("", _faulty)
 
 @contextmanager
 def _off_bus_after(bench: Bench, frames: Sequence[RawFrame], after: int) -> Iterator[Sent]:
-    """Send a message; after `after` of its frames the device's controller goes off the bus."""
+    """Send a message; the device goes bus-off after `after` of its frames."""
     bench.send(frames[:after])
     bench.subject.bus_off(_OFF_BUS_S)
     yield bench.send(frames[after:])
@@ -76,7 +76,7 @@ def _off_bus_after(bench: Bench, frames: Sequence[RawFrame], after: int) -> Iter
 
 @contextmanager
 def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
-    """Send a message; the device's controller goes off the bus during its answer."""
+    """Send a message; the device goes bus-off during its answer."""
     before = bench.tester.frames_received
     sent = bench.send(frames)
     give_up_at = bench.now + bench.limit("ack_s")
@@ -128,7 +128,7 @@ def disturbed_frames(bench: Bench) -> None:
     stimulus="the device's controller leaves the bus for 0.2 s before, between and after the "
     "frames of every message, and in the middle of its answers; from a power-up on, for as long "
     "as its application takes to start",
-    expectation="the device is back, and the upgrade by a patient host completes correctly; alone "
+    expectation="the device recovers, and the upgrade by a patient host completes correctly; alone "
     "on the bus, where no frame of it is acknowledged, it starts its application too",
     requires={DESTRUCTIVE, Requirement.BUS_OFF},
     limit_s=1800.0,
@@ -161,11 +161,11 @@ def bus_off(bench: Bench) -> None:
 
 @case(
     "BU-06",
-    "somebody else uses the id of the device's answers",
+    "another node uses the device's id",
     clause="Welling 2.2.2, table 2; robustness, not in the document",
-    stimulus="answers that are not the device's on its own id, before its answer to each message "
+    stimulus="answers from another node on the device's own id, before its answer to each message "
     "and between two of them",
-    expectation="the device does not mind them, or is back afterwards",
+    expectation="the device ignores them, or recovers afterwards",
     requires={DESTRUCTIVE},
 )
 def same_id(bench: Bench) -> None:
@@ -190,7 +190,7 @@ def same_id(bench: Bench) -> None:
 
 
 def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance]]) -> None:
-    """Repeat the upgrade until every fault has happened, one in each message at most."""
+    """Repeat the upgrade until every fault was applied, at most one per message."""
     image, encoder = bench.good_image, bench.encoder
     left: _PendingFaults = {
         "reset": deque(make(len(encoder.reset()))),
@@ -205,17 +205,17 @@ def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance
         if _send_packets(bench, image, left) and _end(bench, image, left):
             bench.check_image(image)
     done = not any(left.values())
-    bench.check(done, "the upgrades come to their end", "the device restarts in each one")
+    bench.check(done, "the upgrades are completed", "the device restarts in each one")
 
 
 def _next(left: _PendingFaults, message: str) -> _Disturbance:
-    """The next fault for that message; an undisturbed sending when none is left."""
+    """Take the next fault for this message, or an undisturbed send when none is left."""
     return left[message].popleft() if left[message] else _UNDISTURBED
 
 
 def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
-    """Send reset and update command until request transfer. A device that received only a part of
-    them may announce, run, erase or wait for packet 1; it has to request the transfer in the end.
+    """Send reset and update command until request transfer. A device that received only part of
+    them may announce, run, erase or wait for packet 1, but has to request the transfer in the end.
     """
     limit = bench.limit
     names: list[str] = []
@@ -235,7 +235,7 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
             within_s = bench.host.burst_s if disturbance.name else limit("erase_s")
             with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
                 heard = bench.host.request_or_version(sent.left_at, within_s)
-            # It is not known that the bootloader was left: request transfer may be lost (UP-05).
+            # The device may still be in the bootloader: request transfer may be lost (UP-05).
             if heard is None and not (
                 bench.encoder.has_version_query and bench.application_version() is not None
             ):
@@ -243,17 +243,17 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
                 heard = bench.host.request_or_version(sent.left_at, limit("silence_s"))
         if heard is not None and heard.kind is MessageKind.REQUEST:
             break
-        # One that answers no reset may wait for packet 1: its request transfer was lost (R26).
+        # A device that ignores the reset may wait for packet 1: request transfer was lost (R26).
         is_deaf = message == "reset" and not disturbance.name
         message = "update command" if heard is not None or is_deaf else "reset"
     with bench.step("; ".join(names) or "undisturbed"):
         is_there = heard is not None and heard.kind is MessageKind.REQUEST
-        bench.require(is_there, MessageKind.REQUEST.value, heard or "nothing in many tries")
+        bench.require(is_there, MessageKind.REQUEST.value, heard or "nothing after many tries")
 
 
 def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
-    """Send all packets, each one with its fault and then undisturbed until it is acknowledged.
-    False when the device announced a restart: the upgrade begins again (R11).
+    """Send every packet, first with its fault, then undisturbed until it is acknowledged. False
+    when the device announced a restart: the upgrade starts over (R11).
     """
     total, began_at = packet_count(len(image)), bench.now
     for number in range(1, total + 1):
@@ -273,12 +273,12 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
 
 
 def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
-    """End of transfer, with one fault after the other until it is answered; false when the device
-    refused the image explicitly, with two NAKs (R6).
+    """Send end of transfer with one fault after another until it is answered. False when the device
+    rejected the image explicitly, with two NAKs (R6).
     """
     names: list[str] = []
     heard: Received | None = None
-    # Before the device takes the silence for a pause in the transfer (TX-12).
+    # Stop before the device takes the silence for a pause in the transfer (TX-12).
     give_up_at = bench.now + bench.limit("pause_s") / 2
     while heard is None and bench.now < give_up_at and left["end of transfer"]:
         disturbance = _next(left, "end of transfer")
@@ -302,7 +302,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
 
 
 def _answer_as_device(bench: Bench) -> None:
-    """Send complete answers, and the first frame of one, on the device's own id."""
+    """Send complete answers, and the first frame of another, on the device's own id."""
     answer = bench.encoder.answer
     for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):
         bench.send(answer(command, data))

@@ -1,7 +1,6 @@
-"""CO: others on the bus. Load, a babbling node, the upgrade of another target, and the traffic of
-chapter 3.
+"""CO: concurrency. Bus load, a babbling node, a second upgrade, application traffic (chapter 3).
 
-The suite sends the frames of the other nodes too, between its own.
+The suite itself sends the frames of the other nodes, between its own.
 """
 
 from __future__ import annotations
@@ -30,32 +29,32 @@ from flasher.conformance.wire import (
 )
 
 _FOREIGN_IDS: Final = (0x0A0, 0x1F4, 0x3C3, 0x555, 0x6FF)
-"""Ids that nobody of this protocol has."""
+"""Ids that no node of this protocol uses."""
 _FOREIGN_DATA: Final = bytes.fromhex("A5C30F96D2E17B4C")
 _FOREIGN_BITS: Final = 111
-"""A frame of 8 bytes without stuff bits: so long is the gap that stays free."""
+"""Bits of an 8-byte frame without stuff bits: the length of a free gap."""
 _SHARE: Final = 9
-"""Frames of others to one of the upgrade, or to one free place: 90 % of the bus."""
+"""Foreign frames for each frame of the upgrade or free gap: 90 % bus load."""
 _FOREIGN: Final = [
     RawFrame(_FOREIGN_IDS[index % len(_FOREIGN_IDS)], _FOREIGN_DATA) for index in range(_SHARE)
 ]
 _LOAD_S: Final = 0.3
 _LOADED_PACKETS: Final = 24
-"""Packets that are sent under load; more of them show nothing new."""
+"""Packets to send under load; more would show nothing new."""
 _BABBLE_ID: Final = 0x001
 _BABBLE_S: Final = 1.0
 _BABBLE_BURST: Final = 16
 _SHORT_BABBLE: Final = 10 * (RawFrame(_BABBLE_ID, bytes(8)),)
 
 _REPORTS: Final = (
-    # Of the motor controller.
+    # Motor controller.
     (0x710, REPORT, 0x1305, b"READY"),
     (0x710, REPORT, 0x1808, b"SHUTDOWN"),
     (0x712, READ, 0x3009, b"HANDSHAKE"),
     (0x712, READ, 0x3100, b""),
     (0x712, READ, 0x3200, b""),
     (0x712, READ, 0x3300, b""),
-    # Of the battery.
+    # Battery.
     (0x720, REPORT, 0x1010, bytes(16)),
     (0x720, REPORT, 0x1120, bytes(32)),
     (0x720, REPORT, 0x1204, b"\x01\x00\x00\x00"),
@@ -64,7 +63,7 @@ _REPORTS: Final = (
     (0x720, REPORT, 0x1540, bytes(64)),
     (0x720, REPORT, 0x160C, bytes(12)),
     (0x721, REPORT, 0x3005, b"READY"),
-    # Of the on-board computer and the display.
+    # On-board computer and display.
     (0x730, REPORT, 0x1405, b"READY"),
     (0x732, READ, 0x5000, b""),
     (0x732, READ, 0x5100, b""),
@@ -74,13 +73,14 @@ _REPORTS: Final = (
     (0x742, READ, 0x5000, b""),
     (0x742, READ, 0x5100, b""),
 )
-"""Traffic of chapter 3 between other nodes: id, mode, command, data."""
+"""Application traffic (chapter 3) between other nodes: id, mode, command, data."""
 _QUERIES: Final = (
     *(0x3000, 0x3100, 0x3300, 0x3400, 0x3500, 0x3600),
     *(0x3700, 0x3800, 0x3900, 0x3B00, 0x3D00),
 )
-"""What the tool asks an application. Writes are left out: a device that took one by mistake would
-lose what only its manufacturer can give back."""
+"""Read queries from the tool to an application. Writes are left out: a device that accepted one by
+mistake would lose settings that only its manufacturer can restore.
+"""
 _MEMORY_READ: Final = 0x4308
 
 
@@ -90,8 +90,8 @@ _MEMORY_READ: Final = 0x4308
     clause="Welling 2.2.2, table 2; robustness, not in the document",
     stimulus="90 % bus load of other ids around reset, update command and packets; a node that "
     "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer, and for "
-    "5 ms behind end of transfer",
-    expectation="nothing fails under load; what the babbling node delays goes on after it",
+    "5 ms after end of transfer",
+    expectation="nothing fails under load; the upgrade continues after the babbling node stops",
     requires={DESTRUCTIVE, LONG},
     choices=("up_04_burst",),
 )
@@ -127,7 +127,7 @@ def load(bench: Bench) -> None:
         if not any(one.kind is MessageKind.ACK and one.number == loaded for one in heard_all):
             trouble = bench.host.deliver_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
-    with bench.step("end of transfer, the bus taken behind it"):
+    with bench.step("end of transfer, then a busy bus"):
         bench.packets(image, loaded + 1)
         bench.send([*bench.encoder.end(), *_SHORT_BABBLE])
         bench.expect(MessageKind.COMPLETE)
@@ -155,7 +155,7 @@ def two_upgrades(bench: Bench) -> None:
             bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
-                # The other's packet has other data; its next one comes alone.
+                # The other target's packet has other data; its next packet is sent alone.
                 inverse = inverted(packet_payload(image, number))
                 own = bench.encoder.packet_of(image, number)
                 _send_interleaved(bench, own, other.packet(number, total, inverse))
@@ -166,7 +166,7 @@ def two_upgrades(bench: Bench) -> None:
                 if number == 1:
                     bench.send(other.answer(BOOT_VERSION, other.boot_name.encode() + b"V1.0.0"))
                     bench.expect_silence(bench.limit("ack_s"))
-            # A device that hears it ends here, or refuses.
+            # A device that wrongly takes this for its own end of transfer fails here.
             bench.send(other.end())
             bench.send(other.answer(COMPLETE, bytes(2)))
             bench.expect_silence(bench.limit("silence_s"))
@@ -180,7 +180,7 @@ def two_upgrades(bench: Bench) -> None:
     clause="Welling 3, tables 4 to 7; R15",
     stimulus="messages of chapter 3 to the device and between other nodes, during the "
     "announcements, before packet 1, between packets and before the end",
-    expectation="ignored: no answer, and the upgrade goes on as if nothing had been said",
+    expectation="ignored: no answer, and the upgrade continues normally",
     requires={DESTRUCTIVE},
 )
 def application_traffic(bench: Bench) -> None:
@@ -210,12 +210,12 @@ def application_traffic(bench: Bench) -> None:
 
 
 def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
-    """Frames of the upgrade, nine frames of other nodes before each of them."""
+    """Insert nine foreign frames before each frame of the upgrade."""
     return [one for frame in frames for one in (*_FOREIGN, frame)]
 
 
 def _expect_under_load(bench: Bench, kind: MessageKind) -> Received:
-    """The next message of that kind, while the load goes on."""
+    """Wait for a message of this kind while the load continues."""
     within_s = bench.tester.limit_s(kind)
     until = bench.now + within_s
     heard: Received | None = None
@@ -235,7 +235,7 @@ def _babble(bench: Bench) -> None:
 
 
 def _send_interleaved(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) -> None:
-    """Send the frames of two messages alternately; the device's own message ends last."""
+    """Send the frames of two messages alternately, the device's own message ending last."""
     frames: list[RawFrame] = []
     for index in range(max(len(own), len(others))):
         frames += others[index : index + 1]
@@ -247,7 +247,7 @@ def _send_interleaved(bench: Bench, own: Sequence[RawFrame], others: Sequence[Ra
 
 
 def _chapter_3_frames(encoder: Encoder) -> Iterator[RawFrame]:
-    """The messages of chapter 3, without those that the device itself sends."""
+    """Application messages of chapter 3, without those that the device itself sends."""
     for can_id, mode, command, data in _REPORTS:
         if can_id & 0x0F0 != encoder.to_all & 0x0F0:
             yield from split(can_id, build(can_id, mode, command, data))

@@ -40,27 +40,29 @@ _FIELDS: Final = (
     ("CRC", 139, 143),
     ("tail", 143, 144),
 )
-"""The fields of a packet: name, first byte, byte behind the last."""
+"""Fields of a packet: name, first byte, end (exclusive)."""
 _PACKET_LIKE_BYTES: Final = range(6, 143)
-"""Bytes whose damage leaves a message of the same size and kind: it is over with its last frame."""
+"""Bytes that can be damaged without changing the message's size and kind, so that it still ends
+with its last frame.
+"""
 _NO_HEADER_BYTES: Final = bytes(byte for byte in range(256) if byte not in b"\x55\xaa\xf0")
-"""Bytes that a single flip does not make a header of, as it takes two."""
+"""Byte values that a single bit flip cannot turn into a header."""
 _BURST_BITS: Final = 8
 _BURSTS: Final = 250
 _SILENT_BATCH: Final = 16
-"""Damaged packets in a row, where a device does not answer them."""
+"""Damaged packets to send in a row where the device does not answer them."""
 _NO_HEADER_SIZE: Final = 16 * PACKET_BYTES
 _DOCUMENT_SIZE: Final = 78351
 Damage = tuple[str, Callable[[bytes], bytes]]
-"""What is done to a packet, by name, and the function from its bytes to the damaged ones."""
+"""A name, and a function that damages the bytes of a packet."""
 
 
 @case(
     "CR-01",
     "every single-bit flip",
     clause="Welling 2.2.1 (6); robustness, not in the document",
-    stimulus="a packet once for each of its 1152 bits, with that bit the other way round",
-    expectation="none accepted; the packet is taken afterwards, and stored as it is",
+    stimulus="a packet once for each of its 1152 bits, with that bit inverted",
+    expectation="none accepted; afterwards the correct packet is accepted and stored unchanged",
     requires={DESTRUCTIVE, LONG},
     limit_s=1800.0,
 )
@@ -82,7 +84,7 @@ def single_bits(bench: Bench) -> None:
     clause="Welling 2.2.1 (6); Welling 2.2.3, table 3",
     stimulus="packets with 2 to 8 bits in a row changed, chosen by the seed; each frame of a "
     "packet lost, doubled, swapped with the next one",
-    expectation="none accepted; the packet is taken afterwards, and stored as it is",
+    expectation="none accepted; afterwards the correct packet is accepted and stored unchanged",
     requires={DESTRUCTIVE, LONG},
     limit_s=1800.0,
 )
@@ -93,8 +95,8 @@ def bursts(bench: Bench) -> None:
         chosen = [_burst(bench) for _ in range(_BURSTS)]
         _check_none_accepted(bench, probe, chosen, framed=True)
     with bench.step("frames"):
-        # Those after which no intact packet is left: the first or the last frame doubled leaves
-        # one, and behind the last frame there is none to swap it with.
+        # Only faults that leave no intact packet: doubling the first or last frame leaves one, and
+        # the last frame has no next frame to swap with.
         last = PACKET_FRAMES - 1
         faults: list[LineFault] = []
         for index in range(PACKET_FRAMES):
@@ -119,9 +121,9 @@ def bursts(bench: Bench) -> None:
     "CR-03",
     "a checksum of another kind",
     clause="Welling 2.2.1 (6); Welling 4.2",
-    stimulus="update commands and packets whose CRC is for another id, leaves the id out, stands "
+    stimulus="update commands and packets whose CRC is for another id, leaves the id out, is sent "
     "low byte first, is inverted, 00000000 or FFFFFFFF",
-    expectation="rejected; update command and packet with the right one are taken",
+    expectation="rejected; update command and packet with the right CRC are accepted",
     requires={DESTRUCTIVE},
 )
 def other_checksums(bench: Bench) -> None:
@@ -142,9 +144,9 @@ def other_checksums(bench: Bench) -> None:
     "CR-04",
     "messages byte for byte",
     clause="Welling 2.2.1, table 1; Welling 4.1; Welling 4.2",
-    stimulus="an upgrade, then the beginning of one by written-out messages",
-    expectation="they are taken, and each answer is the written-out one to the last byte, its last "
-    "frame no longer than it has to be",
+    stimulus="an upgrade, then the beginning of one, both with literal messages",
+    expectation="accepted, and each answer equals the expected message byte for byte, its last "
+    "frame without padding",
     requires={DESTRUCTIVE},
     choices=("tx_01",),
 )
@@ -173,7 +175,7 @@ def vectors(bench: Bench) -> None:
         exact.expect("ack", limit("ack_s"))
 
 
-# -- written-out messages --------------------------------------------------------------------------
+# -- literal messages ------------------------------------------------------------------------------
 
 VECTORS: Final[dict[str, dict[str, str]]] = {
     "wmc": {
@@ -228,13 +230,13 @@ VECTORS: Final[dict[str, dict[str, str]]] = {
         "complete": "55aa0c04c5020000361cc4c9f0",
     },
 }
-"""Target, then message, in hexadecimal: `update` for 78351 bytes, `small_update` for 128,
-`packet` 1 of 613.
+"""Messages in hexadecimal by target and name: `update` is for 78351 bytes, `small_update` for 128
+bytes, `packet` is number 1 of 613.
 """
 
 
 class _WrittenMessages:
-    """Sends and expects messages that are written out in `VECTORS`."""
+    """Sends and expects the literal messages in `VECTORS`."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
@@ -242,15 +244,14 @@ class _WrittenMessages:
         self._written = {name: bytes.fromhex(text) for name, text in texts.items()}
 
     def frames(self, name: str) -> list[RawFrame]:
-        """A written-out message."""
         return self._bench.encoder.frames(self._written[name])
 
     def expect(self, name: str, within_s: float) -> None:
-        """Require that the next message is the written-out one."""
+        """Require that the next message is exactly this one."""
         self._judge(name, self._written[name], self._bench.next_message(within_s))
 
     def expect_first_nak(self, within_s: float) -> None:
-        """Require the same of NAK 1. Whether a NAK comes, and with which number, is TX-01."""
+        """Require that the next message is exactly NAK 1; another or no NAK is TX-01's concern."""
         heard = self._bench.next_message(within_s)
         if (
             heard is None
@@ -263,7 +264,7 @@ class _WrittenMessages:
             self._judge("nak", self._written["nak"], heard)
 
     def enter(self, update: list[RawFrame]) -> None:
-        """From the application to the request transfer that this update command gets."""
+        """Reset the application and send this update command until request transfer."""
         bench, encoder, limit = self._bench, self._bench.encoder, self._bench.limit
         bench.forget()
         is_own = (encoder.reset_command, encoder.reset_data) != (RESET, RESET_TEXT)
@@ -275,7 +276,7 @@ class _WrittenMessages:
         ):  # one without feedback: RS-01
             self._judge("feedback", self._written["feedback"], heard)
             heard = bench.next_message(limit("first_version_s"))
-        # The text in it is the product's own.
+        # The version text is the product's own.
         text = heard.data[3:] if heard is not None else b""
         version = build(encoder.to_tool, REPORT, BOOT_VERSION, encoder.boot_name.encode() + text)
         self._judge("boot version", version, heard)
@@ -283,7 +284,7 @@ class _WrittenMessages:
             sent = bench.send(update)
             for _ in range(UPDATES_MAX):
                 heard = bench.next_message(limit("erase_s"))
-                # Boot versions sent before it was heard do not count (R2).
+                # Boot versions sent before the update command was received do not count (R2).
                 is_version = heard is not None and heard.kind is MessageKind.BOOT_VERSION
                 if heard is None or not is_version or heard.at > sent.left_at + UPDATE_SPACING_S:
                     break
@@ -303,14 +304,14 @@ class _WrittenMessages:
 
 
 def _probe_without_headers(bench: Bench) -> Probe:
-    """A probe whose data has no bytes that one flipped bit turns into a header."""
+    """Create a probe whose data cannot turn into a header by one bit flip."""
     return Probe(
         bench, bytes(bench.random.choice(_NO_HEADER_BYTES) for _ in range(_NO_HEADER_SIZE))
     )
 
 
 def _flipping(first_bit: int, pattern: int) -> Callable[[bytes], bytes]:
-    """Flips the bits of `pattern` from `first_bit` of a message on."""
+    """Return a function that flips the bits of `pattern`, starting at `first_bit` of a message."""
 
     def flip(raw: bytes) -> bytes:
         flipped = int.from_bytes(raw, "little") ^ pattern << first_bit
@@ -320,7 +321,7 @@ def _flipping(first_bit: int, pattern: int) -> Callable[[bytes], bytes]:
 
 
 def _burst(bench: Bench) -> Damage:
-    """A burst of 2 to 8 bits, its first and last one flipped, where the rest stays a packet."""
+    """A random burst of 2 to 8 bits whose ends are flipped, inside the packet's data."""
     length = bench.random.randint(2, _BURST_BITS)
     pattern = 1 | 1 << length - 1 | bench.random.getrandbits(length)
     last = 8 * _PACKET_LIKE_BYTES.stop - length
@@ -329,11 +330,11 @@ def _burst(bench: Bench) -> Damage:
 
 
 def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
-    """Changes that give a correct message another, wrong CRC."""
+    """Yield changes that replace the correct CRC of a message by a wrong one."""
     encoder = bench.encoder
 
     def by(between: bytes) -> Callable[[bytes], bytes]:
-        """The CRC with these bytes in place of the id."""
+        """Compute the CRC with `between` in place of the id."""
 
         def seal(raw: bytes) -> bytes:
             value = crc(raw[:2] + between + raw[2:-5])
@@ -353,7 +354,7 @@ def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
 
 
 def _with_crc(field: bytes) -> Callable[[bytes], bytes]:
-    """The message with this CRC."""
+    """Return a function that replaces the CRC of a message."""
     return lambda raw: raw[:-5] + field + raw[-1:]
 
 
@@ -363,12 +364,12 @@ def _with_crc(field: bytes) -> Callable[[bytes], bytes]:
 def _check_none_accepted(
     bench: Bench, probe: Probe, damages: Sequence[Damage], *, framed: bool
 ) -> None:
-    """Send the next packet damaged in these ways. The first one that is acknowledged ends the case,
-    since the device then has stored other data than the following checks assume.
+    """Send the next packet with each kind of damage. The first one that is acknowledged ends the
+    case, since the device then holds other data than the following checks assume.
 
-    With `framed` each damaged packet ends with its last frame, so that the next one need not wait
-    for the inter-frame timeout. Where the profile leaves open whether it is answered (tx_01), the
-    answer to the first one tells what to wait for.
+    With `framed` every damaged packet ends with its last frame, so the next one need not wait for
+    the inter-frame timeout. Where the profile leaves the answer open (tx_01), the answer to the
+    first packet decides what to wait for.
     """
     choice = bench.choice("tx_01")
     answers = choice in ("nak_expected", "nak_received")
@@ -393,13 +394,13 @@ def _check_none_accepted(
         else:
             heard = bench.collect(probe.settle_s())
         first, last = batch[0][0], batch[-1][0]
-        told = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
-        _require_none_accepted(bench, f"a packet with {told}", heard)
+        names = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
+        _require_none_accepted(bench, f"a packet with {names}", heard)
     _require_none_accepted(bench, "the last ones", bench.collect(probe.settle_s()))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
 
 
 def _require_none_accepted(bench: Bench, what: str, heard: Sequence[Received]) -> None:
-    """NAK or silence; which of them, with which number, is TX-01."""
+    """Require NAK or silence; TX-01 checks which, and with which number."""
     if any(one.kind is not MessageKind.NAK for one in heard):
         bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003

@@ -1,4 +1,4 @@
-"""EN: the end of a transfer, and the application that is started."""
+"""EN: end of transfer, and the start of the new application."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from flasher.conformance.wire import (
 )
 
 _RESET_PERIOD_S: Final = 0.2
-"""A tool repeats a command at this interval (4.3)."""
+"""Interval at which a tool repeats a command (4.3)."""
 _WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
-"""Bytes of an end of transfer in place of 04."""
+"""Values to send in place of 04."""
 _NO_APPLICATION_S: Final = 1.0
-"""How long an application that must not run is asked."""
+"""How long to query an application that must not run."""
 _UPGRADE_KINDS: Final = (
     MessageKind.REQUEST,
     MessageKind.ACK,
@@ -30,7 +30,7 @@ _UPGRADE_KINDS: Final = (
     MessageKind.COMPLETE,
     MessageKind.FEEDBACK,
 )
-"""What an end of transfer can be answered by; an application that starts may report besides."""
+"""Possible answers to end of transfer; a starting application may send other reports."""
 
 
 @case(
@@ -38,7 +38,7 @@ _UPGRADE_KINDS: Final = (
     "end of transfer",
     clause="Welling 5.1, figure 2 (end); Welling 5.2, table 9 (C502); R19",
     stimulus="all packets, then end of transfer; a restart afterwards",
-    expectation="complete within the limit, then the new application, at once or through the "
+    expectation="complete within the limit, then the new application, directly or through the "
     "bootloader (en_03), and again after the restart",
     requires={DESTRUCTIVE},
     choices=("en_03",),
@@ -46,7 +46,9 @@ _UPGRADE_KINDS: Final = (
 def end(bench: Bench) -> None:
     image = bench.subject.second_image or bench.good_image
     if image is bench.good_image:
-        bench.unsupported("another image than the one before", "the bench has no second good image")
+        bench.unsupported(
+            "an image other than the current one", "the bench has no second good image"
+        )
     bench.start_transfer(len(image))
     bench.packets(image)
     bench.end_transfer()
@@ -69,7 +71,7 @@ def end(bench: Bench) -> None:
     clause="Welling 5.1, figure 2 (end); Welling 5.2, table 8 (A401); R6",
     stimulus="end of transfer to the announcing bootloader, before packet 1, after it and before "
     "the last one; with another byte than 04; end of transfer again after complete",
-    expectation="NAK, and the transfer goes on or can be begun anew; the second one is answered as "
+    expectation="NAK; the transfer continues or can be restarted; the second end is answered as "
     "the profile says (en_02)",
     requires={DESTRUCTIVE},
     choices=("en_02", "rs_03"),
@@ -87,7 +89,7 @@ def end_early_and_twice(bench: Bench) -> None:
             bench.packets(image, done + 1, stored)
             done = stored
             bench.send(bench.encoder.end())
-            # A NAK of any number (R6), and nothing else.
+            # A NAK of any number (R6) and no other message.
             bench.expect(MessageKind.NAK, within_s=bench.limit("complete_s"))
             bench.expect_silence(bench.limit("ack_s"), ignoring=(MessageKind.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
@@ -122,7 +124,7 @@ def end_early_and_twice(bench: Bench) -> None:
 def _restart_transfer(
     bench: Bench, image: bytes, stored: int, heard: Received | None = None
 ) -> None:
-    """Send the packets up to that one in a new transfer; `heard` was the last message."""
+    """Send packets 1 to `stored` in a new transfer; `heard` is the last message received."""
     bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
     found = heard if heard is not None and heard.kind is MessageKind.BOOT_VERSION else None
@@ -134,11 +136,11 @@ def _restart_transfer(
 
 
 def _check_second_end(bench: Bench, first_answer: MessageKind) -> None:
-    """End of transfer once more, right after its answer."""
+    """Send end of transfer again, immediately after its answer, and check the second answer."""
     bench.send(bench.encoder.end())
     heard = bench.collect(bench.limit("ack_s"))
     answers = [one for one in heard if one.kind in _UPGRADE_KINDS]
-    # An application that runs already may confirm what it does not know (R17).
+    # A running application may send general feedback to an unknown message (R17).
     silence: list[list[MessageKind]] = [[], [MessageKind.FEEDBACK]]
     allowed = {
         "same_answer": [[first_answer]],
@@ -160,7 +162,7 @@ def _check_second_end(bench: Bench, first_answer: MessageKind) -> None:
     choices=("en_02", "en_04", "rs_03"),
 )
 def wrong_checksum(bench: Bench) -> None:
-    # Its code is that of the good image: a device that starts it all the same comes to no harm.
+    # The code is that of the good image, so a device that starts it anyway is not harmed.
     image = bench.good_image[:-1] + bytes((bench.good_image[-1] ^ 0xFF,))
     bench.start_transfer(len(image))
     bench.packets(image)
@@ -185,9 +187,9 @@ def wrong_checksum(bench: Bench) -> None:
     "EN-07",
     "upgrades in a row",
     clause="Welling 5.1, figure 2 (end)",
-    stimulus="three upgrades, each one begun as soon as the one before is complete, to a smaller "
+    stimulus="three upgrades, each started as soon as the previous one is complete, to a smaller "
     "image and back",
-    expectation="each one right: nothing of the image before is left in it",
+    expectation="each image is correct: no bytes of the previous image are left",
     requires={DESTRUCTIVE},
 )
 def in_a_row(bench: Bench) -> None:
@@ -200,8 +202,8 @@ def in_a_row(bench: Bench) -> None:
     for turn, image in enumerate(images, 1):
         with bench.step(f"upgrade {turn}, {len(image)} bytes"):
             if turn > 1:
-                # It may just be starting its application and receive nothing: the reset is
-                # repeated until something is received (4.3).
+                # A device that is starting its application receives nothing: repeat the reset until
+                # it answers (4.3).
                 within_s = bench.limit("start_s") + bench.limit("first_version_s")
                 deadline, heard = bench.now + within_s, None
                 while heard is None and bench.now < deadline:

@@ -35,9 +35,9 @@ from flasher.conformance.wire import (
 _HEADER: Final = b"\x55\xaa"
 _RANDOM_SPLITS: Final = 7
 _JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa" * 8 + b"\x16" * 3)
-"""None of them holds a header, nor the beginning of one at its end."""
+"""Contain no header, and do not end with the first byte of one."""
 _LONG_JUNK_BYTES: Final = 300
-"""More than the longest message."""
+"""Longer than the longest message."""
 JUNK_IN_FRAME: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
 _CRCS: Final = tuple(
     map(
@@ -52,9 +52,9 @@ _FREE_BYTES: Final = 8
 _WRONG_TAILS: Final = (0x00, 0x0F, 0xF1, 0x55, 0xFF)
 PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
 _UNKNOWN: Final = 0x77FD
-"""A command that nobody has, with as many bytes as a message can hold."""
+"""Unused command with the largest possible data."""
 _LONG_UNKNOWN: Final = (0x77F5, 0x77F7, _UNKNOWN)
-"""Messages of these have 254 bytes, 256, and as many as can be."""
+"""Unused commands whose messages have 254 bytes, 256 bytes and the maximum."""
 _UNKNOWN_COMMANDS: Final = (0x0000, 0x0100, 0x7704, 0xA202, 0xC601, 0xFF10, _UNKNOWN)
 _PACKET: Final = PACKET.to_bytes(2, "big")
 _END: Final = END.to_bytes(2, "big") + END_MARK
@@ -77,8 +77,9 @@ _WRONG_LENGTHS: Final[tuple[tuple[str, int, Callable[[bytes], bytes]], ...]] = (
         lambda data: _UNKNOWN.to_bytes(2, "big") + data.ljust(253),
     ),
 )
-"""Messages whose length is wrong and whose CRC is right: name, length, and what follows it, made of
-the data of the next packet."""
+"""Messages with a wrong length and a correct CRC: name, length byte, and a function that makes the
+rest from the data of the next packet.
+"""
 _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
 
 
@@ -86,8 +87,8 @@ _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
     "FR-01",
     "splits of a message",
     clause="Welling 2.2.3, table 3; robustness, not in the document",
-    stimulus="update command and packets in CAN frames of 1 to 8 bytes, all alike or by chance",
-    expectation="decoded alike, or rejected (fr_01); packets in frames of 8 bytes are accepted",
+    stimulus="update command and packets in CAN frames of 1 to 8 bytes, equal or random",
+    expectation="decoded normally or rejected (fr_01); packets in frames of 8 bytes are accepted",
     requires={DESTRUCTIVE},
     choices=("fr_01", "up_04_burst"),
 )
@@ -100,7 +101,7 @@ def splits(bench: Bench) -> None:
     with bench.step("packet in frames of 8 bytes"):
         probe.offer(probe.frames(), ACCEPTED)
     for turn in range(_RANDOM_SPLITS):
-        with bench.step(f"packet split by chance, {turn + 1}"):
+        with bench.step(f"packet split randomly, {turn + 1}"):
             probe.offer(bench.encoder.frames_by_chance(probe.raw(), bench.random), choice)
     probe.check_stored()
 
@@ -119,7 +120,7 @@ def junk(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
     long_junk = bytes(bench.random.choice(b"\x00\x11\x16\xaa\xf0") for _ in range(_LONG_JUNK_BYTES))
-    # Where junk may hide a message, the beginning of a header at its end may do so, too.
+    # If junk can hide a message, junk that ends with half a header can hide it too.
     after_half = ACCEPTED if in_frame == ACCEPTED else EITHER
     for own in (*_JUNK_FRAMES, b"\x12\x34\x55", long_junk):
         with bench.step(f"{len(own)} bytes before it, the last one {own[-1]:02X}"):
@@ -135,7 +136,7 @@ def junk(bench: Bench) -> None:
     clause="Welling 2.2.1, table 1",
     stimulus="packets full of 55 AA and F0, at frame boundaries too; whole messages inside data; "
     "packets whose CRC reads as tail or header, or is 00000000 or FFFFFFFF; packets of FF or 00",
-    expectation="no false start or end: each one acknowledged once, and stored as it is",
+    expectation="no false start or end: each one is acknowledged once and stored unchanged",
     requires={DESTRUCTIVE},
 )
 def header_in_data(bench: Bench) -> None:
@@ -157,8 +158,8 @@ def header_in_data(bench: Bench) -> None:
     "FR-04",
     "wrong tail",
     clause="Welling 2.2.1 (1); robustness, not in the document",
-    stimulus="packets with another last byte than F0; a packet behind a wrong tail, in its frame",
-    expectation="discarded, the next message is taken; the one in the same frame: fr_04",
+    stimulus="packets that do not end with F0; a packet after a wrong tail, in the same frame",
+    expectation="discarded; the next message is accepted; the one in the same frame: fr_04",
     requires={DESTRUCTIVE},
     choices=("fr_04",),
 )
@@ -178,7 +179,7 @@ def wrong_tail(bench: Bench) -> None:
     clause="Welling 2.2.1 (3); R12",
     stimulus="messages that end before their length is used up, then a packet: after the "
     "inter-frame timeout, and at once",
-    expectation="a packet is taken after the timeout; at once it may be taken or lost",
+    expectation="a packet is accepted after the timeout; at once it may be accepted or lost",
     requires={DESTRUCTIVE},
 )
 def too_short(bench: Bench) -> None:
@@ -190,8 +191,8 @@ def too_short(bench: Bench) -> None:
     query = build(encoder.to_device, READ, QUERY_VERSION)
     broken_off = {
         "length 255, two bytes follow": b"\x55\xaa\x16\xff\x77\xfd\x01\x02",
-        **{f"packet cut off behind frame {end}": packet[: 8 * end] for end in (1, 9, 17)},
-        "update command cut off behind frame 1": joined(encoder.update(PACKET_BYTES))[:8],
+        **{f"packet cut off after frame {end}": packet[: 8 * end] for end in (1, 9, 17)},
+        "update command cut off after frame 1": joined(encoder.update(PACKET_BYTES))[:8],
         "length greater by one": _HEADER + bytes((READ, 3, QUERY_VERSION >> 8, 1)) + query[-5:],
     }
     for name, raw in broken_off.items():
@@ -203,16 +204,18 @@ def too_short(bench: Bench) -> None:
             frames = bench.encoder.frames(raw) + probe.frames()
             if probe.offer(frames, EITHER):
                 at_once.append(name)
-    bench.info(f"the packet that followed at once was taken after: {', '.join(at_once) or 'none'}")
+    bench.info(
+        f"the immediately following packet was accepted after: {', '.join(at_once) or 'none'}"
+    )
 
 
 @case(
     "FR-06",
-    "lengths that cannot be",
+    "impossible lengths",
     clause="Welling 2.2.1 (3); Welling 2.2.1 (4, 5)",
     stimulus="length 0 and 1; length other than the command's second byte + 2, of update command "
     "too; 255 with an unknown command; all with the right CRC",
-    expectation="discarded, no overflow: the next packet is taken, nothing else is stored",
+    expectation="discarded without overflow: the next packet is accepted, nothing else is stored",
     requires={DESTRUCTIVE},
 )
 def wrong_length(bench: Bench) -> None:
@@ -243,7 +246,7 @@ def padded(bench: Bench) -> None:
     choice, probe = _expected_acceptance(bench, "fr_07"), Probe(bench, bench.filler(1))
     for index, filler in enumerate(PADDINGS):
         with bench.step(f"update command padded with {filler:02X}"):
-            # In the midst of a transfer where the device starts over, which takes no pause (UP-08).
+            # Within a transfer where the device starts over, which allows no pause (UP-08).
             if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
             update = bench.encoder.update(len(probe.image))
@@ -283,7 +286,7 @@ def back_to_back(bench: Bench) -> None:
         probe.enter(query + bench.encoder.update(len(probe.image)), ACCEPTED)
     for count in (1, 2, 3):
         with bench.step(f"{count} times a query, then a packet"):
-            # Whether a bootloader answers a query is CO-04.
+            # CO-04 checks whether a bootloader answers a query.
             frames = count * query + probe.frames()
             probe.offer(frames, ACCEPTED, ignoring=(MessageKind.FEEDBACK, MessageKind.OTHER))
     with bench.step("the last packet again, then the next one"):
@@ -302,7 +305,7 @@ def back_to_back(bench: Bench) -> None:
     clause="Welling 2.1; Welling 2.2.3, table 3",
     stimulus="frames of 0 bytes, remote, extended and error frames, and frames of the ids that "
     "differ in one bit, between the frames of a packet",
-    expectation="never taken for payload: the packet is acknowledged",
+    expectation="never treated as payload: the packet is acknowledged",
     requires={DESTRUCTIVE},
 )
 def no_payload(bench: Bench) -> None:
@@ -336,10 +339,10 @@ def no_payload(bench: Bench) -> None:
     "FR-10",
     "unknown mode, unknown command",
     clause="Welling 2.2.1 (2); R15; robustness, not in the document",
-    stimulus="packets and update commands with modes that nobody has; commands that nobody has, "
+    stimulus="packets and update commands with unused modes; unused commands, "
     "with a whole packet in their data too",
-    expectation="not acted on: NAK, silence or general feedback (fr_10); update command and "
-    "packets are taken as before",
+    expectation="ignored: NAK, silence or general feedback (fr_10); update command and "
+    "packets are accepted afterwards",
     requires={DESTRUCTIVE},
     choices=("fr_10",),
 )
@@ -367,13 +370,13 @@ def unknown(bench: Bench) -> None:
 
 
 def _expected_acceptance(bench: Bench, key: str) -> str:
-    """Whether the message that a choice of the profile is about has to be accepted."""
+    """Translate a choice of the profile into ACCEPTED, REJECTED or EITHER."""
     taken, not_taken = choice_words(key)
     return {taken: ACCEPTED, not_taken: REJECTED}.get(bench.choice(key), EITHER)
 
 
 def _offer_forms(bench: Bench, probe: Probe, key: str) -> None:
-    """The next packets, in the forms that this key decides about."""
+    """Offer the next packets in each form that this profile key decides about."""
     for form in forms(bench.encoder)[key]:
         with bench.step(form.step):
             frames = bench.encoder.frames(form.before + probe.raw(), form.frame_bytes)
@@ -381,7 +384,7 @@ def _offer_forms(bench: Bench, probe: Probe, key: str) -> None:
 
 
 def _write_of(bench: Bench, command: int) -> list[RawFrame]:
-    """A write of that command; its data are zeros, as many as the command says."""
+    """A write of this command with zeros as data."""
     return bench.encoder.message(WRITE, command, bytes(command & 0xFF))
 
 
@@ -389,8 +392,8 @@ def _write_of(bench: Bench, command: int) -> list[RawFrame]:
 
 
 class PacketForm(NamedTuple):
-    """A form of an intact packet: `step` names it in a case, `asked` in a profile of `init`; the
-    bytes `before` it stand in its first frame.
+    """A form of an intact packet: `step` names it in a case, `asked` in a profile written by
+    `init`; the bytes `before` precede it in its first frame.
     """
 
     step: str
@@ -400,19 +403,19 @@ class PacketForm(NamedTuple):
 
 
 def forms(encoder: Encoder) -> dict[str, list[PacketForm]]:
-    """Forms of a packet by the key of the profile that decides about them: its first word is for a
-    packet that is taken, the second one for the other. Cases, `init` and walks send all of them.
+    """Packet forms by the profile key that decides about them; the key's first word means accepted,
+    its second word not. Cases, `init` and walks send all of them.
     """
     splits = {size: f"packet in frames of {size} bytes" for size in range(1, FRAME_BYTES)}
     junk = {f"{own.hex(' ').upper()} in its first frame": own for own in JUNK_IN_FRAME}
     query = joined(encoder.query_version())[:-1]
     return {
         "fr_01": [PacketForm(step, f"a {step}", frame_bytes=size) for size, step in splits.items()],
-        "fr_02": [PacketForm(step, f"a packet behind {step}", own) for step, own in junk.items()],
+        "fr_02": [PacketForm(step, f"a packet after {step}", own) for step, own in junk.items()],
         "fr_04": [
             PacketForm(
                 f"query that ends with {tail:02X}, packet in the same frame",
-                f"a packet behind a tail {tail:02X} in its first frame",
+                f"a packet after a tail {tail:02X} in its first frame",
                 query + bytes((tail,)),
             )
             for tail in (0x00, 0x55)
@@ -421,12 +424,12 @@ def forms(encoder: Encoder) -> dict[str, list[PacketForm]]:
 
 
 def _payloads_like_messages(bench: Bench) -> Iterator[tuple[str, bytes]]:
-    """Data that looks like the beginning or the end of messages, whatever the frame boundaries."""
+    """Yield data that resembles the start or end of a message, on and across frame boundaries."""
     encoder, to_device = bench.encoder, bench.encoder.to_device
-    yield "55 AA all over", _HEADER * (PACKET_BYTES // 2)
-    yield "55 AA all over, odd", (b"\x00" + _HEADER * PACKET_BYTES)[:PACKET_BYTES]
+    yield "55 AA throughout", _HEADER * (PACKET_BYTES // 2)
+    yield "55 AA throughout, odd offset", (b"\x00" + _HEADER * PACKET_BYTES)[:PACKET_BYTES]
     for byte in (b"\xf0", b"\xff", b"\x00"):
-        yield f"{byte.hex().upper()} all over", byte * PACKET_BYTES
+        yield f"{byte.hex().upper()} throughout", byte * PACKET_BYTES
     yield "F0, then 55 AA", b"\xf0\x55\xaa\xf0" * (PACKET_BYTES // 4)
     whole = {
         "end of transfer": joined(encoder.end()),
@@ -435,7 +438,7 @@ def _payloads_like_messages(bench: Bench) -> Iterator[tuple[str, bytes]]:
         "head of a packet": build(to_device, WRITE, PACKET, bytes(5 + PACKET_BYTES))[:16],
         "head of the longest message": b"\x55\xaa\x16\xff\x77\xfd",
     }
-    # Data begins at byte 11 of a packet: the sixth byte of it is the first one of a frame.
+    # Data starts at byte 11 of a packet, so its sixth byte is the first of a frame.
     for name, raw in whole.items():
         for offset in (5, 3):
             where = "at a frame's start" if offset == 5 else "across frames"
@@ -444,8 +447,8 @@ def _payloads_like_messages(bench: Bench) -> Iterator[tuple[str, bytes]]:
 
 
 def _data_for_crc(bench: Bench, number: int, total: int, wanted: bytes) -> bytes:
-    """The data of a packet with that CRC. A CRC is linear: what each bit of the last bytes changes
-    in it tells which of them have to be turned.
+    """Find packet data with this CRC. A CRC is linear: compute the change that each of the last
+    bits causes, then solve for the bits to flip.
     """
     body = bytes((WRITE, 2 + (PACKET & 0xFF))) + _PACKET + struct.pack("<BHH", START, number, total)
     start = bench.random.randbytes(PACKET_BYTES - _FREE_BYTES)
@@ -456,7 +459,7 @@ def _data_for_crc(bench: Bench, number: int, total: int, wanted: bytes) -> bytes
 
     plain = crc_of(0)
     basis: dict[int, tuple[int, int]] = {}
-    """By its highest bit: a change of the CRC, and the bits that make it."""
+    """Highest bit to a change of the CRC and the data bits that cause it."""
     for bit in range(8 * _FREE_BYTES):
         change, bits = _reduce(crc_of(1 << bit) ^ plain, 1 << bit, basis)
         if change:
@@ -467,7 +470,7 @@ def _data_for_crc(bench: Bench, number: int, total: int, wanted: bytes) -> bytes
 
 
 def _reduce(change: int, bits: int, basis: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
-    """A change of the CRC without what others make, and the bits that make the rest of it."""
+    """Eliminate from `change` what the basis can cause; return the rest and the bits used."""
     for top in sorted(basis, reverse=True):
         if change.bit_length() == top:
             change, bits = change ^ basis[top][0], bits ^ basis[top][1]

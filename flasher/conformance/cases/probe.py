@@ -1,5 +1,5 @@
-"""A transfer that is never ended, for the cases about framing, checksum and gaps. Whether its next
-packet is acknowledged shows how the device took the bytes before it.
+"""Transfers that are never ended, for cases about framing, checksum and gaps. Whether the next
+packet is acknowledged shows how the device handled the preceding bytes.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ ACCEPTED: Final = "accepted"
 REJECTED: Final = "rejected"
 EITHER: Final = "either"
 _PACKETS: Final = 48
-"""More than any case here needs; a device that takes smaller images begins again."""
+"""More than any case needs; with smaller images the probe starts a new transfer."""
 _REST: Final = bytes(5)
 _QUIET_S: Final = 0.05
-"""Behind an ACK, for what else is said to the same bytes (R10)."""
+"""Time after an ACK during which further answers to the same bytes may arrive (R10)."""
 
 
 def complies(wanted: str, taken: bool) -> bool:  # noqa: FBT001
-    """True when a message that was taken, or not, complies with one of the three words above."""
+    """True when the outcome `taken` matches ACCEPTED, REJECTED or EITHER."""
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
 
 class PacketTransfer:
-    """A transfer of `image` that goes on packet by packet; so many of them are `stored`."""
+    """A transfer of `image`, packet by packet; `stored` counts the packets acknowledged so far."""
 
     def __init__(self, bench: Bench, image: bytes) -> None:
         self.bench = bench
@@ -44,19 +44,18 @@ class PacketTransfer:
 
     @property
     def number(self) -> int:
-        """Of the packet that is next."""
+        """Number of the next packet."""
         return self.stored + 1
 
     def packet(self, number: int) -> list[RawFrame]:
-        """A packet of the image."""
         return self.bench.encoder.packet_of(self.image, number)
 
     def frames(self) -> list[RawFrame]:
-        """The next packet as it should be."""
+        """Frames of the next packet, unchanged."""
         return self.packet(self.number)
 
     def raw(self) -> bytes:
-        """The next packet, header to tail."""
+        """The next packet as bytes, header to tail."""
         return joined(self.frames())
 
     def settle_s(self) -> float:
@@ -70,13 +69,13 @@ class PacketTransfer:
     def answers(
         self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
     ) -> list[Received]:
-        """Send frames that hold the next packet, `gap_s` behind each of the first `gaps` of them
-        (None: between all); the messages up to its ACK, and shortly after it.
+        """Send frames that contain the next packet, with `gap_s` after each of the first `gaps`
+        frames (None: all). Returns the messages up to its ACK and shortly after.
         """
         bench = self.bench
         bench.forget()
         bench.send(frames, gap_s=gap_s, gaps=gaps)
-        # Long enough, too, that nothing of it is left when the next packet comes.
+        # Long enough that no partial message is left when the next packet arrives.
         deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
         heard: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
@@ -87,28 +86,28 @@ class PacketTransfer:
 
 
 class Probe(PacketTransfer):
-    """A transfer (of some packets of chance by default) for stimuli that are judged.
+    """A transfer of random packets (by default) that judges stimuli.
 
-    With "accepted" the stimulus has to be acknowledged as the next packet. With "rejected" it must
-    not be, and NAK or silence are both right: which of them, with which number, is TX-01. With
-    "either" both will do. In every case the next packet as it should be has to be taken then.
+    With ACCEPTED the stimulus has to be acknowledged as the next packet. With REJECTED it must not
+    be; NAK and silence are both correct (TX-01 checks which). EITHER allows both. In every case the
+    unchanged packet has to be acknowledged afterwards.
     """
 
     def __init__(self, bench: Bench, image: bytes | None = None) -> None:
         largest = bench.number("largest_image_bytes")
         wanted = bench.filler(_PACKETS) if image is None else image
-        # Some bytes more, as a whole number of packets is a matter of its own (UP-01).
+        # Not a whole number of packets; UP-01 covers that.
         super().__init__(bench, (wanted + _REST)[:largest])
         self._taken_at = bench.now
 
     def begin(self) -> None:
-        """From the running application to request transfer."""
+        """Reset the running application and get request transfer."""
         self.bench.start_transfer(len(self.image))
         self._taken_at = self.bench.now
 
     def enter(self, frames: Sequence[RawFrame], wanted: str, *, reset: bool = True) -> None:
-        """Send what holds the update command to the announcing bootloader, judge whether it is
-        taken as `wanted`, and get request transfer in any case.
+        """Send frames that contain the update command to the announcing bootloader, check whether
+        it is accepted as `wanted`, and get request transfer in any case.
         """
         bench = self.bench
         if reset:
@@ -125,8 +124,8 @@ class Probe(PacketTransfer):
         self.stored, self._taken_at = 0, bench.now
 
     def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:
-        """At the first boot version, send what has to be rejected: it announces itself on, with NAK
-        at the most in between, and takes the update command then.
+        """At the first boot version, send stimuli that have to be rejected: the device may answer
+        NAK, continues to announce itself, and then accepts the update command.
         """
         bench = self.bench
         bench.reset_to_bootloader()
@@ -142,12 +141,12 @@ class Probe(PacketTransfer):
                 break
         ok = all(one.kind in (MessageKind.NAK, MessageKind.BOOT_VERSION) for one in heard)
         goes_on = not is_burst or (bool(heard) and heard[-1].kind is MessageKind.BOOT_VERSION)
-        bench.require(ok and goes_on, "boot version, NAK at the most before it", describe(heard))
+        bench.require(ok and goes_on, "boot version, at most NAK before it", describe(heard))
         bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
 
     def frames(self) -> list[RawFrame]:
-        """The next packet as it should be; begins a new transfer when all were sent."""
+        """Frames of the next packet; starts a new transfer when all packets were sent."""
         if self.stored == self.total:
             self.bench.restart_transfer(len(self.image))
             self.stored = 0
@@ -156,16 +155,14 @@ class Probe(PacketTransfer):
     # -- stimuli ----------------------------------------------------------------------------------
 
     def send_next(self) -> None:
-        """The next packet as it should be; its ACK has to come, else the case ends."""
+        """Send the next packet unchanged; without its ACK the case ends."""
         self.frames()
         self.bench.forget()
         self.bench.packet(self.image, self.number)
         self._note_stored()
 
     def keep_alive(self) -> None:
-        """Send the next packet when none was taken for so long that the device may soon give the
-        transfer up (TX-12).
-        """
+        """Send the next packet if the device may soon take the silence for a pause (TX-12)."""
         if self.bench.now - self._taken_at > self.bench.limit("pause_s") / 2:
             self.bench.wait(self.settle_s())
             self.send_next()
@@ -179,9 +176,9 @@ class Probe(PacketTransfer):
         gaps: int | None = None,
         ignoring: Sequence[MessageKind] = (),
     ) -> bool:
-        """Send `frames`, as `answers` does, and judge whether the next packet is taken as `wanted`;
-        sends it as it should be when it was not. Messages of the kinds `ignoring` do not count.
-        Returns whether it was taken.
+        """Send `frames` like `answers` and check whether the next packet is accepted as `wanted`;
+        if it is not, send it unchanged. Ignores messages of the kinds `ignoring`. Returns whether
+        the packet was accepted.
         """
         heard = self.answers(frames, gap_s=gap_s, gaps=gaps)
         taken = any(map(self.is_accepted, heard))
@@ -201,8 +198,8 @@ class Probe(PacketTransfer):
         return taken
 
     def check_discarded(self, frames: Sequence[RawFrame]) -> None:
-        """Send what has to be discarded: NAK or no answer, and after a pause the next packet is
-        taken. A device that takes it ends the case, as it may have stored anything.
+        """Send frames that have to be discarded: NAK or no answer, then the next packet is
+        accepted. Anything else ends the case, as the device may have stored other data.
         """
         bench = self.bench
         bench.forget()
@@ -213,15 +210,15 @@ class Probe(PacketTransfer):
         self.send_next()
 
     def check_stored(self) -> None:
-        """What was acknowledged is in the flash, and is right; the last packet of it may be on its
-        way (PW-01), and what the profile lets the device keep in memory.
+        """Check that acknowledged packets are in the flash, except the last one, which may still be
+        being written (PW-01), and what the profile allows the device to buffer.
         """
         bench = self.bench
         written = (self.number - 2) * PACKET_BYTES - bench.number("buffer_bytes")
         if written > 0:
             bench.check_stored(self.image[:written])
         else:
-            bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
+            bench.unsupported("the flash holds the image", "all of it may still be buffered")
 
     def _note_stored(self) -> None:
         self.stored += 1

@@ -1,5 +1,5 @@
-"""PW: power cuts. At whatever moment the power is cut, the device is reachable afterwards and never
-starts a mixture of two images.
+"""PW: power cuts. Whenever the power is cut, the device stays reachable and never starts a mixture
+of two images.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from flasher.conformance.wire import (
 )
 
 _ALL_PACKETS: Final = 8
-"""Up to so many packets, an upgrade is cut at each of its frames."""
+"""An upgrade of up to this many packets is cut at each of its frames."""
 _BETWEEN_MAX: Final = 6
-"""Beyond, so many of those between the first and the last one are cut, at a frame by the seed."""
+"""Larger upgrades: packets between the first and last that are cut, each at a random frame."""
 _FAR_PACKET: Final = 64
-"""Beyond it a cut costs so much time on a real bus that only some are made."""
+"""Cuts beyond this packet take so long on a real bus that only some are made."""
 _FEW_FRAMES: Final = (1, 9, 17, 18)
 _OFF_S: Final = 0.3
 _ERASE_SHARES: Final = (0.1, 0.3, 0.5, 0.7, 0.9)
 _SHARES: Final = (0.0, 0.5, 1.0)
-"""Before a flash operation, in its middle, and when it is over."""
+"""Before, halfway through and after a flash operation."""
 _OPERATIONS_MAX: Final = 24
-"""Operations of one upgrade that are cut; a large image has more, which are alike."""
+"""Operations of one upgrade to cut; larger images only repeat similar ones."""
 
 
 class _Cut(NamedTuple):
-    """Power is cut after so many frames of a message: the `packet` of that number (from 1), or,
-    with packet 0, the update command; the number of packets plus one is the end.
+    """A power cut after `frames` frames of a message: packet number `packet`, the update command
+    (0), or end of transfer (number of packets + 1).
     """
 
     packet: int
@@ -45,18 +45,18 @@ class _Cut(NamedTuple):
 
 @dataclass
 class _InterruptedUpgrade:
-    """The images of a case, and how far the interrupted upgrade went."""
+    """The images of a case and the progress of the interrupted upgrade."""
 
     old: bytes
     new: bytes
     end_was_sent: bool = False
     was_requested: bool = False
-    """True when the last one came as far as request transfer: nothing is erased any more."""
+    """True when the last attempt reached request transfer, so that the application is erased."""
     runs: bool = True
-    """True while an application runs, so that the way into the bootloader is a reset."""
+    """True while an application runs, so that a reset enters the bootloader."""
 
     def swap(self) -> None:
-        """Swap the images: the new one runs, and the next upgrade is to the other one."""
+        """Swap the images after the new one was installed."""
         self.old, self.new = self.new, self.old
 
 
@@ -66,8 +66,8 @@ class _InterruptedUpgrade:
     clause="R14; R19",
     stimulus="power cut at the frames of reset, update command, packets and end of transfer; while "
     "it erases, just after complete; before, in and after every flash operation",
-    expectation="the device announces itself again, starts nothing but a whole image, and can be "
-    "upgraded; what was acknowledged is stored",
+    expectation="the device announces itself again, starts only complete images, and can be "
+    "upgraded; acknowledged packets are stored",
     requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
     limit_s=7200.0,
@@ -98,7 +98,7 @@ def cuts(bench: Bench) -> None:
     clause="R14; R19",
     stimulus="power cut in a transfer, and again: during the announcements, the erase, a packet, "
     "between two of them, before and at end of transfer",
-    expectation="the device announces itself again, starts nothing but a whole image, and can be "
+    expectation="the device announces itself again, starts only complete images, and can be "
     "upgraded",
     requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
@@ -131,8 +131,8 @@ def second_cut(bench: Bench) -> None:
 
 
 def _cuts_at_frames(bench: Bench, image: bytes) -> Iterator[_Cut]:
-    """Every frame of every message; of a large image's packets between the first and the last one
-    some, by chance.
+    """Yield a cut at every frame of every message; of a large image only at some packets between
+    the first and the last.
     """
     for frames in range(1, len(bench.encoder.update(len(image))) + 1):
         yield _Cut(0, frames)
@@ -153,7 +153,6 @@ def _cuts_at_frames(bench: Bench, image: bytes) -> Iterator[_Cut]:
 
 
 def _cut_text(cut: _Cut, total: int) -> str:
-    """The cut in words; `total` is the number of packets."""
     what = {0: "the update command", total + 1: "end of transfer"}
     return f"after frame {cut.frames} of {what.get(cut.packet, f'packet {cut.packet}')}"
 
@@ -162,15 +161,15 @@ def _cut_text(cut: _Cut, total: int) -> str:
 
 
 def _upgrade(bench: Bench) -> _InterruptedUpgrade:
-    """From the good image to another one where there is one, so that they can be told apart; it is
-    said where they cannot.
+    """Upgrade between the good image and a second one, so that the two can be told apart; recorded
+    as unsupported where they cannot.
     """
     upgrade = _InterruptedUpgrade(bench.good_image, bench.subject.second_image or bench.good_image)
     same = version_in(upgrade.old) == version_in(upgrade.new) or version_in(upgrade.old) is None
     if not bench.subject.has_readback and (same or not bench.encoder.has_version_query):
         bench.unsupported(
-            "what runs after a cut is a whole image",
-            "it takes readback, or a version query and two images of different versions",
+            "the image that runs after a cut is complete",
+            "needs readback, or a version query and two images of different versions",
         )
     return upgrade
 
@@ -179,7 +178,7 @@ def _upgrade(bench: Bench) -> _InterruptedUpgrade:
 
 
 def _enter(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """Request transfer, from the application or from a bootloader that waits for it."""
+    """Get request transfer, from the application or from a waiting bootloader."""
     upgrade.end_was_sent = False
     if upgrade.runs:
         bench.reset_to_bootloader()
@@ -188,7 +187,7 @@ def _enter(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 
 def _upgrade_up_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> None:
-    """Carry out the upgrade up to the cut."""
+    """Perform the upgrade up to the cut."""
     total, encoder = packet_count(len(upgrade.new)), bench.encoder
     if not cut.packet:
         if upgrade.runs:
@@ -205,8 +204,8 @@ def _upgrade_up_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> Non
 
 
 def _check_upgrade(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """From a power-up where no application runs, as a bootloader that only listens ignores the
-    reset of a host (rs_03).
+    """Without a running application start from a power-up, since a listening bootloader may ignore
+    the reset of a host (rs_03).
     """
     with bench.step("afterwards"):
         if not upgrade.runs:
@@ -217,36 +216,34 @@ def _check_upgrade(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 def _check_after_cut(
     bench: Bench, upgrade: _InterruptedUpgrade, first: Received | None = None
 ) -> None:
-    """The device announces itself (`first` was heard), or starts an application, but only a whole
-    one.
+    """Check that the device announces itself (`first` is its boot version) or starts an
+    application, and that only a complete image runs.
     """
     if first is None and bench.wait_for(MessageKind.BOOT_VERSION) is None:
-        # That it should have announced itself is another case (RS-05).
+        # RS-05 checks that it should have announced itself.
         upgrade.runs = _check_whole(bench, upgrade)
         bench.require(
-            upgrade.runs, MessageKind.BOOT_VERSION.value, "neither that nor an application"
+            upgrade.runs, MessageKind.BOOT_VERSION.value, "neither boot version nor application"
         )
         return
     spacing_s = bench.limit("version_spacing_s") + bench.limit("version_spacing_tolerance_s")
     heard = bench.collect(bench.host.burst_s + 2 * spacing_s)
     announced = 1 + sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
-    # More than a burst: it has nothing to start.
+    # More than a burst means that it has no application to start.
     upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
     if not upgrade.runs:
         bench.succeed("no application is started", "none")
 
 
 def _check_whole(bench: Bench, upgrade: _InterruptedUpgrade) -> bool:
-    """What runs is the old image, or the new one that was sent to its end; false when nothing
-    runs.
-    """
+    """Check that the old image runs, or the new one if its end was sent. False when none runs."""
     images = [upgrade.old, upgrade.new] if upgrade.end_was_sent else [upgrade.old]
     if bench.encoder.has_version_query:
         version = bench.application_version(bench.limit("start_s"))
         if version is None:
             return False
         known = [version_in(image) for image in images]
-        expected = f"a whole image runs, of version {' or '.join(map(str, known))}"
+        expected = f"a complete image runs, version {' or '.join(map(str, known))}"
         bench.require(None in known or version in known, expected, f"version {version!a}")
         images = [image for image in images if version_in(image) in (None, version)]
     elif not bench.application_runs():
@@ -254,16 +251,16 @@ def _check_whole(bench: Bench, upgrade: _InterruptedUpgrade) -> bool:
     if bench.subject.has_readback:
         stored = bench.subject.readback()
         images = [image for image in images if stored[: len(image)] == image]
-        got = "a whole one" if images else "a mixture"
-        bench.require(bool(images), "the flash holds a whole image", got)
+        got = "a complete one" if images else "a mixture"
+        bench.require(bool(images), "the flash holds a complete image", got)
     if images == [upgrade.new]:
         upgrade.swap()
     return True
 
 
 def _restore_old_image(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """Let the old image run, so that what is erased is an application. From a power-up, as a
-    bootloader that only listens ignores the reset of a host (rs_03).
+    """Install the old image so that there is an application to erase. Starts from a power-up, since
+    a listening bootloader may ignore the reset of a host (rs_03).
     """
     if upgrade.runs:
         return
@@ -277,7 +274,7 @@ def _restore_old_image(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 
 def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """A cut while the application is erased, at shares of the time that it took once."""
+    """Cut the power at several shares of the measured erase time."""
     _restore_old_image(bench, upgrade)
     upgrade.end_was_sent = upgrade.runs = False
     bench.reset_to_bootloader()
@@ -296,11 +293,11 @@ def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 
 def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """A cut before, in and after each operation, until an upgrade has no more of them."""
+    """Cut the power before, during and after each flash operation of an upgrade."""
     if not bench.subject.has_timed_cuts:
         bench.unsupported(
             "power cuts before, in and after every flash operation",
-            "nobody sees from outside when one is under way",
+            "the start of a flash operation is not visible from outside",
         )
         return
     for operation in range(_OPERATIONS_MAX):
@@ -314,7 +311,7 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
                 bench.subject.cut_in_operation(operation, share, _OFF_S)
                 version = _upgrade_until_cut(bench, upgrade)
                 if not bench.subject.take_cut():
-                    # Whole, and not cut: what it left is for EN-01 and EN-07 to judge.
+                    # The upgrade finished without a cut; EN-01 and EN-07 judge its result.
                     upgrade.runs = bench.application_runs()
                     upgrade.swap()
                     return
@@ -348,13 +345,13 @@ def _upgrade_until_cut(bench: Bench, upgrade: _InterruptedUpgrade) -> Received |
 
 
 def _cut_after_ack(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """Packets that the device acknowledged are still stored after a power cut (R10)."""
+    """Check that acknowledged packets are still stored after a power cut (R10)."""
     written = 2 * PACKET_BYTES
     last = packet_count(written + bench.number("buffer_bytes"))
     with bench.step(f"after ACK {last}"):
         if not bench.subject.has_readback or packet_count(len(upgrade.new)) <= last:
-            why = f"it takes readback and {last + 1} packets"
-            bench.unsupported("what was acknowledged is stored", why)
+            why = f"needs readback and {last + 1} packets"
+            bench.unsupported("acknowledged packets are stored", why)
             return
         _enter(bench, upgrade)
         bench.packets(upgrade.new, 1, last)
@@ -369,7 +366,7 @@ def _cut_after_ack(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
 
 
 def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
-    """What was said to be complete runs after a power cut."""
+    """Check that a completed image runs after a power cut."""
     _restore_old_image(bench, upgrade)
     with bench.step("just after complete"):
         _enter(bench, upgrade)

@@ -31,11 +31,11 @@ _IGNORED_RESETS: Final = (
     ("as a read", READ, RESET, RESET_TEXT),
     ("as a report", REPORT, RESET, RESET_TEXT),
 )
-"""Messages that are nearly a reset: step, mode, command, data."""
+"""Messages that resemble a reset: step, mode, command, data."""
 _OTHER_SENDERS: Final = (1, 2, 3, 4)
-"""Their digits in an id: motor controller, battery, on-board computer, display."""
+"""Sender digits in an id: motor controller, battery, on-board computer, display."""
 _LISTENS_S: Final = 16.0
-"""255 announcements 50 ms apart take less: a counter of a byte has run over by then."""
+"""Longer than 255 announcements 50 ms apart: a one-byte counter has overflowed by then."""
 
 
 @case(
@@ -71,23 +71,23 @@ def reset_again(bench: Bench) -> None:
         bench.send(bench.encoder.reset() + bench.encoder.reset())
         first = bench.wait_for(MessageKind.BOOT_VERSION)
         bench.require(first is not None, "boot version", first or "nothing")
-        # The second one may reach a bootloader that announces itself by then.
+        # The second reset may reach a bootloader that already announces itself.
         restarts = bench.choice("rs_02") != "ignored"
         again = (count,) if restarts else ()
-        _check_count(bench, count - 1, "one burst, of which the first was heard", *again)
+        _check_count(bench, count - 1, "one burst, its first boot version already received", *again)
         bench.check_application()
     with bench.step("reset after the second boot version"):
         bench.reset_to_bootloader()
         bench.next_version()
         bench.send(bench.encoder.reset())
         if bench.choice("rs_02") == "either":
-            # One may be on its way when the reset comes.
-            _check_count(bench, count - 2, "the burst goes on, or anew", count, count + 1)
+            # One boot version may be under way when the reset arrives.
+            _check_count(bench, count - 2, "the burst continues or restarts", count, count + 1)
         elif bench.choice("rs_02") == "ignored":
-            _check_count(bench, count - 2, "the burst goes on as if nothing had happened")
+            _check_count(bench, count - 2, "the burst continues")
         else:
             bench.expect(MessageKind.BOOT_VERSION)
-            _check_count(bench, count - 1, "a whole burst anew")
+            _check_count(bench, count - 1, "a new complete burst")
         bench.check_application()
 
 
@@ -114,11 +114,11 @@ def no_update(bench: Bench) -> None:
             bench.update(len(bench.good_image))
             bench.finish(bench.good_image)
         elif bench.choice("rs_03") == "announces":
-            # The document gives no period (R14); each one may take as long as the first one.
+            # The document gives no period (R14); each may take as long as the first one.
             more, wanted = 0, 2 * count + 1
             while more < wanted and bench.wait_for(MessageKind.BOOT_VERSION) is not None:
                 more += 1
-            expected = f"it announces on, {wanted} boot versions more"
+            expected = f"it continues to announce: {wanted} more boot versions"
             bench.check(more == wanted, expected, f"{more} boot versions")
             bench.collect(_LISTENS_S)
             bench.check_upgrade()
@@ -133,11 +133,11 @@ def no_update(bench: Bench) -> None:
 
 @case(
     "RS-04",
-    "what is no reset",
+    "messages that are not a reset",
     clause="Welling 3.4, table 7 (4205); Welling 2.2.1 (2); Welling 2.2.2, table 2",
     stimulus="reset with another text or length, as a read, as a report, to another target's id, "
     "from other nodes",
-    expectation="no restart; the application runs on",
+    expectation="no restart; the application keeps running",
 )
 def no_reset(bench: Bench) -> None:
     encoder = bench.encoder
@@ -170,7 +170,7 @@ def power_up(bench: Bench) -> None:
 
 
 def _check_burst(bench: Bench, first: Received) -> None:
-    """The rest of a burst after its first boot version, the spacing in it, and its end."""
+    """Check the rest of a burst after its first boot version: spacing, text and end."""
     limit, count = bench.limit, bench.number("versions")
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
     burst = [first]
@@ -190,8 +190,8 @@ def _check_burst(bench: Bench, first: Received) -> None:
 
 
 def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
-    """Exactly `count` boot versions, or one of `others`, and nothing else, come until burst and
-    window are over.
+    """Check that exactly `count` boot versions, or one of `others`, and no other messages arrive
+    until burst and window are over.
     """
     heard = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
     wanted = " or ".join(map(str, (count, *others)))
@@ -206,7 +206,7 @@ def _versions(heard: list[Received]) -> int:
 
 
 def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
-    """The device does not restart; it may answer (an application confirms every write)."""
+    """Check that the device does not restart; an application may confirm every write."""
     with bench.step(step):
         bench.send(frames)
         bench.expect_silence(

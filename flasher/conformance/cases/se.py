@@ -1,4 +1,4 @@
-"""SE: bad input."""
+"""SE: bad input. Floods, random noise, and writes outside the application area."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from flasher.conformance.wire import (
 )
 
 _FLOOD_FRAMES: Final = 600
-"""Frames in a row of one kind: 4.8 kB, more than a small device can keep."""
+"""Frames of one flood: 4.8 kB, more than a small device can buffer."""
 _HEADS: Final = bytes((0x55, 0xAA, WRITE, 0xFF))
 _UNKNOWN: Final = 0x6F00
-"""A command of no document, without data; its second byte is their number."""
+"""Unused command; its second byte is set to the length of the data."""
 _SLOW_GAP_S: Final = 0.04
-"""Between two useless messages where time, not their number, is what matters."""
+"""Gap between useless messages where the time matters, not their number."""
 _RANDOM_FRAMES: Final = 120
 _RANDOM_MESSAGES: Final = 30
 _LIKELY: Final = (BOOT_VERSION, UPDATE, PACKET, END, QUERY_VERSION)
 _SETTINGS: Final = range(0x30, 0x50)
-"""Serial numbers of commands that the application writes settings by: a bench device keeps them."""
+"""First bytes of commands that write settings to the application, which a device would keep."""
 
 
 # -- floods ---------------------------------------------------------------------------------------
@@ -48,20 +48,20 @@ _SETTINGS: Final = range(0x30, 0x50)
     "SE-01",
     "endless bytes and useless messages",
     clause="R12; robustness, not in the document",
-    stimulus="header after header, data without an end, long and short messages of no use: to the "
+    stimulus="repeated headers, endless data, useless long and short messages: to the "
     "application, in the announcements and in a transfer",
-    expectation="it goes on as if nothing had come; the window and the pause (tx_12) end in time",
+    expectation="the device continues normally; the window and the pause (tx_12) end in time",
     requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
 )
 def endless(bench: Bench) -> None:
     encoder, image = bench.encoder, transfer_image(bench)
-    # As reads: an application has nothing to write.
+    # Sent as reads, so that an application does not write anything.
     long_message = encoder.message(READ, _UNKNOWN + 253, bytes(range(253)))
     short_message = encoder.message(READ, _UNKNOWN)
     floods = {
-        "header after header": encoder.frames((_HEADS * 2) * _FLOOD_FRAMES),
-        "data without an end": encoder.frames(_HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2)),
+        "repeated headers": encoder.frames((_HEADS * 2) * _FLOOD_FRAMES),
+        "endless data": encoder.frames(_HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2)),
         "long messages": long_message * (_FLOOD_FRAMES // len(long_message)),
         "short messages": short_message * (_FLOOD_FRAMES // len(short_message)),
     }
@@ -98,7 +98,7 @@ def endless(bench: Bench) -> None:
 
 
 def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
-    """Send useless data beyond the window; the application has to start all the same."""
+    """Send useless data beyond the end of the window; the application still has to start."""
     bench.reset_to_bootloader()
     ends_at = bench.now + bench.host.burst_s
     for _ in range(1 + int(bench.host.burst_s / (_FLOOD_FRAMES * 0.0004))):
@@ -111,10 +111,10 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
         )
         expected = f"an application that answers within {limit_s:g} s"
         bench.check(heard is not None, expected, heard or "none")
-        # Many were asked for: a late answer is none to what follows.
+        # Many queries were sent: discard late answers.
         bench.collect(bench.limit("silence_s"))
     else:
-        expected = "an application that answers while useless data go on"
+        expected = "an application that answers while useless data continue"
         bench.unsupported(expected, "the document has no version query for this target")
     bench.check_application()
 
@@ -122,13 +122,13 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
 def _send_slowly_until(
     bench: Bench, kind: MessageKind, within_s: float, query: list[RawFrame]
 ) -> Received | None:
-    """Send useless messages and bytes, `query` between them, until `kind` is received."""
+    """Send useless messages slowly, with `query` between them, until `kind` is received."""
     deadline = bench.now + within_s
     encoder = bench.encoder
     drops = cycle((encoder.message(READ, _UNKNOWN), encoder.frames(_HEADS * 2)))
     heard: Received | None = None
     while heard is None and bench.now < deadline:
-        # Quiet for long enough that the query is not taken for the rest of the bytes.
+        # A pause, so that the query is not taken for the rest of a partial message.
         bench.send([*next(drops)])
         bench.wait(bench.limit("inter_frame_s") + _SLOW_GAP_S if query else 0.0)
         if query:
@@ -145,7 +145,7 @@ def _send_slowly_until(
     "random input in every state",
     clause="R19; robustness, not in the document",
     stimulus="random frames and random intact messages (by the seed) to the application, in the "
-    "announcements, while it erases, before, amid and after the packets, and after complete",
+    "announcements, during the erase, before, between and after packets, and after complete",
     expectation="reachable, and the old or the new application is intact",
     requires={DESTRUCTIVE, LONG},
     choices=("up_08",),
@@ -179,8 +179,8 @@ def noise(bench: Bench) -> None:
 
 
 def _continue_transfer(bench: Bench, image: bytes, stored: int) -> int:
-    """Send the next packet, or the end of transfer. A device that left the transfer has to take a
-    whole upgrade instead. Returns the packets stored, 0 without a transfer.
+    """Send the next packet or end of transfer. A device that left the transfer has to accept a
+    complete upgrade instead. Returns the packets stored, 0 without a transfer.
     """
     bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     if stored < packet_count(len(image)):
@@ -193,13 +193,13 @@ def _continue_transfer(bench: Bench, image: bytes, stored: int) -> int:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
     done = bench.upgrade(image, blind=bench.choice("up_08") != "rejected")
-    bench.require(done.ok, "the transfer goes on, or the device can be upgraded", done.reason)
+    bench.require(done.ok, "the transfer continues, or the device can be upgraded", done.reason)
     bench.check_application(image)
     return 0
 
 
 def _send_noise(bench: Bench) -> None:
-    """Frames of any bytes, then messages of any content with a right CRC."""
+    """Send random frames, then random messages with a correct CRC."""
     chance, encoder = bench.random, bench.encoder
     frames = []
     for _ in range(_RANDOM_FRAMES):
@@ -213,8 +213,8 @@ def _send_noise(bench: Bench) -> None:
 
 
 def _random_message(bench: Bench) -> list[RawFrame]:
-    """Any mode, command and data; one that would write a setting becomes a read. That random data
-    make a correct reset, update command or packet is too unlikely to be excluded.
+    """A message of random mode, command and data; a write of a setting becomes a read. Random data
+    are too unlikely to form a correct reset, update command or packet to exclude these.
     """
     chance = bench.random
     if chance.randrange(2):
@@ -239,9 +239,9 @@ def _random_message(bench: Bench) -> list[RawFrame]:
     "SE-04",
     "writes outside of the application area",
     clause="R8; R9",
-    stimulus="update command for sizes beyond the area, also such as become small when they are "
+    stimulus="update command for sizes beyond the area, also those that overflow when they are "
     "rounded up; packets with number 0 and beyond the total, with the total to match as well",
-    expectation="rejected; nothing of it is stored, and application and bootloader are unharmed",
+    expectation="rejected; nothing is stored, and application and bootloader are intact",
     requires={DESTRUCTIVE, LONG},
     choices=("up_02", "tx_01"),
 )

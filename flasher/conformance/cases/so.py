@@ -1,4 +1,4 @@
-"""SO: soak. Runs only when it is named: it wears the flash."""
+"""SO: soak test. Runs only when selected by name, as it wears the flash."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from flasher.conformance.catalogue import DESTRUCTIVE, LONG, WEAR, case
 from flasher.conformance.results import CaseStopped, CheckOutcome
 
 _FAILURES_MAX: Final = 10
-"""After so many the rest would only wear the device."""
+"""Stop after this many failures to spare the device."""
 _NAMED_MAX: Final = 20
 
 
@@ -18,8 +18,8 @@ _NAMED_MAX: Final = 20
     "many upgrades",
     clause="Welling 5.1, figure 2 (end); robustness, not in the document",
     stimulus=f"{WEAR['SO-01']} upgrades (--upgrades), to the second image and the good one in turn",
-    expectation="each one succeeds, no message repeated, and the application that follows is its "
-    "own; failures are named by their number",
+    expectation="each one succeeds without repeated messages, and its own application runs; "
+    "failures are listed by number",
     requires={DESTRUCTIVE, LONG},
     limit_s=float("inf"),
 )
@@ -38,7 +38,7 @@ def many_upgrades(bench: Bench) -> None:
             image = bench.good_image
             rescued = bench.upgrade(image).ok or bench.upgrade(image, blind=True).ok
             if not (rescued and bench.application_runs()):
-                bench.fail("the device can be upgraded after it", "it cannot")
+                bench.fail("the device can be upgraded afterwards", "it cannot")
                 break
     named = ", ".join(map(str, failed[:_NAMED_MAX]))
     got = f"{done - len(failed)} of {done}" + (f"; failed: number {named}" if failed else "")
@@ -49,8 +49,8 @@ def many_upgrades(bench: Bench) -> None:
 
 
 def _upgrade_once(bench: Bench, image: bytes) -> bool:
-    """Upgrade to `image`, each message once. What passed is not kept, check by check: a report of a
-    thousand upgrades has to be read.
+    """Upgrade to `image`, sending each message once. Drops checks that passed to keep a report of a
+    thousand upgrades readable.
     """
     checks, begin = bench.judge.checks, len(bench.judge.checks)
     try:

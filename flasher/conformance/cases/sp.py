@@ -1,6 +1,5 @@
-"""SP: speed. Runs only when it is named: it wears the flash. The times are those of TM-05, often
-enough to see how they are spread, so that a slower bootloader is seen in the comparison of two
-reports.
+"""SP: speed. Runs only when selected by name, as it wears the flash. Measures the times of TM-05
+often enough to compare their distribution between two reports.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ _NOT_TAKEN: Final = "last boot version to an update command that is not taken"
 _END: Final = "last boot version to the window's end"
 _PATIENCE: Final = 3
 _ASK_S: Final = 0.02
-"""The application is asked so often: the measured start is later than the real one by so much."""
+"""Query interval; the measured start time may be this much too long."""
 _BEYOND: Final = 1.2
-"""The last update command, in windows."""
+"""Offset of the last update command, in windows."""
 _AT_THE_END: Final = 0.5
-"""The share of the update commands that come within a tenth of the window around its end."""
+"""Share of the update commands sent within 5 % of the window's end."""
 
 
 @case(
@@ -64,7 +63,7 @@ def answer_times(bench: Bench) -> None:
 
 
 def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> None:
-    """Ask the application until it answers; if it is not asked, wait as long as it may take."""
+    """Query the application until it answers; without `is_asked`, wait as long as it may take."""
     limit_s = bench.limit("start_s")
     if not is_asked:
         bench.wait_until(since + limit_s)
@@ -79,9 +78,9 @@ def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> 
     "SP-02",
     "the window, offset by offset",
     clause="Welling 5.1, figure 2 (begin); R2",
-    stimulus=f"update command {WEAR['SP-02']} times (--upgrades) behind the last boot version, "
-    "half of them around the window's end; those that are taken are upgrades to the good image",
-    expectation="taken up to the window's end, and behind it as the profile says (up_04)",
+    stimulus=f"update command {WEAR['SP-02']} times (--upgrades) after the last boot version, "
+    "half of them around the window's end; accepted ones continue as upgrades to the good image",
+    expectation="accepted up to the window's end, and after it as the profile says (up_04)",
     requires={DESTRUCTIVE, TIMING, LONG},
     choices=("up_04",),
     limit_s=float("inf"),
@@ -98,7 +97,7 @@ def window(bench: Bench) -> None:
     offsets_s = [_BEYOND * window_s * (at + 0.5) / wide for at in range(wide)]
     offsets_s += [window_s * (0.95 + 0.1 * (at + 0.5) / close) for at in range(close)]
     for offset_s in sorted(offsets_s):
-        with bench.step(f"{offset_s * 1000:.1f} ms behind the last boot version"):
+        with bench.step(f"{offset_s * 1000:.1f} ms after the last boot version"):
             heard = bench.reset_to_bootloader()
             for _ in range(bench.number("versions") - 1):
                 heard = bench.next_version()
@@ -107,9 +106,9 @@ def window(bench: Bench) -> None:
             request = bench.wait_for(MessageKind.REQUEST)
             (not_taken if request is None else taken).append(at_s)
             bench.measure(_NOT_TAKEN if request is None else _TAKEN, at_s)
-            got = "not taken" if request is None else "taken"
+            got = "rejected" if request is None else "accepted"
             if at_s < window_s - edge_s:
-                bench.check(request is not None, "taken", got)
+                bench.check(request is not None, "accepted", got)
             elif at_s > window_s + edge_s and choice != "either":
                 bench.check((request is not None) == (choice == "accepted"), choice, got)
             if request is None:
@@ -119,7 +118,7 @@ def window(bench: Bench) -> None:
     if taken and not_taken:
         bench.measure(_END, (max(taken) + min(not_taken)) / 2)
         bench.info(
-            f"taken {len(taken)} of {bench.upgrades} times, up to {max(taken) * 1000:.1f} ms; not "
-            f"taken from {min(not_taken) * 1000:.1f} ms on"
+            f"accepted {len(taken)} of {bench.upgrades} times, up to {max(taken) * 1000:.1f} ms; "
+            f"rejected from {min(not_taken) * 1000:.1f} ms on"
         )
     bench.info(f"flash wear: the application was erased and written {len(taken)} times")

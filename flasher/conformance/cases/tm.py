@@ -1,4 +1,4 @@
-"""TM: timing. TM-01, TM-03 and TM-04 are the host's."""
+"""TM: timing. TM-01, TM-03 and TM-04 concern the host."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ from flasher.conformance.wire import (
 )
 
 _SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
-"""Gaps between frames, as shares of `limits.inter_frame_s`."""
 _RESETS: Final = 5
 _PACKETS: Final = 64
-"""So many packets, at the least, tell how their answers are spread."""
+"""Smallest number of packets that shows the distribution of answer times."""
 _REST: Final = bytes(5)
-"""A whole number of packets is a matter of its own (UP-01)."""
+"""Makes the image not a whole number of packets; UP-01 covers that."""
 _PATIENCE: Final = 3
-"""A late answer is waited for so many times as long as it may take, so that the report has it."""
+"""Wait this many times the limit for a late answer, so that the report shows its time."""
 
 
 @case(
@@ -48,15 +47,15 @@ def gaps(bench: Bench) -> None:
             sent = [one.at_s for one in bench.tester.trace if one.sent and one.at_s > began_at]
             pairs = pairwise(sent[:PACKET_FRAMES])  # of the packet, as it was on the bus
             widest_s = max(behind - before for before, behind in pairs)
-            bench.info(f"gap of {gap_s * 1000:.1f} ms: {'taken' if taken else 'not taken'}")
+            bench.info(f"gap of {gap_s * 1000:.1f} ms: {'accepted' if taken else 'rejected'}")
             if wanted == EITHER:
                 continue
             if widest_s < limit_s - bench.port.uncertainty_s:
                 got = "accepted" if taken else "no ACK"
-                expected = f"accepted with frames {widest_s * 1000:.1f} ms apart at the most"
+                expected = f"accepted with frames {widest_s * 1000:.1f} ms apart at most"
                 bench.check(taken, expected, got)
             else:
-                got = f"a frame was sent {widest_s * 1000:.1f} ms behind the one before"
+                got = f"a frame was sent {widest_s * 1000:.1f} ms after the previous one"
                 bench.unsupported(f"frames less than {limit_s * 1000:g} ms apart", got)
     probe.check_stored()
 
@@ -85,7 +84,7 @@ def times(bench: Bench) -> None:
         measure_packets(bench, image)
         measure_end(bench)
     for turn in range(_RESETS):
-        # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
+        # EN-01 and RS-03 check that it starts each time; judge the times measured so far.
         if not bench.application_runs():
             break
         with bench.step(f"reset {turn + 1}"):
@@ -94,7 +93,7 @@ def times(bench: Bench) -> None:
 
 
 def check_times(bench: Bench) -> None:
-    """Judge all that was measured by the profile's limits."""
+    """Compare all measured times with the profile's limits."""
     check, limit = bench.judge.check_measured, bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
     check(Times.FIRST, high_s=limit("first_version_s"))
@@ -106,7 +105,7 @@ def check_times(bench: Bench) -> None:
 
 
 def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
-    """One reset and its burst; returns its last boot version, with `wait` when it is over."""
+    """Reset and measure the burst. Returns its last boot version, with `wait` after the burst."""
     last = bench.reset_measured(_PATIENCE * bench.limit("first_version_s"))
     for _ in range(bench.number("versions") - 1):
         within_s = _PATIENCE * bench.limit("version_spacing_s")
@@ -121,7 +120,7 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
 
 
 def measure_packets(bench: Bench, image: bytes) -> None:
-    """All packets of `image`, each one acknowledged."""
+    """Send all packets of `image` and measure each ACK."""
     limit_s = _PATIENCE * bench.limit("ack_s")
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
@@ -130,7 +129,7 @@ def measure_packets(bench: Bench, image: bytes) -> None:
 
 
 def measure_end(bench: Bench) -> Received:
-    """End of transfer; returns complete."""
+    """Send end of transfer and measure the time to complete, which is returned."""
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")
     heard = bench.await_message(MessageKind.COMPLETE, within_s=within_s)

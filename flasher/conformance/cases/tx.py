@@ -1,5 +1,5 @@
-"""TX: the transfer. Packets that are damaged, repeated or have a wrong head, the largest image, and
-pauses and resets during a transfer.
+"""TX: transfer. Damaged and repeated packets, wrong packet headers, the largest image, and pauses
+and resets during a transfer.
 """
 
 from __future__ import annotations
@@ -28,33 +28,31 @@ from flasher.conformance.wire import (
 
 _PACKETS_MIN: Final = 7
 _DATA_AT: Final = 40
-"""An offset amid the 128 bytes of a packet."""
+"""An offset inside the 128 data bytes of a packet."""
 _LOST_FRAMES: Final = (0, 1, 9, 17)
-"""The first frame of a packet, the one in which its number ends, one of the data, the last one."""
+"""The first frame, the frame in which the number ends, a data frame and the last frame."""
 _NUMBER_IN: Final = 1
 _BUFFER_BYTES: Final = 4096
-"""What a device that writes whole pages may hold back until the end of transfer."""
+"""Bytes that a device that writes whole pages may hold back until end of transfer."""
 _REPEATS: Final = 2
 _NUMBER_MAX: Final = 0xFFFF
 _STORED: Final = 3
-"""Packets stored when packets with a wrong head come."""
+"""Packets stored before packets with a wrong header are sent."""
 _START_BYTES: Final = (0x00, 0x02, 0x04, 0x10, 0x81, 0xFF)
 _UNFINISHED_PACKETS: Final = 3
-"""Packets of a transfer that is only begun."""
+"""Packets of an unfinished transfer."""
 _SHORT: Final = 0.5
-"""A pause that is no pause, as a part of limits.pause_s."""
+"""Share of limits.pause_s that does not count as a pause."""
 _LONG: Final = 1.5
 _JUST_NOT: Final = 0.9
 _CHECKSUM_BYTES: Final = 4
 _WRAP_S: Final = 66.0
-"""More than 65.536 s, where a clock of milliseconds in 16 bits wraps."""
+"""Longer than 65.536 s, the range of a 16-bit millisecond counter."""
 _APART_S: Final = 3.0
 
 
 def transfer_image(bench: Bench) -> bytes:
-    """The good image, for a transfer in which things go wrong. Raises Unsupported when it is too
-    small for that.
-    """
+    """The good image, for transfers with faults. Raises Unsupported when it is too small."""
     image = bench.good_image
     if packet_count(len(image)) < _PACKETS_MIN:
         raise Unsupported(f"the good image has less than {_PACKETS_MIN} packets")
@@ -62,8 +60,8 @@ def transfer_image(bench: Bench) -> bytes:
 
 
 def _transfer_stopping_at(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
-    """Transfer `image`, stopping before each of these packets: it is sent as it should be, and has
-    to be accepted, when the case goes on. The whole ends with the application of the image.
+    """Transfer `image` and stop before each of these packets; after the case resumes, the packet is
+    sent unchanged and has to be accepted. Ends with a check that the image runs.
     """
     bench.start_transfer(len(image))
     done = 0
@@ -72,15 +70,15 @@ def _transfer_stopping_at(bench: Bench, image: bytes, numbers: Iterable[int]) ->
         yield number
         with bench.step(f"packet {number} as it should be"):
             bench.send_packet(image, number)
-            # Where a frame was lost a NAK may come as late as the next message (FR-05).
+            # After a lost frame a NAK may come as late as the next message (FR-05).
             bench.expect(MessageKind.ACK, number=number, ignoring=(MessageKind.NAK,))
         done = number
     bench.finish(image, done + 1)
 
 
 def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
-    """Packet or end of transfer to the announcing bootloader: whatever it says, it is none of what
-    answers them in a transfer.
+    """Send a packet or end of transfer to the announcing bootloader and check that no ACK, complete
+    or request transfer follows.
     """
     bench.reset_to_bootloader()
     bench.wait_until_listening()
@@ -117,7 +115,7 @@ def damaged(bench: Bench) -> None:
             with bench.step(f"packet {number} without its frame {index + 1}"):
                 frames = bench.encoder.packet_of(image, number)
                 bench.send(frames[:index] + frames[index + 1 :])
-                # Without the first frame there is nothing to know a packet by.
+                # Without its first frame the message cannot be recognised as a packet.
                 named = None if trusts_it and index <= _NUMBER_IN else number
                 bench.check_naks([named], choice if index else "either")
             continue
@@ -146,7 +144,7 @@ def damaged(bench: Bench) -> None:
     "ACK lost",
     clause="Welling 5.1, figure 2 (packets); R10",
     stimulus="first, second and last packet sent again after their ACK, twice each",
-    expectation="ACK n again (tx_02), one answer a copy; nothing is written twice",
+    expectation="ACK n again (tx_02), one answer per copy; nothing is written twice",
     requires={DESTRUCTIVE},
     choices=("tx_02",),
 )
@@ -159,7 +157,7 @@ def repeated(bench: Bench) -> None:
     "repeated number with other data",
     clause="R10",
     stimulus="first, second and last packet again, with other data and a right CRC",
-    expectation="answered as a repetition (tx_02); the first data stay",
+    expectation="answered as a repetition (tx_02); the first data are kept",
     requires={DESTRUCTIVE},
     choices=("tx_02",),
 )
@@ -168,13 +166,13 @@ def other_data(bench: Bench) -> None:
 
 
 def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
-    """A transfer with repetitions whose data are those of the first copy, `changed`."""
+    """Transfer with repeated packets whose data are the `changed` data of the first copy."""
     image, choice = transfer_image(bench), bench.choice("tx_02")
     total = packet_count(len(image))
     for number in bench.transfer_in_parts(image, (1, 2, total)):
         payload = changed(packet_payload(image, number))
         allowed = bench.repetition_answers(number)
-        # Behind the last packet there is no next one to ask for.
+        # After the last packet there is no next packet to request.
         more = [f"ACK {number}", f"NAK {number}"] if number == total and choice != "ack" else []
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
@@ -194,7 +192,7 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     stimulus="before packet 1, after packet 3 and after the last one: a number skipped, the last "
     "one, 0, beyond the total, the right one and 256, 65535; older ones, with right and with other "
     "data; packets to the announcing bootloader",
-    expectation="rejected (tx_01), the older ones as the profile says (tx_03); nothing of it is "
+    expectation="rejected (tx_01), older packets as the profile says (tx_03); none of the data is "
     "stored",
     requires={DESTRUCTIVE},
     choices=("tx_01", "tx_03"),
@@ -208,12 +206,12 @@ def out_of_order(bench: Bench) -> None:
     for stored in bench.transfer_in_parts(image, (0, _STORED, total)):
         beyond = (stored + 2, total, 0, total + 1, _NUMBER_MAX, stored + 1 + 256)
         for number in dict.fromkeys(beyond):
-            # The one stored last is a repetition (TX-02), and 65536 cannot be said.
+            # The packet stored last is a repetition (TX-02), and 65536 does not fit the field.
             if 0 < number == stored or number > _NUMBER_MAX:
                 continue
             with bench.step(f"after packet {stored}, number {number}"):
                 bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
-                # When all is there, which number is wanted is nobody's business.
+                # When all packets are stored, any number in a NAK is correct.
                 is_open = stored == total
                 bench.check_packet_rejected(*(None, None) if is_open else (stored + 1, number))
         for number in range(1, _STORED) if stored == _STORED else ():
@@ -258,7 +256,7 @@ def wrong_total(bench: Bench) -> None:
     "TX-06",
     "wrong start byte",
     clause="Welling 5.2, table 8 (A385)",
-    stimulus="packet 1, 4 and the last one beginning with 00, 02, 04, 10, 81 and FF",
+    stimulus="packet 1, 4 and the last one starting with 00, 02, 04, 10, 81 and FF",
     expectation="rejected (tx_01); accepted with 01",
     requires={DESTRUCTIVE},
     choices=("tx_01",),
@@ -281,26 +279,28 @@ def wrong_start_byte(bench: Bench) -> None:
     "TX-07",
     "many packets",
     clause="Welling 5.2, table 8 (A385); R4; R9",
-    stimulus="the largest image, all its packets: across 255/256, up to the last one; once more, "
-    "the good image with FF behind it, with the end of transfer",
-    expectation="every packet is accepted and stored at its place; the second one runs",
+    stimulus="the largest image, all its packets: across 255/256, up to the last one; then "
+    "the good image padded with FF, including end of transfer",
+    expectation="every packet is accepted and stored at its place; the second image runs",
     requires={DESTRUCTIVE, LONG},
     limit_s=7200.0,
 )
 def many_packets(bench: Bench) -> None:
     if needs_power(bench.profile) and not bench.subject.has_power:
-        raise Unsupported("only power ends a transfer of this product, and none is controlled")
+        raise Unsupported(
+            "only a power cycle ends a transfer of this product, and the bench cannot switch power"
+        )
     size = bench.number("largest_image_bytes")
     image = bench.random.randbytes(size)
     bench.start_transfer(size)
     if not _send_all(bench, image):
         return
-    # Never ended, as nobody could start it; what may still be in a buffer is not looked at.
+    # Not ended, since the image cannot run; skip what may still be buffered.
     buffer_bytes = max(_BUFFER_BYTES, bench.number("buffer_bytes"))
     if size > buffer_bytes:
         bench.check_stored(image[:-buffer_bytes])
     else:
-        bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
+        bench.unsupported("the flash holds the image", "all of it may still be buffered")
     with bench.step("once more, to its end"):
         bench.leave_transfer()
         whole = _largest_valid_image(bench, size)
@@ -311,7 +311,7 @@ def many_packets(bench: Bench) -> None:
         within_s = bench.limit("complete_s")
         heard = bench.wait_for(MessageKind.COMPLETE, MessageKind.NAK, within_s=within_s)
         if heard is not None and heard.kind is MessageKind.NAK:
-            why = "the device refuses the good image with FF behind it, by a check of its own"
+            why = "the device rejects the padded good image by a check of its own"
             bench.unsupported("the largest image runs", why)
             return
         bench.require_received(heard, MessageKind.COMPLETE.value, within_s)
@@ -319,7 +319,7 @@ def many_packets(bench: Bench) -> None:
 
 
 def _send_all(bench: Bench, image: bytes) -> bool:
-    """All packets, in one check, as 65535 are too many to read; False when it failed."""
+    """Send all packets and record one check, as up to 65535 would be too many; False on failure."""
     total = packet_count(len(image))
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
@@ -333,8 +333,8 @@ def _send_all(bench: Bench, image: bytes) -> bool:
 
 
 def _largest_valid_image(bench: Bench, size: int) -> bytes:
-    """The good image with FF behind it, as the flash behind it reads else, and with its checksum
-    where the product's images have one.
+    """The good image padded with FF to `size` bytes, with a new checksum where the product's images
+    have one.
     """
     image = bench.good_image
     if bench.choice("en_04") == "none":
@@ -349,7 +349,7 @@ def _largest_valid_image(bench: Bench, size: int) -> bytes:
     "TX-08",
     "last packet not filled with FF",
     clause="Welling 5.2, table 8 (A385)",
-    stimulus="other bytes than FF behind the end of the image in the last packet",
+    stimulus="bytes other than FF after the end of the image in the last packet",
     expectation="ignored or rejected (tx_08)",
     requires={DESTRUCTIVE},
     choices=("tx_08", "tx_01"),
@@ -385,9 +385,9 @@ def other_filler(bench: Bench) -> None:
     "TX-12",
     "pause in a transfer",
     clause="R12; R14",
-    stimulus="half of limits.pause_s before a packet; more than it before packet 1, amid the "
+    stimulus="half of limits.pause_s before a packet; a longer pause before packet 1, between "
     "packets and before the end; a transfer of more than 66 s without a pause",
-    expectation="announces again, or waits on (tx_12); reachable in both; the long one goes on",
+    expectation="announces again or keeps waiting (tx_12); reachable; the long transfer continues",
     requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
     limit_s=900.0,
@@ -400,11 +400,13 @@ def pause(bench: Bench) -> None:
 
 
 def _send_slowly(bench: Bench) -> None:
-    """Packets, half a pause apart at the most, until a clock of 16 bits has wrapped: none of them
-    may be taken for late. The transfer is left.
+    """Send packets up to half a pause apart until a 16-bit millisecond counter has overflowed, then
+    leave the transfer: no packet may count as late.
     """
     if needs_power(bench.profile) and not bench.subject.has_power:
-        why = "only power ends a transfer of this product, and none is controlled"
+        why = (
+            "only a power cycle ends a transfer of this product, and the bench cannot switch power"
+        )
         bench.unsupported("a long transfer", why)
         return
     apart_s = min(_SHORT * bench.limit("pause_s"), _APART_S)
@@ -430,7 +432,7 @@ def _announces(bench: Bench) -> None:
         bench.packet(image, 1)
     for stored in (1, _UNFINISHED_PACKETS, 0):
         with bench.step(_step_text("a pause", stored)):
-            # The short pause left packet 1 stored, a long one ended all.
+            # After the short pause packet 1 is stored; a long pause ended the transfer.
             if stored != 1:
                 bench.update(len(image))
             bench.packets(image, 2 if stored == 1 else 1, stored)
@@ -444,8 +446,8 @@ def _announces(bench: Bench) -> None:
 
 
 def _announces_or_waits(bench: Bench) -> None:
-    """Whatever it does, the transfer goes on or begins anew, and what ended a transfer before a
-    pause ends it after the pause.
+    """Check that after a pause the transfer continues or restarts, and that an update command that
+    ended a transfer before a pause still does so.
     """
     image = transfer_image(bench)
     pause_s = _LONG * bench.limit("pause_s")
@@ -468,7 +470,7 @@ def _announces_or_waits(bench: Bench) -> None:
         bench.send(bench.encoder.update(len(image)))
         within_s = bench.limit("pause_s") / 2
         if bench.wait_for(MessageKind.REQUEST, within_s=within_s) is None:
-            bench.unsupported("a new upgrade after a pause", "an update command starts none")
+            bench.unsupported("a new upgrade after a pause", "an update command does not start one")
             return
         bench.packet(image, 1)
         bench.collect(pause_s)
@@ -486,7 +488,7 @@ def _waits(bench: Bench) -> None:
         starts_over = bench.choice("up_08") == "starts_over"
         can_leave = bench.choice("tx_13") == "restarts" or bench.subject.has_power
         if not (starts_over or can_leave):
-            bench.unsupported("a new upgrade", "only power ends a transfer of this product")
+            bench.unsupported("a new upgrade", "only a power cycle ends a transfer of this product")
             return
         bench.start_transfer(len(image))
         bench.expect_silence(pause_s)
@@ -500,7 +502,7 @@ def _waits(bench: Bench) -> None:
     "TX-13",
     "reset in a transfer",
     clause="R18",
-    stimulus="reset while it erases, before packet 1, amid the packets and before the end",
+    stimulus="reset during the erase, before packet 1, between packets and before the end",
     expectation="ignored, or restarts (tx_13); a new upgrade succeeds",
     requires={DESTRUCTIVE},
     choices=("tx_13",),
@@ -510,9 +512,9 @@ def reset(bench: Bench) -> None:
     total = packet_count(len(image))
     within_s = bench.limit("first_version_s")
     if bench.choice("tx_12") != "waits":
-        # Later than that, it is the pause that ends the transfer.
+        # Later than that, the pause ends the transfer.
         within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
-    with bench.step("reset while it erases"):
+    with bench.step("reset during the erase"):
         _reset_while_it_erases(bench)
     bench.start_transfer(len(image))
     done = 0
@@ -537,21 +539,21 @@ def reset(bench: Bench) -> None:
 
 
 def _reset_while_it_erases(bench: Bench) -> None:
-    """Whether the bootloader hears it then is open; it requests the transfer, or announces itself,
-    and can be upgraded.
+    """Send a reset right after the update command. The device may request the transfer or announce
+    itself, and has to accept an upgrade.
     """
     image = bench.good_image
     bench.reset_to_bootloader()
     bench.wait_until_listening()
     bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
-    # Boot versions that were on their way when the update command came do not count (R11).
+    # Boot versions sent before the update command arrived do not count (R11).
     bench.wait(UPDATE_SPACING_S)
     within_s = bench.limit("erase_s") + bench.limit("first_version_s")
     heard = bench.wait_for(MessageKind.REQUEST, MessageKind.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(heard, "request transfer, or boot version", within_s)
     restarts: Received | None = found
     if found.kind is MessageKind.REQUEST and bench.choice("tx_13") != "ignored":
-        # It may hear the reset when it has erased; what it announced before does not count.
+        # The device may process the reset after the erase; earlier boot versions do not count.
         restarts = bench.wait_for(
             MessageKind.BOOT_VERSION,
             within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),

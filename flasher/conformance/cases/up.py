@@ -1,4 +1,4 @@
-"""UP: the update command."""
+"""UP: update command. Sizes, names, the time window and repetitions."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from flasher.conformance.wire import (
 
 _SIZES: Final = (1, 127, 128, 129, 78351)
 _SENT_WHOLE_PACKETS: Final = 2
-"""Images of that many packets are sent too, so that the device shows how many it expects."""
+"""Images of up to this many packets are sent in full, to check the expected number of packets."""
 _SIZE_BITS: Final = (16, 24, 31)
-"""A device that keeps fewer bits of the size takes one for a small image."""
+"""A device that stores the size in fewer bits would take it for a small image."""
 _SOON_S: Final = 0.1
 _FIRST_PACKETS: Final = 3
 _MANY: Final = 24
-"""Transfers begun without a restart between them: none may leave something behind."""
+"""Transfers started without a restart in between, to find state that is left behind."""
 
 
 @case(
     "UP-01",
-    "sizes that are taken",
+    "accepted sizes",
     clause="Welling 5.2, table 8 (A10B); Welling 2.2.1 (7); Welling 5.2, table 9 (C402); R9",
     stimulus="update command for 1, 127, 128, 129, 78351 bytes and the largest image",
-    expectation="request transfer within the erase limit, and the packets of that size are taken",
+    expectation="request transfer within the erase limit; the packets of that size are accepted",
     requires={DESTRUCTIVE, LONG},
 )
 def sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
     if largest < max(_SIZES):
-        bench.info(f"no image of more than {largest} bytes, which is all that the device takes")
+        bench.info(f"sizes above {largest} bytes, the largest image of the device, were left out")
     bench.reset_to_bootloader()
     for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
         with bench.step(f"{size} bytes"):
@@ -58,7 +58,7 @@ def sizes(bench: Bench) -> None:
 
 @case(
     "UP-02",
-    "sizes that are rejected",
+    "rejected sizes",
     clause="Welling 5.2, table 8 (A10B); R9",
     stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes, the size "
     "of the good image with a bit more beyond the largest image",
@@ -101,7 +101,7 @@ def without_reset(bench: Bench) -> None:
 
 @case(
     "UP-04",
-    "when the update command is heard",
+    "when the update command is accepted",
     clause="Welling 5.1, figure 2 (begin); R2",
     stimulus="update command at each boot version, just before and just after the window's end",
     expectation="accepted inside the window; between the announcements and after the window as the "
@@ -143,7 +143,7 @@ def window(bench: Bench) -> None:
     "update command repeated",
     clause="R2; R25; robustness, not in the document",
     stimulus="update command twice before request transfer; again before packet 1",
-    expectation="request transfer once, or for each of them (up_05); the transfer begins at packet "
+    expectation="request transfer once, or for each of them (up_05); the transfer starts at packet "
     "1 and ends well",
     requires={DESTRUCTIVE},
     choices=("up_05",),
@@ -168,7 +168,7 @@ def repeated(bench: Bench) -> None:
     "update command that is not for this device",
     clause="Welling 5.2, table 8 (A10B); Welling 2.2.2, table 2",
     stimulus="names of other targets, each letter another one, small letters; payload too short, "
-    "too long, longer than the command says; as a read",
+    "too long, longer than the command states; as a read",
     expectation="rejected; the old application starts",
     requires={DESTRUCTIVE},
     choices=("up_02",),
@@ -199,7 +199,7 @@ def wrong_names(bench: Bench) -> None:
     clause="R2; robustness, not in the document",
     stimulus="update command of the same size, and of another one, after packet 3; 24 in a row, "
     "each one after packet 1",
-    expectation="starts over cleanly or rejects (up_08), and never mixes two images",
+    expectation="starts over cleanly or rejects it (up_08), and never mixes two images",
     requires={DESTRUCTIVE},
     choices=("up_08",),
 )
@@ -237,8 +237,8 @@ def in_transfer(bench: Bench) -> None:
 
 
 def _starts_over(bench: Bench) -> bool:
-    """Whether an update command in the midst of a transfer starts over; the image is the same, so
-    that nothing can be mixed. The application runs in the end.
+    """True when an update command during a transfer of the same image starts it over. Ends with the
+    application running.
     """
     image, number = bench.good_image, _FIRST_PACKETS + 1
     bench.start_transfer(len(image))
@@ -250,16 +250,16 @@ def _starts_over(bench: Bench) -> bool:
         heard = bench.wait_for(
             MessageKind.ACK, MessageKind.REQUEST, within_s=bench.limit("erase_s")
         )
-    found = bench.require_received(heard, "request transfer, or the transfer goes on", 0.0)
+    found = bench.require_received(heard, "request transfer, or the transfer continues", 0.0)
     starts_over = found.kind is MessageKind.REQUEST
-    bench.info("the device starts over" if starts_over else "the device goes on")
+    bench.info("the device starts over" if starts_over else "the device continues")
     bench.finish(image, 1 if starts_over else number + 1)
     return starts_over
 
 
 def _finish_requested(bench: Bench, choice: str) -> None:
-    """The transfer after a second update command: packet 1 is sent at request transfer, and again
-    at another one (R16), of which there may be as many as `choice` says.
+    """Finish the transfer after a second update command: send packet 1 at request transfer, and
+    again at a second one (R16); `choice` says how many may come.
     """
     image = bench.good_image
     heard = bench.collect(_SOON_S)
@@ -280,7 +280,7 @@ def _finish_requested(bench: Bench, choice: str) -> None:
             acknowledged = found
         else:
             more += 1
-            bench.require(more <= 1, "request transfer twice at the most", f"{more + 1} times")
+            bench.require(more <= 1, "request transfer at most twice", f"{more + 1} times")
     bench.require(acknowledged.number == 1, "ACK 1", acknowledged)
     if copies == 1:
         bench.measure(Times.ANSWER, acknowledged.at - sent.left_at)
@@ -293,8 +293,8 @@ def _finish_requested(bench: Bench, choice: str) -> None:
 
 
 def _offer_update(bench: Bench, choice: str) -> None:
-    """Update command for the good image, taken or not as `choice` says; then the application, the
-    one that was there or the new one.
+    """Send an update command for the good image, accepted or rejected as `choice` says; then check
+    that the old or new application runs.
     """
     image, limit = bench.good_image, bench.limit
     bench.send(bench.encoder.update(len(image)))
@@ -302,7 +302,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
         _expect_request(bench)
         bench.finish(image)
         return
-    # One that took it against the profile shows no application when this time is over.
+    # A device that accepted it against the profile has no application when this time is over.
     within_s = limit("erase_s") if choice == "either" else limit("silence_s")
     request = bench.wait_for(MessageKind.REQUEST, within_s=within_s)
     ok = request is None or choice == "either"
@@ -314,12 +314,12 @@ def _offer_update(bench: Bench, choice: str) -> None:
 
 
 def _expect_request(bench: Bench) -> None:
-    """Request transfer follows; boot versions that are still on their way do not count."""
+    """Expect request transfer, ignoring boot versions still on their way."""
     bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
 
 
 def _enter_at(bench: Bench, version: int) -> float:
-    """Reset, and wait for that boot version of the burst (from 1); returns when it was there."""
+    """Reset, wait for boot version number `version` of the burst (from 1) and return its time."""
     heard = bench.reset_to_bootloader()
     for _ in range(version - 1):
         heard = bench.next_version()
@@ -327,8 +327,8 @@ def _enter_at(bench: Bench, version: int) -> float:
 
 
 def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
-    """In the bootloader: no request transfer, an answer as up_02 says, and the old application
-    starts as if nothing had been said.
+    """Send these frames to the bootloader and check that it does not request the transfer, answers
+    as up_02 says, and starts the old application.
     """
     with bench.step(step):
         bench.reset_to_bootloader()
@@ -342,8 +342,8 @@ def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> No
 def _check_answer(
     bench: Bench, answers: list[Received], kind: MessageKind, choice: str, prefix: str = ""
 ) -> None:
-    """One message of `kind`, or none, as `choice` says ("silence", "either", or another word for
-    the message).
+    """Check for one message of `kind` or none, as `choice` says: "silence", "either" or a word for
+    the message.
     """
     counts = {"silence": (0,), "either": (0, 1)}.get(choice, (1,))
     wanted = {"silence": "silence", "either": f"{kind.value} or silence"}.get(choice, kind.value)
