@@ -82,7 +82,8 @@ class LowerCaseInJson:
 
 def json_keys(keys: str) -> Callable[[_Type], _Type]:
     """Declares what JSON has of a dataclass, in this order: names of fields and of properties,
-    separated by blanks; `key=name` gives one another key. It is for writing only.
+    separated by blanks; `key=name` gives one another key. What is read from JSON has to have all of
+    it; a `cached_property` then has the value that was read.
     """
     names = {key: name or key for key, _, name in (each.partition("=") for each in keys.split())}
 
@@ -101,8 +102,12 @@ def json_keys(keys: str) -> Callable[[_Type], _Type]:
                 value = handler.generate_schema(Annotated[hint, Field(description=read.__doc__)])
                 fields[name] = core_schema.dataclass_field(name, value)
             whole["schema"]["fields"] = [
-                {**fields[name], "serialization_alias": key} for key, name in names.items()
+                {**fields[name], "serialization_alias": key, "validation_alias": key}
+                for key, name in names.items()
             ]
+            for field in whole["schema"]["fields"]:
+                if field["schema"]["type"] == "default":
+                    field["schema"] = field["schema"]["schema"]
             whole["fields"] = list(names.values())
             return schema
 

@@ -25,6 +25,10 @@ Schema = dict[str, Any]
 
 
 _PUBLISHED: Final = {
+    "flasher.conformance.results.CaseResult": "ResultDocument",
+    "flasher.conformance.results.Histogram": "HistogramDocument",
+    "flasher.conformance.results.RunReport": "ReportDocument",
+    "flasher.conformance.results.Times": "TimesDocument",
     "flasher.conformance.results.WalkFinding": "FindingDocument",
     "flasher.conformance.results.StepCoverage": "CoverageDocument",
     "flasher.host.outcome.Outcome": "OutcomeDocument",

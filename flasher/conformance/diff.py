@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from flasher.conformance.json_report import SCHEMA_VERSION, ReportDocument, adapter
-from flasher.conformance.results import CaseVerdict, worst
+from flasher.conformance.json_report import adapter
+from flasher.conformance.results import SCHEMA_VERSION, CaseVerdict, RunReport, worst
 from flasher.errors import UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.text import printable
@@ -81,7 +81,7 @@ class Difference:
         )
 
 
-def read_report(path: Path) -> ReportDocument:
+def read_report(path: Path) -> RunReport:
     """Read a report. Raises UsageError for a file that cannot be read or is no report."""
     from pydantic import ValidationError  # noqa: PLC0415  slow
 
@@ -119,7 +119,7 @@ def _not_a_report(
 
 
 def compare(
-    old: ReportDocument, new: ReportDocument, threshold_percent: float = THRESHOLD_PERCENT
+    old: RunReport, new: RunReport, threshold_percent: float = THRESHOLD_PERCENT
 ) -> Difference:
     """What is different in `new`."""
     before, after = _judged(old), _judged(new)
@@ -156,36 +156,34 @@ def compare(
     )
 
 
-def verdicts_of(report: ReportDocument) -> dict[str, CaseVerdict]:
+def verdicts_of(report: RunReport) -> dict[str, CaseVerdict]:
     """The worst verdict of every case."""
     found: dict[str, list[CaseVerdict]] = {}
     for result in report.results:
-        found.setdefault(result.id, []).append(result.status)
+        found.setdefault(result.case_id, []).append(result.verdict)
     return {case_id: worst(verdicts) for case_id, verdicts in found.items()}
 
 
-def _judged(report: ReportDocument) -> dict[str, CaseVerdict]:
+def _judged(report: RunReport) -> dict[str, CaseVerdict]:
     verdicts = verdicts_of(report)
     return {case_id: each for case_id, each in verdicts.items() if each not in _NOT_JUDGED}
 
 
-def reasons_of(report: ReportDocument) -> dict[str, str]:
+def reasons_of(report: RunReport) -> dict[str, str]:
     """What the first result of each case says that has something to say."""
     found: dict[str, str] = {}
     for result in report.results:
         reason = result.note
-        if result.status is CaseVerdict.PASS_IN_PART:
+        if result.verdict is CaseVerdict.PASS_IN_PART:
             reason = f"not tried: {'; '.join(result.not_tried)}"
         elif result.findings:
             reason = str(result.findings[0])
         if reason:
-            found.setdefault(result.id, reason)
+            found.setdefault(result.case_id, reason)
     return found
 
 
-def _changed_times(
-    old: ReportDocument, new: ReportDocument, threshold_percent: float
-) -> list[TimeChange]:
+def _changed_times(old: RunReport, new: RunReport, threshold_percent: float) -> list[TimeChange]:
     """Times of both runs whose median or 95th percentile is another one."""
     found = []
     by_name = {times.name: times for times in old.times}
@@ -205,7 +203,7 @@ def _changed_times(
     return found
 
 
-def _other_conditions(old: ReportDocument, new: ReportDocument) -> list[str]:
+def _other_conditions(old: RunReport, new: RunReport) -> list[str]:
     pairs = [(key, getattr(old, key), getattr(new, key)) for key in _CONDITIONS]
     pairs += [
         (f"profile, {key[:60]}", old.profile.get(key), new.profile.get(key))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from flasher.conformance.reports import ByResult, distribution, group_title
+from flasher.conformance.reports import group_title
 from flasher.conformance.results import (
     CaseResult,
     CaseText,
@@ -17,12 +17,12 @@ from flasher.conformance.results import (
     Check,
     CheckOutcome,
     RunReport,
+    Times,
 )
 from flasher.conformance.side_by_side import SideBySide
 from flasher.conformance.trace_excerpt import Excerpt, excerpt, frame_lines
 from flasher.report import chart
 from flasher.report.base import Status, render_page
-from flasher.trace.figures import Distribution
 
 CHECKS_SHOWN: Final = 12
 """Checks of a case that have a line: those that did not pass first."""
@@ -69,7 +69,6 @@ class CaseView(NamedTuple):
     result: CaseResult
     title: str
     status: Status
-    trace_file: str
     replay: str
     checks: Sequence[tuple[Check, Status]]
     infos: Sequence[str]
@@ -82,22 +81,15 @@ class CaseView(NamedTuple):
 class TimesView(NamedTuple):
     """All measurements of one name."""
 
-    name: str
-    distribution: Distribution
-    uncertainty_s: float
+    times: Times
     histograms: dict[str, chart.Histogram]
     """A drawing for each width; empty where there is nothing to draw."""
 
 
-def html_page(
-    report: RunReport, *, started_at: str, replays: ByResult, trace_files: ByResult
-) -> str:
-    """The page of a run. `replays` and `trace_files` are by case id and repeat."""
+def html_page(report: RunReport) -> str:
+    """The page of a run."""
     groups = {
-        f"{group} {group_title(group)}": [
-            _case(text, result, replays.get(result.key, ""), trace_files.get(result.key, ""))
-            for text, result in members
-        ]
+        f"{group} {group_title(group)}": [_case(text, result) for text, result in members]
         for group, members in report.by_group().items()
     }
     others = {
@@ -109,7 +101,6 @@ def html_page(
         report=report,
         status=Status.GOOD if report.ok else Status.BAD,
         word="passed" if report.ok else "not passed",
-        started_at=started_at,
         groups=groups,
         troubled=[case for cases in groups.values() for case in cases if case.status is Status.BAD],
         traces_open=TRACES_OPEN,
@@ -131,19 +122,18 @@ def comparison_page(found: SideBySide) -> str:
 
 def _times(report: RunReport) -> Sequence[TimesView]:
     views = []
-    for name, measured in report.times().items():
-        found = distribution(measured)
+    measured = report.measured()
+    for found in report.times:
         drawings = {}
         is_spread = found.minimum_s > 0 and found.maximum_s - found.minimum_s > _CLOCK_S
         if found.count >= HISTOGRAM_LEAST and is_spread:
-            values_s = [one.value_s for one in measured]
+            values_s = [one.value_s for one in measured[found.name]]
             drawings = {width: chart.histogram(values_s, at) for width, at in chart.WIDTHS.items()}
-        unsure_s = max(one.uncertainty_s for one in measured)
-        views.append(TimesView(name, found, unsure_s, drawings))
+        views.append(TimesView(found, drawings))
     return views
 
 
-def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> CaseView:
+def _case(text: CaseText, result: CaseResult) -> CaseView:
     colour = _COLOURS[result.verdict]
     is_wrong = colour is not Status.GOOD
     trace = excerpt(
@@ -159,8 +149,7 @@ def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> C
         result,
         title=text.title + repeat,
         status=colour,
-        trace_file=trace_file,
-        replay=replay if colour in (Status.BAD, Status.WARNING) else "",
+        replay=result.replay if colour in (Status.BAD, Status.WARNING) else "",
         checks=[(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
         infos=result.infos[:_INFOS_SHOWN],
         trace=trace,

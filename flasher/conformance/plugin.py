@@ -9,6 +9,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -27,12 +28,13 @@ from flasher.conformance.catalogue import (
     known_cases,
     why_unsupported,
 )
-from flasher.conformance.json_report import report_document, to_bytes
+from flasher.conformance.json_report import to_bytes
 from flasher.conformance.profile import ConformanceProfile, check_deviations
 from flasher.conformance.real import HOST_UNCERTAINTY_S, DevicePowerCommand, ReadbackCommand
 from flasher.conformance.reports import (
     TRACED,
     candump,
+    completed,
     distribution,
     failure_details,
     is_traced,
@@ -144,7 +146,7 @@ class PluginRun:
         _report(node, result)
         said = f"{result.verdict.text}: {result.reason}"
         text = case_text(case.id, self.profile)
-        details = failure_details(text, result, self._replay(case.id))
+        details = failure_details(text, replace(result, replay=self._replay(case.id)))
         match result.verdict:
             case CaseVerdict.PASS_IN_PART if self._is_strict:
                 pytest.fail(said, pytrace=False)
@@ -197,18 +199,19 @@ class PluginRun:
         """
         final = self._run.finish() if self._has_begun else FINAL_IMAGE_OK
         report = self.report()
-        told_by: dict[str, Any] = {
-            "started_at": self._started_at,
-            "replays": {one.key: self._replay(one.case_id) for one in report.results},
-            "trace_files": self._traces,
-        }
+        report = completed(
+            report,
+            started_at=self._started_at,
+            replays={one.key: self._replay(one.case_id) for one in report.results},
+            trace_files=self._traces,
+        )
 
         def page() -> bytes:
             from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
 
-            return html_page(report, **told_by).encode("utf-8")
+            return html_page(report).encode("utf-8")
 
-        self._write("json_report", lambda: to_bytes(report_document(report, **told_by)))
+        self._write("json_report", lambda: to_bytes(report))
         self._write("html", page)
         if final != FINAL_IMAGE_OK:
             pytest.fail(f"the good image at the end: {final}", pytrace=False)

@@ -5,7 +5,8 @@ which `flasher explain`, candump's friends and python-can read.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from typing import Final
 
 from flasher.conformance.catalogue import GROUPS
@@ -15,8 +16,10 @@ from flasher.conformance.results import (
     CaseText,
     CaseVerdict,
     CheckOutcome,
+    Histogram,
     Measurement,
     RunReport,
+    Times,
     TraceEntry,
 )
 from flasher.protocol.frame import Frame
@@ -40,8 +43,10 @@ _JUNIT_RESULTS: Final = {
 """What was not judged is skipped with its reason, but a case that was not run because the run broke
 off is an error: a server must not show green for it."""
 
+BINS: Final = 20
 ByResult = Mapping[tuple[str, int], str]
 """A text for results, by case id and repeat."""
+_NONE: Final[ByResult] = {}
 
 
 def group_title(group: str) -> str:
@@ -57,13 +62,52 @@ def distribution(measurements: Iterable[Measurement]) -> Distribution:
     return found
 
 
+def completed(
+    report: RunReport, *, started_at: str, replays: ByResult = _NONE, trace_files: ByResult = _NONE
+) -> RunReport:
+    """The report as it is printed and written: with the ISO time of its start, how its times are
+    spread, and by case id and repeat the commands and the files of its results.
+    """
+    return replace(
+        report,
+        started_at=started_at,
+        results=tuple(
+            replace(
+                result,
+                replay=replays.get(result.key, ""),
+                trace_file=trace_files.get(result.key, ""),
+            )
+            for result in report.results
+        ),
+        times=tuple(
+            Times(
+                name,
+                **asdict(distribution(found)),
+                uncertainty_s=max(one.uncertainty_s for one in found),
+                histogram=_histogram([one.value_s for one in found]),
+            )
+            for name, found in report.measured().items()
+        ),
+    )
+
+
+def _histogram(values_s: Sequence[float]) -> Histogram:
+    low_s, high_s = min(values_s), max(values_s)
+    width_s = (high_s - low_s) / BINS
+    if width_s <= 0:
+        return Histogram(edges_s=[low_s, high_s], counts=[len(values_s)])
+    counts = [0] * BINS
+    for value_s in values_s:
+        counts[min(BINS - 1, int((value_s - low_s) / width_s))] += 1
+    edges_s = [low_s + index * width_s for index in range(BINS)] + [high_s]
+    return Histogram(edges_s=edges_s, counts=counts)
+
+
 # -- JUnit ----------------------------------------------------------------------------------------
 
 
-def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> bytes:
-    """The report as JUnit XML, a suite a group. `started_at` is an ISO time, `replays` are the
-    commands that repeat a result.
-    """
+def junit_report(report: RunReport) -> bytes:
+    """The report as JUnit XML, a suite a group."""
     properties = {
         "subject": report.subject,
         "target": report.target,
@@ -74,27 +118,26 @@ def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> by
         "uncertainty_s": report.uncertainty_s,
         "judged_in_full": report.in_full,
         "not_tried": "; ".join(
-            f"{why}: {' '.join(case_ids)}" for why, case_ids in report.not_tried().items()
+            f"{why}: {' '.join(case_ids)}" for why, case_ids in report.not_tried.items()
         ),
         "final_image": report.final_image_text,
         "bench_is": "; ".join(map(str, report.gaps)),
     }
     suites = {
         f"{group} {group_title(group)}": [
-            _junit_case(text, result, report, replays.get(result.key, ""))
-            for text, result in members
+            _junit_case(text, result, report) for text, result in members
         ]
         for group, members in report.by_group().items()
     }
     suites[_RUN] = _junit_run(report)
     return junit_xml(
         f"conformance {report.subject}",
-        [JUnitSuite(name, cases, started_at, properties) for name, cases in suites.items()],
+        [JUnitSuite(name, cases, report.started_at, properties) for name, cases in suites.items()],
         report.duration_s,
     )
 
 
-def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: str) -> JUnitCase:
+def _junit_case(text: CaseText, result: CaseResult, report: RunReport) -> JUnitCase:
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     ended = _JUNIT_RESULTS.get(result.verdict, JUnitResult.PASSED)
     is_broken = report.adapter_failed or report.killed_by
@@ -108,7 +151,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     if ended is JUnitResult.SKIPPED:
         message, kind = f"{word}: {message}", ""
     elif ended in (JUnitResult.FAILURE, JUnitResult.ERROR):
-        details = failure_details(text, result, replay)
+        details = failure_details(text, result)
     elif report.strict and result.deviation_resolved:
         ended, kind = JUnitResult.FAILURE, "resolved deviation"
         message = f"the profile says that it deviates ({text.deviation}), but it passes"
@@ -131,7 +174,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     )
 
 
-def failure_details(text: CaseText, result: CaseResult, replay: str) -> str:
+def failure_details(text: CaseText, result: CaseResult) -> str:
     """What a case asks for, what failed, and how to run it again, line by line."""
     failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
     lines = [f"clause: {label}: {content}" for label, content in text.clauses.items()]
@@ -140,7 +183,7 @@ def failure_details(text: CaseText, result: CaseResult, replay: str) -> str:
     if len(failed) > _FINDINGS:
         lines.append(f"{len(failed) - _FINDINGS} more failed checks")
     lines.append(f"seed: {result.seed}")
-    return "\n".join([*lines, f"replay: {replay}"] if replay else lines)
+    return "\n".join([*lines, f"replay: {result.replay}"] if result.replay else lines)
 
 
 def _junit_run(report: RunReport) -> list[JUnitCase]:

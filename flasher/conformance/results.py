@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
+from itertools import islice
 from typing import Final, NamedTuple
 
 from flasher.conformance.wire import RawFrame
 from flasher.validation import json_keys
 
 FINAL_IMAGE_OK: Final = "verified"
+SCHEMA_VERSION: Final = 2
+"""Of a report in JSON: counts up when a field changes its meaning or goes away; not for a new
+one."""
+CHECKS_KEPT: Final = 50
+"""Checks of one case that JSON has, those that did not pass; all are counted."""
 
 
 class CaseVerdict(Enum):
@@ -65,12 +72,46 @@ class Check:
 
 
 @dataclass(frozen=True)
+class CheckCounts:
+    """How many checks of a case ended how."""
+
+    passed: int
+    failed: int
+    inconclusive: int
+    unsupported: int
+
+
+@dataclass(frozen=True)
 class Measurement:
     """One measured time; the name says from what to what ("packet to ACK")."""
 
     name: str
     value_s: float
     uncertainty_s: float
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How often values fell into bins of one width: as many counts as edges, less one."""
+
+    edges_s: Sequence[float]
+    counts: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Times:
+    """How the times of one name are spread. Percentiles are values that were measured."""
+
+    name: str
+    count: int
+    minimum_s: float
+    median_s: float
+    p95_s: float
+    p99_s: float
+    maximum_s: float
+    uncertainty_s: float
+    """How far a single value may be off: the greatest of them."""
+    histogram: Histogram
 
 
 class TraceEntry(NamedTuple):
@@ -102,34 +143,52 @@ class CaseText:
     """The reason in the profile why the device may differ."""
 
 
+@json_keys(
+    "id=case_id repeat status=verdict seed note checks=counts findings not_tried infos"
+    " deviation_resolved duration_s replay trace_file"
+)
 @dataclass(frozen=True)
 class CaseResult:
-    """The result of one run of a case, which `case_id` and `repeat` (from 1) identify."""
+    """What came of one run of a case."""
 
     case_id: str
     verdict: CaseVerdict
-    repeat: int = 1
+    repeat: int = 1  # from 1; with the case it identifies a result
     seed: str = ""
     note: str = ""
     checks: tuple[Check, ...] = ()
     measurements: tuple[Measurement, ...] = ()
-    infos: tuple[str, ...] = ()
-    """What was observed without being judged."""
+    infos: tuple[str, ...] = ()  # what was observed without being judged
     duration_s: float = 0.0
     trace: tuple[TraceEntry, ...] = ()
     trace_dropped: int = 0
     """Frames that were not kept, as there were too many; the newest ones are kept."""
     deviation_resolved: bool = False
     """The profile documents a deviation, but the case passes."""
+    replay: str = ""
+    """The command that runs this case alone, with its seed; empty where there is none."""
+    trace_file: str = ""
+    """Name of the file with its frames; empty without one."""
 
     @property
     def key(self) -> tuple[str, int]:
         """Case id and repeat."""
         return self.case_id, self.repeat
 
-    @property
+    @cached_property
+    def counts(self) -> CheckCounts:
+        outcomes = [check.outcome for check in self.checks]
+        return CheckCounts(*map(outcomes.count, CheckOutcome))
+
+    @cached_property
+    def findings(self) -> tuple[Check, ...]:
+        """The checks that did not pass, the first ones of many."""
+        bad = (check for check in self.checks if check.outcome is not CheckOutcome.PASS)
+        return tuple(islice(bad, CHECKS_KEPT))
+
+    @cached_property
     def not_tried(self) -> tuple[str, ...]:
-        """The parts that were not tried, each with the reason, once."""
+        """The parts that this bench could not try, each with the reason."""
         found = (one for one in self.checks if one.outcome is CheckOutcome.UNSUPPORTED)
         return tuple(dict.fromkeys(f"{one.expected} ({one.got})" for one in found))
 
@@ -150,10 +209,6 @@ class CaseResult:
         if self.verdict is CaseVerdict.PASS_IN_PART:
             return f"not tried: {'; '.join(self.not_tried)}"
         return str(self.first_failure or self.note)
-
-    def count(self, outcome: CheckOutcome) -> int:
-        """How many checks ended so."""
-        return sum(check.outcome is outcome for check in self.checks)
 
 
 @dataclass(frozen=True)
@@ -184,45 +239,72 @@ class Rescue:
     how: str
 
 
+@json_keys(
+    "report_schema passed=ok started_at duration_s subject target bitrate_bps timestamp_source"
+    " uncertainty_s seed strict profile_source profile stopped adapter_failed killed_by"
+    " not_upgradable final_image final_image_seen_by passes passes_in_full not_tried counts cases"
+    " results rescues times gaps not_selected host_cases"
+)
 @dataclass(frozen=True)
 class RunReport:
-    """A run from its first case to the last. Times in seconds, on the bench's clock."""
+    """A run of the conformance suite."""
 
+    # Times are in seconds, on the bench's clock. What the clock of the computer tells, `times`,
+    # and where each result is repeated and traced are added by `reports.completed`.
     subject: str
     target: str
     bitrate_bps: int
     timestamp_source: str
     uncertainty_s: float
     profile_source: str
-    profile: Mapping[str, str | int | float]
-    """Every key of the profile with its value."""
+    profile: Mapping[str, str | int | float]  # every key with its value
     seed: str
     strict: bool
-    cases: tuple[CaseText, ...]
-    """The cases of `results`, each once, in the order of the catalogue."""
+    cases: tuple[CaseText, ...]  # those of `results`, each once, in the order of the catalogue
     results: tuple[CaseResult, ...]
     gaps: tuple[Gap, ...] = ()
-    """What the bench could not judge, by what it lacks."""
-    not_selected: tuple[str, ...] = ()
-    """Cases that the selection left out."""
+    """What this bench could not judge of the selected cases, by what it lacks."""
+    not_selected: tuple[str, ...] = ()  # cases that the selection left out
     host_cases: tuple[str, ...] = ()
-    """Cases of the catalogue that concern the host, and are no part of this suite."""
+    """Cases of the catalogue about the tool, which are no part of this suite."""
     stopped: str = ""
-    """Why the run ended before its end; empty for a whole one."""
+    """Why the run ended before its planned end; empty for a whole one."""
+    # True when the adapter, or a command for power or readback, is what `stopped` is about.
     adapter_failed: bool = False
-    """True when the adapter, or a command for power or readback, is what `stopped` is about."""
     not_upgradable: str = ""
-    """Why the good image could not be flashed before the first case; the cases were run all the
-    same, as the bootloader could be reached, and those that need an application have none."""
+    """Why the good image could not be flashed at first; empty when it could."""
+    # The cases were run all the same, as the bootloader could be reached, and those that need an
+    # application have none.
     killed_by: str = ""
-    """The case after which the device could not be brought back."""
+    """The case after which the device could not be brought back; empty for none."""
     rescues: tuple[Rescue, ...] = ()
     final_image: str = ""
-    """Whether the good image is back at the end: "verified", or what failed."""
-    final_image_seen_by: tuple[str, ...] = ()
-    """By what that was seen: "version", "readback", "memory over the bus"; with none of them, some
-    application answers."""
+    """"verified", or what came of the good image at the end."""
+    final_image_seen_by: tuple[str, ...] = ()  # "version", "readback", "memory over the bus"
+    """By what it was verified: version, readback; with neither, some application answers."""
     duration_s: float = 0.0
+    started_at: str = ""
+    """In UTC."""
+    times: tuple[Times, ...] = ()
+
+    @cached_property
+    def report_schema(self) -> int:
+        """Version of this part."""
+        return SCHEMA_VERSION
+
+    @cached_property
+    def passes(self) -> int:
+        """Cases that passed, in full or in part."""
+        return self.passes_in_full + self.count(CaseVerdict.PASS_IN_PART)
+
+    @cached_property
+    def passes_in_full(self) -> int:
+        return self.count(CaseVerdict.PASS)
+
+    @cached_property
+    def counts(self) -> dict[str, int]:
+        """How many results have each status."""
+        return {verdict.value: self.count(verdict) for verdict in CaseVerdict}
 
     def count(self, verdict: CaseVerdict) -> int:
         """How many results have that verdict."""
@@ -233,11 +315,12 @@ class RunReport:
         """Cases that pass although the profile documents a deviation."""
         return tuple(result.case_id for result in self.results if result.deviation_resolved)
 
-    @property
+    @cached_property
     def ok(self) -> bool:
-        """True when nothing failed, nothing was left out by a stop, and the good image is back. A
-        strict run has no pass in part, and no deviation that is none any more.
+        """True when nothing failed, nothing was left out by an early end, and the good image is
+        back on the device.
         """
+        # A strict run has no pass in part, and no deviation that is none any more.
         if self.stopped or self.final_image != FINAL_IMAGE_OK:
             return False
         if self.strict and (self.resolved_deviations or self.count(CaseVerdict.PASS_IN_PART)):
@@ -253,9 +336,8 @@ class RunReport:
     @property
     def in_full(self) -> str:
         """How many of the passes were judged in full; "" without any pass."""
-        full = self.count(CaseVerdict.PASS)
-        passes = full + self.count(CaseVerdict.PASS_IN_PART)
-        return f"{full} of {passes} passes were judged in full" if passes else ""
+        full = f"{self.passes_in_full} of {self.passes} passes were judged in full"
+        return full if self.passes else ""
 
     @property
     def final_image_text(self) -> str:
@@ -267,6 +349,7 @@ class RunReport:
         none = "; no readback was possible" if self.final_image_seen_by == ("version",) else ""
         return f"flashed and verified by {' and '.join(self.final_image_seen_by)}{none}"
 
+    @cached_property
     def not_tried(self) -> dict[str, list[str]]:
         """Reasons why parts were not tried, with the cases that passed without them."""
         found: dict[str, dict[str, None]] = {}
@@ -292,7 +375,7 @@ class RunReport:
             found.setdefault(text.group, []).append((text, result))
         return found
 
-    def times(self) -> dict[str, list[Measurement]]:
+    def measured(self) -> dict[str, list[Measurement]]:
         """All measurements by name, in the order in which the names came first."""
         found: dict[str, list[Measurement]] = {}
         for result in self.results:

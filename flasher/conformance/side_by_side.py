@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.conformance.diff import reasons_of, verdicts_of
-from flasher.conformance.json_report import ReportDocument
-from flasher.conformance.results import CaseVerdict
+from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.protocol.text import printable
 
 _FACTS: Final = (
@@ -88,13 +87,13 @@ class SideBySide:
     times: Sequence[TimeRow]
 
 
-def side_by_side(paths: Sequence[Path], reports: Sequence[ReportDocument]) -> SideBySide:
+def side_by_side(paths: Sequence[Path], reports: Sequence[RunReport]) -> SideBySide:
     """The reports, which were read from `paths`, as columns."""
     columns = [
         RunColumn(
             printable(path.name),
             report.subject,
-            report.passed,
+            report.ok,
             report.passes,
             report.passes_in_full,
             {name: count for name, count in report.counts.items() if count},

@@ -7,7 +7,7 @@ from typing import Final
 
 from flasher import __version__
 from flasher.conformance.profile import profile_keys
-from flasher.conformance.reports import distribution, group_title
+from flasher.conformance.reports import group_title
 from flasher.conformance.results import CaseResult, CaseText, CaseVerdict, RunReport
 from flasher.conformance.trace_excerpt import boot_versions
 from flasher.report.base import Status, render_page
@@ -24,9 +24,8 @@ _WRONG: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE)
 
 def badge(report: RunReport) -> str:
     """A drawing (SVG) that says how the run ended, for a web page."""
-    full, in_part = (
-        report.count(verdict) for verdict in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART)
-    )
+    full = report.passes_in_full
+    in_part = report.passes - full
     bad = sum(map(report.count, (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN)))
     if report.ok:
         status = Status.WARNING if in_part else Status.GOOD
@@ -41,17 +40,15 @@ def badge(report: RunReport) -> str:
     return render_page("badge.svg", label=_LABEL, text=text, status=status, widths=widths)
 
 
-def summary_page(report: RunReport, *, started_at: str) -> str:
+def summary_page(report: RunReport) -> str:
     """The run on one page."""
     by_case = report.by_case()
-    times = [(name, distribution(found)) for name, found in report.times().items()]
     columns = [verdict for verdict in CaseVerdict if report.count(verdict)]
     return render_page(
         "release.html",
         report=report,
         status=Status.GOOD if report.ok else Status.BAD,
         word="passed" if report.ok else "not passed",
-        started_at=started_at,
         version=__version__,
         boot_versions=boot_versions(report),
         columns=columns,
@@ -74,7 +71,7 @@ def summary_page(report: RunReport, *, started_at: str) -> str:
             for path, key in profile_keys().items()
             if report.profile.get(path, key.default) != key.default
         ),
-        times=sorted(times, key=lambda row: -row[1].count)[:_LISTED],
+        times=sorted(report.times, key=lambda row: -row.count)[:_LISTED],
     )
 
 

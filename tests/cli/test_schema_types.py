@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum, StrEnum
+from functools import cached_property
 from typing import Literal
 
 import pytest
-from pydantic import PydanticUserError
+from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from flasher.cli.documents import as_json
 from flasher.cli.schema import schema_of
@@ -135,3 +136,22 @@ def test_a_type_that_names_its_keys_has_them_inside_of_another_too() -> None:
         "fields": [{"area_m2": 1.0, "long": 1.0}],
         "best": {"area_m2": 2.0, "long": 2.0},
     }
+
+
+def test_a_type_that_names_its_keys_is_read_by_them_and_keeps_what_was_derived() -> None:
+    @json_keys("seen=count sum")
+    @dataclass(frozen=True)
+    class Tally:
+        count: int = 0
+        values: tuple[int, ...] = ()
+
+        @cached_property
+        def sum(self) -> int:
+            return sum(self.values)
+
+    assert as_json(Tally(2, (3, 4))) == {"seen": 2, "sum": 7}
+    found = TypeAdapter(Tally).validate_python({"seen": 2, "sum": 7})
+    assert (found.count, found.sum, found.values) == (2, 7, ())
+    for missing in ("seen", "sum"):
+        with pytest.raises(ValidationError):
+            TypeAdapter(Tally).validate_python({missing: 2})

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.json_report import report_document, to_bytes
+from flasher.conformance.json_report import to_bytes
 from flasher.conformance.mock import MockSubject, variant_maker
+from flasher.conformance.reports import completed
 from flasher.conformance.runner import run
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
@@ -27,7 +28,7 @@ def made() -> bytes:
     subject = MockSubject("bms", make_device=variant_maker("announces-three-times"))
     selection = Selection(cases=("RS-01", "RS-04", "UP-05", "EN-04"))
     report = run(subject, PROFILE, selection=selection)
-    return to_bytes(report_document(report, started_at="", replays={}, trace_files={}))
+    return to_bytes(completed(report, started_at=""))
 
 
 @pytest.fixture

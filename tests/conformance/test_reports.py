@@ -13,11 +13,19 @@ from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
-from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes, to_json
+from flasher.conformance.json_report import to_bytes, to_json
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
+from flasher.conformance.reports import (
+    BINS,
+    candump,
+    completed,
+    is_traced,
+    junit_report,
+    trace_file_name,
+)
 from flasher.conformance.results import (
+    CHECKS_KEPT,
     CaseResult,
     CaseVerdict,
     Check,
@@ -65,19 +73,18 @@ def hostile_report() -> RunReport:
 
 
 def document_of(report: RunReport) -> dict[str, Any]:
-    made = report_document(report, started_at=AT, replays={}, trace_files={})
-    loaded = json.loads(to_bytes(made))
+    loaded = json.loads(to_bytes(completed(report, started_at=AT)))
     assert isinstance(loaded, dict)
     return loaded
 
 
 def junit_of(report: RunReport) -> ET.Element:
-    return ET.fromstring(junit_report(report, started_at=AT, replays={}))  # noqa: S314  our own
+    return ET.fromstring(junit_report(completed(report, started_at=AT)))  # noqa: S314  our own
 
 
 def page_of(report: RunReport, **replays: str) -> str:
     commands = {(case_id.replace("_", "-"), 1): words for case_id, words in replays.items()}
-    return html_page(report, started_at=AT, replays=commands, trace_files={})
+    return html_page(completed(report, started_at=AT, replays=commands))
 
 
 # -- JSON -----------------------------------------------------------------------------------------
@@ -90,7 +97,7 @@ def test_the_document_is_as_its_schema_says(make: Any) -> None:
 
 
 def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
-    written = report_document(
+    written = completed(
         wrong_run(),
         started_at=AT,
         replays={("RS-01", 1): "flasher ..."},
@@ -117,6 +124,7 @@ def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: l
     profile = ConformanceProfile({**given, "device.application_address": address})
     report = run(device, profile, selection=Selection(cases=("UP-08", "TX-07")))
     document, how = document_of(report), report.final_image_text
+    report = completed(report, started_at=AT)
     assert document["final_image_seen_by"] == by
     assert how.endswith("no readback was possible" if address == 0 else "memory over the bus")
     lacks = [gap["requirement"] for gap in document["gaps"]]
@@ -124,8 +132,8 @@ def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: l
     junit = junit_of(report).iter("property")
     properties = {one.get("name", ""): one.get("value", "") for one in junit}
     assert properties["final_image"] == how
-    pages = (page_of(report), summary_page(report, started_at=AT))
-    texts = ["\n".join(report_lines(report, {})), *(Page(html).text for html in pages)]
+    pages = (page_of(report), summary_page(report))
+    texts = ["\n".join(report_lines(report)), *(Page(html).text for html in pages)]
     assert all(how in text for text in texts)
     for text in (properties["bench_is"], *texts):
         assert ("any readback of the image that runs" in text) == (address == 0)
@@ -238,8 +246,8 @@ def test_a_run_that_broke_off_is_no_green_one() -> None:
 
 
 def test_a_failure_tells_stimulus_seed_and_replay() -> None:
-    xml = junit_report(wrong_run(), started_at=AT, replays={("RS-01", 1): "flasher x"})
-    root = ET.fromstring(xml)  # noqa: S314  our own
+    run = completed(wrong_run(), started_at=AT, replays={("RS-01", 1): "flasher x"})
+    root = ET.fromstring(junit_report(run))  # noqa: S314  our own
     assert_valid(root)
     failure = root.find(".//failure")
     assert failure is not None

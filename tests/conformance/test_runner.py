@@ -11,9 +11,10 @@ import pytest
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Requirement, Selection
-from flasher.conformance.json_report import report_document, to_bytes
+from flasher.conformance.json_report import to_bytes
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.reports import completed
 from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
@@ -447,8 +448,7 @@ def test_a_listener_is_told_in_order() -> None:
 
 def test_the_report_is_json_with_everything_in_it() -> None:
     report = run(subject(), PROFILE, selection=Selection(cases=("RS-01",)))
-    made = report_document(report, started_at="", replays={}, trace_files={})
-    document = json.loads(to_bytes(made))
+    document = json.loads(to_bytes(completed(report, started_at="")))
     assert document["passed"] is True
     (result,) = document["results"]
     assert result["status"] == "pass"

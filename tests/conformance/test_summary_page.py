@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
+from flasher.conformance.reports import completed
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.summary_page import badge, summary_page
 from tests.cli.conftest import Flasher
@@ -57,6 +58,6 @@ def test_a_run_writes_both(flasher: Flasher, tmp_path: Path) -> None:
 
 
 def test_hostile_text_does_nothing_on_the_summary() -> None:
-    html = summary_page(hostile_report(), started_at="")
+    html = summary_page(completed(hostile_report(), started_at=""))
     assert_self_contained(Page(html))
     assert_visible(html)

@@ -9,9 +9,9 @@ import pytest
 
 from flasher.conformance.catalogue import CASES, WEAR, Selection
 from flasher.conformance.diff import compare
-from flasher.conformance.json_report import report_document
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.reports import completed
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import RunOptions, run
 from flasher.mock.model import MockDevice
@@ -82,9 +82,7 @@ def test_what_passes_is_told_in_one_check() -> None:
 
 def test_a_slower_bootloader_is_seen_in_the_comparison_and_fails_a_limit() -> None:
     before, after = (worn("SP-01", 5, program_time_s=time_s) for time_s in (0.001, 0.004))
-    reports = [
-        report_document(each, started_at="", replays={}, trace_files={}) for each in (before, after)
-    ]
+    reports = [completed(each, started_at="") for each in (before, after)]
     assert {one(each, "SP-01").verdict for each in (before, after)} == {CaseVerdict.PASS}
     slower = {change.name: change for change in compare(reports[0], reports[1]).slower}
     assert set(slower) == {"packet to ACK", "end of transfer to complete"}
@@ -103,10 +101,10 @@ def test_a_slower_bootloader_is_seen_in_the_comparison_and_fails_a_limit() -> No
 def test_a_window_that_ends_elsewhere_is_found(window_s: float, verdict: CaseVerdict) -> None:
     report = worn("SP-02", 30, profile=profile_of_mock(), window_s=window_s)
     assert one(report, "SP-02").verdict is verdict
-    (end,) = report.times()["last boot version to the window's end"]
+    (end,) = report.measured()["last boot version to the window's end"]
     # The model's window begins when it queues the last announcement, 1.2 ms before it is there.
     assert end.value_s == pytest.approx(window_s - 0.0012, abs=0.02)
-    taken = report.times()["last boot version to an update command that is taken"]
+    taken = report.measured()["last boot version to an update command that is taken"]
     assert max(time.value_s for time in taken) < window_s
 
 

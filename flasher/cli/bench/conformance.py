@@ -5,7 +5,7 @@ runs; documents the profile.
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -62,7 +62,6 @@ from flasher.conformance.catalogue import (
     missing_requirements,
 )
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
-from flasher.conformance.json_report import ReportDocument
 from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunReport
 from flasher.conformance.side_by_side import SideBySide, side_by_side
 from flasher.errors import ErrorCode, ExitCode, UsageError
@@ -111,7 +110,7 @@ _RUN_OPTIONS: Final = frozenset(
 class ConformanceDocument:
     """What came of a run."""
 
-    report: ReportDocument
+    report: RunReport
 
 
 @dataclass(frozen=True)
@@ -314,32 +313,38 @@ def _tell(
     """Print the summary and write the files. What cannot be written keeps nothing else from it.
     Raises UsageError.
     """
-    from flasher.conformance.json_report import report_document  # noqa: PLC0415
-    from flasher.conformance.reports import candump, is_traced, trace_file_name  # noqa: PLC0415
+    from flasher.conformance.reports import (  # noqa: PLC0415
+        candump,
+        completed,
+        is_traced,
+        trace_file_name,
+    )
 
-    replays = replay_commands(report)
-    output.results(report_lines(report, replays, verbose=output.verbosity > 0))
-    traces: dict[tuple[str, int], str] = {}
+    report = completed(report, started_at=started_at, replays=replay_commands(report))
+    output.results(report_lines(report, verbose=output.verbosity > 0))
     failed: list[UsageError] = []
     if chosen.trace_dir is not None:
-        for result in filter(is_traced, report.results):
-            name = trace_file_name(result)
-            try:
-                write_whole(
-                    chosen.trace_dir / name, candump(result.trace), _TRACE_DIR, is_private=True
-                )
-                traces[result.key] = name
-            except UsageError as error:
-                failed.append(error)
-    if traces:
-        output.progress(f"traces: {len(traces)} in {printable(str(chosen.trace_dir))}")
-    document = report_document(report, started_at=started_at, replays=replays, trace_files=traces)
+        results = list(report.results)
+        for index, result in enumerate(results):
+            if is_traced(result):
+                name = trace_file_name(result)
+                try:
+                    write_whole(
+                        chosen.trace_dir / name, candump(result.trace), _TRACE_DIR, is_private=True
+                    )
+                    results[index] = replace(result, trace_file=name)
+                except UsageError as error:
+                    failed.append(error)
+        report = replace(report, results=tuple(results))
+        count = sum(bool(result.trace_file) for result in results)
+        if count:
+            output.progress(f"traces: {count} in {printable(str(chosen.trace_dir))}")
     for name, option_name in _FILES.items():
         path: Path | None = getattr(chosen, name)
         if path is None:
             continue
         try:
-            write_whole(path, _content(name, report, document), option_name)
+            write_whole(path, _content(name, report), option_name)
             output.progress(f"{name.replace('_', ' ')}: {printable(str(path))}")
         except UsageError as error:
             failed.append(error)
@@ -347,29 +352,24 @@ def _tell(
         raise failed[0]
     if code not in (ExitCode.OK, ExitCode.PARTIAL):
         output.error_line(f"the run is not complete: {printable(report.stopped)}")
-    output.document(ConformanceDocument(document), exit_code=code)
+    output.document(ConformanceDocument(report), exit_code=code)
 
 
-def _content(name: str, report: RunReport, document: ReportDocument) -> bytes:
+def _content(name: str, report: RunReport) -> bytes:
     """What is written into the file of this name."""
     from flasher.conformance import html_report, json_report, reports, summary_page  # noqa: PLC0415
 
-    started_at = document.started_at
-    replays = {(one.id, one.repeat): one.replay for one in document.results}
-    traces = {(one.id, one.repeat): one.trace_file for one in document.results if one.trace_file}
     match name:
         case "junit":
-            return reports.junit_report(report, started_at=started_at, replays=replays)
+            return reports.junit_report(report)
         case "json_report":
-            return json_report.to_bytes(document)
+            return json_report.to_bytes(report)
         case "html":
-            text = html_report.html_page(
-                report, started_at=started_at, replays=replays, trace_files=traces
-            )
+            text = html_report.html_page(report)
         case "badge":
             text = summary_page.badge(report)
         case _:
-            text = summary_page.summary_page(report, started_at=started_at)
+            text = summary_page.summary_page(report)
     return text.encode("utf-8")
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from math import ceil
 from typing import Final
 
 from flasher.cli.output import counted, duration
 from flasher.cli.terminal import columns
 from flasher.conformance.diff import Difference, VerdictChange
-from flasher.conformance.reports import ByResult, distribution, group_title
+from flasher.conformance.reports import group_title
 from flasher.conformance.results import (
     CaseResult,
     CaseText,
@@ -44,7 +44,7 @@ _DRAWN_MS: Final = 0.1
 # -- a run ----------------------------------------------------------------------------------------
 
 
-def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False) -> Iterator[str]:
+def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
     """The summary of a run: groups, what went wrong with how to see it again, times, the verdict.
 
     `verbose` tells every case and every failed check.
@@ -69,7 +69,7 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
             line
             for text, result in cases
             if result.verdict is status
-            for line in _told(text, result, replays, verbose=verbose)
+            for line in _told(text, result, verbose=verbose)
         ]
         if lines:
             yield ""
@@ -90,15 +90,15 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
 
 
-def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: bool) -> Iterator[str]:
+def _told(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]:
     """One line: which case, what was expected, what was got, and how to run it again."""
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     said = result.reason
     if result.verdict is CaseVerdict.DEVIATION:
         said = f"{said} (profile: {text.deviation})"
     head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
-    replay = replays.get(result.key, "")
-    yield printable(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
+    replay = f" | replay: {result.replay}" if result.replay else ""
+    yield printable(f"{head}: {_short(said)}") + replay
     failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
         for label, content in text.clauses.items():
@@ -118,7 +118,7 @@ def _not_judged(report: RunReport) -> Iterator[str]:
             whys = [check.got for check in result.checks if check.outcome is unsupported]
             why = result.note or next(iter(whys), "no reason given")
             reasons.setdefault((result.verdict, why), []).append(result.case_id)
-    for why, case_ids in report.not_tried().items():
+    for why, case_ids in report.not_tried.items():
         reasons[CaseVerdict.PASS_IN_PART, why] = case_ids
     if reasons:
         yield ""
@@ -128,21 +128,20 @@ def _not_judged(report: RunReport) -> Iterator[str]:
 
 
 def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
-    found = report.times()
-    if not found:
+    if not report.times:
         return
+    measured = report.measured()
     yield ""
     unsure = f" +- {report.uncertainty_s * _MS:g} ms" if report.uncertainty_s else ""
     yield f"times in ms (time stamps: {printable(report.timestamp_source)}{unsure})"
     rows: list[tuple[str, ...]] = [("", "count", "least", "median", "p95", "p99", "most", "")]
-    for name, measurements in found.items():
-        spread = distribution(measurements)
-        if spread.count < 2 and not verbose and len(found) > _NOTES_SHOWN:
+    for of in report.times:
+        if of.count < 2 and not verbose and len(report.times) > _NOTES_SHOWN:
             continue
-        count, *values_s = astuple(spread)
+        values_s = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
         figures = (f"{value * _MS:.1f}" for value in values_s)
-        drawn = _drawn([one.value_s for one in measurements])
-        rows.append((printable(name), f"{count}", *figures, drawn))
+        drawn = _drawn([one.value_s for one in measured[of.name]])
+        rows.append((printable(of.name), f"{of.count}", *figures, drawn))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
