@@ -13,6 +13,7 @@ import os
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -296,8 +297,15 @@ def _write(path: Path, lines: list[str]) -> None:
             file.seek(size - 1)
             if file.read(1) != b"\n":
                 data = b"\n" + data  # after half a line, which a crash has left
-        file.write(data)
-        os.fsync(file.fileno())
+        try:
+            rest = memoryview(data)
+            while rest:  # a disk that gets full takes a part first, without an error
+                rest = rest[file.write(rest) :]
+            os.fsync(file.fileno())
+        except OSError:
+            with suppress(OSError):  # what is kept next would make a fault of half a line
+                file.truncate(size)
+            raise
     if is_new:
         sync_folder(path.parent)
 

@@ -13,6 +13,7 @@ from flasher.errors import FlasherError
 from flasher.station.records import heads as heads_module
 from flasher.station.records.heads import Checkpoint, Fault, Head, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
+from tests.loops import each
 from tests.station.factory import Bench
 
 SEGMENT_BYTES = 1500
@@ -65,6 +66,29 @@ def test_a_full_segment_is_closed_and_another_one_goes_on(tmp_path: Path, key: S
     assert [each.segment for each in closed] == list(range(1, len(names)))
     assert file.last() == head(30)
     assert file.first() == head(1)
+
+
+@each("room", [0, 1, 100])
+def test_a_disk_that_gets_full_in_a_line_loses_no_head(
+    tmp_path: Path, key: SigningKey, room: int
+) -> None:
+    """The system writes the part for which there is room, and reports no error at first."""
+    resource = pytest.importorskip("resource")
+    folder = tmp_path / f"{room}"
+    folder.mkdir()
+    file = kept(folder, key, count=2)
+    size = file.path.stat().st_size
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size + room, before[1]))
+    try:
+        with pytest.raises(FlasherError):
+            file.append([head(3)], key)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert file.path.stat().st_size == size
+    file.append([head(3)], key)
+    assert heads_of(again(file)) == [1, 2, 3]
+    assert faults_of(again(file)) == []
 
 
 def test_only_the_last_segment_is_read_at_start_and_to_add(
