@@ -218,6 +218,11 @@ class StepEnded(Timed):
     text: str = ""
     target: str = ""
 
+    @property
+    def name(self) -> str:
+        """The name in the records: steps of one target name it, tries are counted by name."""
+        return f"{self.step.value} {self.target}".strip()
+
 
 @dataclass(frozen=True)
 class RunEnded(Timed):

@@ -25,6 +25,8 @@ from flasher.station.events import (
     OperatorPrompted,
     PinAwaited,
     PinEnded,
+    RunEnded,
+    RunStarted,
     ScanAccepted,
     ScanRefused,
     SocketChanged,
@@ -32,11 +34,11 @@ from flasher.station.events import (
     UnitArrived,
     UnitRemoved,
 )
-from flasher.station.messages import AdapterDown, PresenceChanged, Ready
+from flasher.station.messages import AdapterDown, PresenceChanged, Ready, RunResult
 from flasher.station.people import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
-from flasher.station.records.model import AuditEvent, RunState
+from flasher.station.records.model import AuditEvent, Order, RunState
 from flasher.station.scans import (
     Command,
     Label,
@@ -97,11 +99,6 @@ _CHANGED: Final = (
 
 
 @dataclass(frozen=True)
-class Claimed:
-    """The claim is in the records; the process of the socket works on the run."""
-
-
-@dataclass(frozen=True)
 class NotClaimed:
     """The records refused the claim. `code` is a stable word; `stops_line` stops the line."""
 
@@ -109,19 +106,6 @@ class NotClaimed:
     reason: str
     remedy: str
     stops_line: bool = False
-
-
-@dataclass(frozen=True)
-class Ended:
-    """The process reported the end of the run; the outcome is not on disk yet."""
-
-
-@dataclass(frozen=True)
-class Saved:
-    """The outcome of the run is on disk. `action` tells the operator what to do."""
-
-    outcome: RunState
-    action: str
 
 
 @dataclass(frozen=True)
@@ -133,19 +117,18 @@ class NotSaved:
 
 
 SocketInput = (
-    Ready | AdapterDown | PresenceChanged | Claimed | NotClaimed | Ended | Saved | NotSaved
+    Ready
+    | AdapterDown
+    | PresenceChanged
+    | RunStarted
+    | NotClaimed
+    | RunResult
+    | RunEnded
+    | NotSaved
 )
-
-
-@dataclass(frozen=True)
-class ClaimRun:
-    """Claim a run in the records; answered by `Claimed`, `NotClaimed` or `NotSaved`."""
-
-    socket: str
-    serial: str
-    operator: str
-    lot: str
-    reason: str
+"""`RunStarted`: the claim is in the records. `RunResult`: the process reported the end of the run,
+which is not on disk before `RunEnded`.
+"""
 
 
 @dataclass(frozen=True)
@@ -188,8 +171,10 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
-"""An event is to be published."""
+Effect = Order | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
+"""An order is to be claimed, and answered by `RunStarted`, `NotClaimed` or `NotSaved`; an event is
+to be published.
+"""
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -386,7 +371,7 @@ class Line:
             )
             self._tell(OperatorPrompted(socket.name, sentence, source=named.source.name))
 
-    def _claimed(self, socket: Socket, _what: Claimed, _now: float) -> None:
+    def _claimed(self, socket: Socket, _what: RunStarted, _now: float) -> None:
         socket.phase = Phase.RUN
         socket.last, socket.is_last_there, socket.note = None, False, ""
         for each in self.sockets.values():
@@ -405,7 +390,7 @@ class Line:
         socket.phase, socket.serial = Phase.REST, ""
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
-    def _ended(self, socket: Socket, _what: Ended, now: float) -> None:
+    def _ended(self, socket: Socket, _what: RunResult, now: float) -> None:
         socket.phase = Phase.SAVE
         socket.last, socket.is_last_there = LastRun(socket.serial), True
         # In the run it may have got its number: what is heard from now on counts.
@@ -413,7 +398,7 @@ class Line:
         if not socket.is_virtual and socket.sees_units:
             socket.occupancy = Occupancy.UNKNOWN
 
-    def _saved(self, socket: Socket, what: Saved, _now: float) -> None:
+    def _saved(self, socket: Socket, what: RunEnded, _now: float) -> None:
         socket.phase, socket.note, socket.serial = Phase.REST, "", ""
         if socket.last is not None:
             socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
@@ -869,7 +854,9 @@ class Line:
                 serial, socket.label, socket.begin_at_s = socket.label, "", None
                 socket.phase, socket.serial = Phase.CLAIM, serial
                 reason = self._reasons.get(serial, "")
-                self._effects.append(ClaimRun(socket.name, serial, self.operator, self.lot, reason))
+                whose, lot = self.operator, self.lot
+                order = Order(serial, socket.name, whose, lot, reason, socket.is_virtual)
+                self._effects.append(order)
         for socket in self.sockets.values():
             shown = socket.view(self.stopped, is_only=len(self.sockets) == 1)
             if socket.shown != shown and socket.phase is not Phase.CLAIM:
@@ -1010,20 +997,20 @@ class Line:
 
     _TABLE: ClassVar[Mapping[Phase, Mapping[type, Callable[..., None]]]] = {
         Phase.REST: {Ready: _ready, AdapterDown: _down, PresenceChanged: _unit},
-        Phase.CLAIM: {Claimed: _claimed, NotClaimed: _not_claimed, NotSaved: _claim_failed},
+        Phase.CLAIM: {RunStarted: _claimed, NotClaimed: _not_claimed, NotSaved: _claim_failed},
         Phase.RUN: {
             Ready: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
-            Ended: _ended,
+            RunResult: _ended,
         },
         Phase.SAVE: {
             Ready: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
-            Saved: _saved,
+            RunEnded: _saved,
         },
     }
     """Handlers by phase of the socket and type of the input."""

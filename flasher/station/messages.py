@@ -2,65 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import date
 from pathlib import Path
 from typing import Any, Protocol
 
 from flasher.errors import FlasherError
 from flasher.station.config import MockUnits
-from flasher.station.events import OperatorPrompted, Progressed, StepStarted
-from flasher.station.records.model import (
-    Measurement,
-    RunId,
-    RunKind,
-    RunState,
-    StepName,
-    StepState,
-    Verified,
-    WriteId,
-)
+from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
+from flasher.station.records.model import Claim, Measurement, RunState, Verified, WriteId
 
 # -- a run --------------------------------------------------------------------------------------
-
-Texts = Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class RunOrder:
-    """A claimed run. The `..._before` fields come from the records of the unit's earlier runs."""
-
-    run_id: RunId
-    kind: RunKind
-    serial: str
-    day: date
-    lot: str = ""
-    known_before: Texts = field(default_factory=dict)
-    """What must not change, as it was read first, by the name of its measurement."""
-    flashed_before: frozenset[str] = frozenset()
-    """Targets whose last flash, of this very image, was read back."""
-    written_before: Texts = field(default_factory=dict)
-    """What the unit's last PASS wrote, by target and item ("bms serial-number")."""
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """One try of a step, as it goes into the records."""
-
-    step: StepName
-    target: str
-    try_number: int
-    state: StepState
-    duration_s: float
-    code: str = ""
-    text: str = ""
-    measurements: tuple[Measurement, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The name in the records: steps of one target name it, tries are counted by name."""
-        return f"{self.step.value} {self.target}".strip()
 
 
 @dataclass(frozen=True)
@@ -72,6 +24,21 @@ class RunResult:
     text: str
     duration_s: float
     verified: Mapping[str, Verified] = field(default_factory=dict)
+    trace_sha256: str | None = None
+    """Of the closed trace (`packed`); None where it could not be written."""
+
+
+@dataclass(frozen=True)
+class Write:
+    """A write to a device, which is recorded before it is done, and again when it is."""
+
+    target: str
+    what: str
+    value: str
+    write_id: WriteId | None = None
+    """Once it is recorded."""
+    read_back: str | None = None
+    """None when nothing could be read back."""
 
 
 class JournalError(FlasherError):
@@ -81,18 +48,23 @@ class JournalError(FlasherError):
 class Journal(Protocol):
     """Records on disk when a method returns; each method raises JournalError when not."""
 
-    def intent(self, target: str, what: str, value: str) -> WriteId:
+    def intent(self, target: str, what: str, value: str) -> Write:
         """Before a write to the device."""
 
-    def verified(self, write_id: WriteId, read_back: str | None) -> None:
+    def verified(self, write: Write, read_back: str | None) -> None:
         """After it; `read_back` is None when nothing could be read back."""
 
-    def step(self, report: StepReport) -> None:
+    def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
         """A try of a step ended."""
 
 
+def packed(trace: Path) -> Path:
+    """Where the closed trace of a run is."""
+    return trace.with_name(f"{trace.name}.gz")
+
+
 def write_key(target: str, item: str) -> str:
-    """The name of something written, as `RunOrder.written_before` has it."""
+    """The name of something written, as `Claim.written_before` has it."""
     return f"{target} {item}"
 
 
@@ -139,18 +111,6 @@ class WorkerSetup:
 
 
 @dataclass(frozen=True)
-class Begin:
-    """Run this unit; the trace goes to `trace`."""
-
-    order: RunOrder
-    trace: Path
-    presence: int = 0
-    """The number of the last change of presence that the station knows: the label was given to
-    the unit of which that is true.
-    """
-
-
-@dataclass(frozen=True)
 class Reply:
     """The answer to an `Ask`. `error` is empty when it is on disk."""
 
@@ -169,7 +129,7 @@ class Quit:
     """End; a run that goes on is stopped first."""
 
 
-ToWorker = Begin | Reply | Abort | Quit
+ToWorker = Claim | Reply | Abort | Quit
 
 # -- from the process -----------------------------------------------------------------------------
 
@@ -221,45 +181,13 @@ class PresenceChanged:
 
 
 @dataclass(frozen=True)
-class Intent:
-    """Record a write before it is done."""
-
-    target: str
-    what: str
-    value: str
-
-
-@dataclass(frozen=True)
-class Done:
-    """Record that it is done."""
-
-    write_id: WriteId
-    read_back: str | None
-
-
-@dataclass(frozen=True)
 class Ask:
     """Save this and reply; the process waits for the reply."""
 
     number: int
-    what: Intent | Done | StepReport
-
-
-@dataclass(frozen=True)
-class TraceFile:
-    """The closed trace of a run."""
-
-    path: Path
-    sha256: str
-
-
-@dataclass(frozen=True)
-class Finished:
-    """The run has ended; the outcome is not on disk yet."""
-
-    result: RunResult
-    trace: TraceFile | None
-    """None when it could not be written."""
+    what: Write | StepEnded
+    measurements: tuple[Measurement, ...] = ()
+    """Of a step."""
 
 
 @dataclass(frozen=True)
@@ -271,4 +199,4 @@ class CannotWork:
 
 RunEvent = StepStarted | Progressed | OperatorPrompted
 """Progress of a run, for display only. The station adds the socket."""
-FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | Finished | CannotWork
+FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork

@@ -38,8 +38,6 @@ PROBE_S: Final = 0.5
 """How often a unit is asked whether it is there."""
 PAUSE_S: Final = 0.25
 """Announcements of one power-up follow each other sooner."""
-_START_S: Final = 1.0
-"""All targets of a unit announce themselves within this time after the first one."""
 _RHYTHM_S: Final = 1.0
 """Pauses of a bootloader that goes on announcing come again within this time."""
 _ALIKE: Final = 1.5
@@ -76,10 +74,6 @@ class TargetWatcher:
         """Of its bootloader, as announced last, escaped."""
         self.heard_at: float | None = None
         """When the device last said anything."""
-        self.known_at: float | None = None
-        """When its bootloader last ended a message, or its application sent anything: a part of a
-        message may be of an announcement, which says more when it is whole.
-        """
         self.announced_at: float | None = None
         self.transfer_requests = 0
         """Of its bootloader."""
@@ -117,12 +111,10 @@ class TargetWatcher:
         if frame.can_id in self._own_ids:
             self.heard_at = now
             if frame.can_id != self._boot.can_id:
-                self.known_at = now
                 self._hear_application()
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
                 if isinstance(found, Message):
-                    self.known_at = now
                     self._hear_bootloader(found, now)
         if self._answers is not None and frame.can_id == self._answers.can_id:
             for found in self._answers.feed(frame.data, now):
@@ -161,8 +153,6 @@ class TargetWatcher:
         self._missed_s += missed_s
         if self.heard_at is not None:
             self.heard_at += missed_s
-        if self.known_at is not None:
-            self.known_at += missed_s
 
     def _announced(self, now: float) -> None:
         pause_s = float("inf")
@@ -225,12 +215,16 @@ class Presence:
         """True when a unit that is there can be asked."""
         return bool(self._requests)
 
+    @property
+    def _power_ups(self) -> int:
+        return sum(watcher.power_ups for watcher in self.watchers)
+
     def _is_in_bootloader(self, now: float) -> bool:
         """True when nothing is heard but announcements."""
         return all(
             watcher.is_in_bootloader
             for watcher in self.watchers
-            if watcher.known_at is not None and now - watcher.known_at < SILENCE_S
+            if watcher.heard_at is not None and now - watcher.heard_at < SILENCE_S
         )
 
     def begin(self) -> None:
@@ -250,15 +244,14 @@ class Presence:
         self.watchers = [TargetWatcher(each) for each in self._targets]
         """One for each target: what was heard of the unit that is there."""
         self._told_serial: str | None = None
-        self._told_power_ups: list[int] = [0] * len(self.watchers)
-        self._powered_up_at: float = float("-inf")
+        self._told_power_ups = 0
         self._was_missed = False
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
-            if watcher.known_at == now:
+            if watcher.heard_at == now:
                 self._heard_at = now
 
     def miss(self, missed_s: float) -> None:
@@ -269,21 +262,6 @@ class Presence:
             watcher.miss(missed_s)
         if self._heard_at is not None:
             self._heard_at += missed_s
-
-    def _powers_up(self, now: float) -> bool:
-        """True when its power came since the last change. The targets of a unit announce themselves
-        one after another: the first announcement of each further one is of the same start.
-        """
-        found = [watcher.power_ups for watcher in self.watchers]
-        told, self._told_power_ups = self._told_power_ups, found
-        is_start = now - self._powered_up_at < _START_S
-        powers_up = any(
-            count > before and not (is_start and before == 0)
-            for count, before in zip(found, told, strict=True)
-        )
-        if powers_up:
-            self._powered_up_at = now
-        return powers_up
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""
@@ -304,7 +282,7 @@ class Presence:
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not heard:
             return None
-        is_power_up = heard and self._powers_up(now)
+        is_power_up = heard and self._power_ups > self._told_power_ups
         in_bootloader = heard and self._is_in_bootloader(now)
         # What the unit says that it is; None before it has said anything.
         said = [each.serial for each in self.watchers if each.serial is not None]
@@ -320,6 +298,7 @@ class Presence:
         if self.is_there and was_missed:
             self.missed_number = self._number
         self.is_there, self._told_in_bootloader = heard, in_bootloader
+        self._told_power_ups = self._power_ups
         if not heard:
             self._forget_unit()
             return PresenceChanged(is_there=False, number=self._number)

@@ -16,16 +16,16 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final
 
+from flasher.api import prepare
 from flasher.errors import Fault, FlasherError, UsageError
 from flasher.files import TOML_MAX_SIZE, opened, read
-from flasher.host.identity import judge_bytes
+from flasher.host.identity import IdentityCheck
 from flasher.host.items import Readable, find_item, meaningful_fields, readable
 from flasher.host.query import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
-from flasher.image.plan import plan
-from flasher.image.release import Release, check_target
+from flasher.image.release import Release
 from flasher.protocol.fields import Codec, NumberField
 from flasher.protocol.spec import Target
 from flasher.settings.manifest import manifest_path, read_release
@@ -218,6 +218,11 @@ def _load_target(
 
 # -- checks ---------------------------------------------------------------------------------------
 
+_REMEDIES: Final = {
+    IdentityCheck.PLAUSIBLE: "Name the firmware file itself.",
+    IdentityCheck.TARGET: "Choose the image for this target, or the target that it was built for.",
+}
+
 
 def _check_target(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iterator[Fault]:
     if target.firmware.sha256 != target.image.sha256:
@@ -227,18 +232,12 @@ def _check_target(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Ite
             "Take the image that the recipe was released with, or release a new recipe.",
         )
     try:
-        target.release.check_bytes(target.image)
-        check_target(target.image, target.release, target.target)
         identity = target.profile.identity(release=target.release)
-        for found in judge_bytes(target.image, identity):
+        for found in prepare(target.image, target.profile, identity=identity).checks:
             if found.ending is not None:
-                yield Fault(where, f"{found.text}.", "Name the firmware file itself.")
-        target.profile.check_fits(target.image)
-        plan(target.image, target.target, target.profile.dialect.bitrate_bps)
+                yield Fault(where, f"{found.text}.", _REMEDIES.get(found.check, ""))
     except FlasherError as error:
         yield Fault(where, error.what, error.remedy)
-    if not target.profile.has_upgrade:
-        yield Fault(where, "its profile has no upgrade (has_upgrade).")
     yield from _check_level(loaded, target, where)
 
 

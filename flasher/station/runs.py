@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
-from flasher.station.messages import Finished, RunOrder, RunResult, flash_value, write_key
+from flasher.station.messages import RunResult, flash_value, packed, write_key
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
@@ -22,6 +21,7 @@ from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
     AttachmentFile,
+    Claim,
     Ending,
     RunDetails,
     RunState,
@@ -38,14 +38,13 @@ from flasher.station.unit_checks import BEFORE
 class ActiveRun:
     """A claimed run whose outcome is not saved yet."""
 
-    trace: Path
+    claim: Claim
     begun_s: float
-    order: RunOrder
     where: str = StepName.CONNECT.value
     """The step that goes on, with its target."""
     journal_error: str = ""
     """Something of it could not be saved: it cannot pass any more."""
-    finished: Finished | None = None
+    reported: RunResult | None = None
     """Its end, once the process said it."""
     ended_s: float = 0.0
     attached: list[AttachmentFile] = field(default_factory=list)
@@ -63,22 +62,22 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
     if not run.is_save_noted:
         duration_s = max(0.0, now_s() - run.ended_s)
         state = StepState.ERROR if run.result.code == codes.TRACE_NOT_SAVED.name else StepState.PASS
-        store.step(run.order.run_id, StepName.SAVE.value, state, duration_s=duration_s)
+        store.step(run.claim.run_id, StepName.SAVE.value, state, duration_s=duration_s)
         run.is_save_noted = True
     try:
-        store.finish(run.order.run_id, _ending(run, run.result))
+        store.finish(run.claim.run_id, _ending(run, run.result))
     except RuleBrokenError as error:
         # The records know better: it is no PASS. That is a bug, and the unit is not judged.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
-        store.finish(run.order.run_id, _ending(run, run.result))
-    store.files.forget_spooled(run.order.run_id)
+        store.finish(run.claim.run_id, _ending(run, run.result))
+    store.files.forget_spooled(run.claim.run_id)
     return run.result
 
 
 def _judged(run: ActiveRun) -> RunResult:
-    if run.finished is None:
+    result = run.reported
+    if result is None:
         raise ValueError("a run that has not ended cannot be saved")
-    result = run.finished.result
     if run.journal_error and result.outcome is not RunState.ABORTED:
         return _worse(result, codes.RECORD_NOT_SAVED, run.journal_error)
     return result
@@ -86,16 +85,16 @@ def _judged(run: ActiveRun) -> RunResult:
 
 def _attach(store: Store, run: ActiveRun) -> None:
     """Store the trace, and check that it is the one that the process closed."""
-    trace = run.finished.trace if run.finished is not None else None
-    if trace is None:
-        if run.trace.exists():
+    trace, closed = run.claim.trace, run.reported and run.reported.trace_sha256
+    if closed is None:
+        if trace.exists():
             with suppress(FileNotFoundError):
-                run.attached = [store.files.add(TORN_TRACE, run.trace)]
+                run.attached = [store.files.add(TORN_TRACE, trace)]
         if run.result is not None and run.result.outcome is RunState.PASS:
             run.result = _worse(run.result, codes.TRACE_NOT_SAVED, "There is no trace of the bus.")
         return
-    file = store.files.add(TRACE, trace.path)
-    if file.sha256 != trace.sha256 and run.result is not None:
+    file = store.files.add(TRACE, packed(trace))
+    if file.sha256 != closed and run.result is not None:
         words = "The trace on disk is not the one that was written."
         run.result = _worse(run.result, codes.TRACE_NOT_SAVED, words)
     run.attached = [file]
@@ -129,9 +128,9 @@ _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED
 
 
 def with_history(
-    order: RunOrder, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
-) -> RunOrder:
-    """The order with what the unit's runs before mean for it. A verdict ends a story: what came
+    claim: Claim, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
+) -> Claim:
+    """The claim with what the unit's runs before mean for it. A verdict ends a story: what came
     before the last PASS or FAIL is not the state in which this run finds the unit; nor is a flash
     before a run in which the unit may have become another one. But what must
     not change is held until a PASS: a run that failed after its first write may be what changed it.
@@ -144,7 +143,7 @@ def with_history(
     passed = next((run for run in reversed(runs) if run.run.state is RunState.PASS), None)
     written = passed.writes if passed is not None else ()
     return replace(
-        order,
+        claim,
         known_before=_known(still_open if is_reworked else unfinished),
         flashed_before=_flashed(of_this_unit, recipe),
         written_before={

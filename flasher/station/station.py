@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -49,33 +49,31 @@ from flasher.station.messages import (
     Abort,
     AdapterDown,
     Ask,
-    Begin,
-    Done,
-    Finished,
     FromWorker,
-    Intent,
     PresenceChanged,
     Ready,
     Reply,
-    RunOrder,
     RunResult,
-    StepReport,
     WorkerSetup,
+    Write,
 )
 from flasher.station.people import Crew
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.claims import Order
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
     AuditEvent,
+    Claim,
     Clock,
     Figures,
+    Measurement,
+    Order,
     RunFilter,
     RunId,
     RunKind,
     RunRecord,
     RunState,
     UnitLife,
+    WriteId,
 )
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
@@ -335,9 +333,11 @@ class Station:
         while effects := self.line.take():
             for effect in effects:
                 match effect:
-                    case line.ClaimRun():
-                        self.line.feed(effect.socket, self._claim(effect), self._now)
-                        self._begin(effect.socket)
+                    case Order(_, socket):
+                        claimed = self._claim(effect)
+                        self.line.feed(socket, claimed, self._now)
+                        if isinstance(claimed, RunStarted):
+                            self._begin(claimed)
                     case line.AbortRun(socket):
                         self.supervisor.send(socket, Abort())
                     case line.SaveAgain(sockets):
@@ -358,13 +358,13 @@ class Station:
         match message:
             case Ready() | AdapterDown() | PresenceChanged():
                 self._feed(socket, message)
-            case Ask(number, what):
-                self._answer(socket, number, what)
+            case Ask():
+                self._answer(socket, message)
             case StepStarted() | Progressed() | OperatorPrompted() if socket in self._runs:
                 if isinstance(message, StepStarted):
                     self._runs[socket].where = f"{message.step.value} {message.target}".strip()
                 self.tell(replace(message, socket=socket))
-            case Finished():
+            case RunResult():
                 self.supervisor.worked(socket)
                 self._end(socket, message)
             case WorkerLost(reason, hung, restart_in_s):
@@ -397,7 +397,7 @@ class Station:
 
     def _end_unknown(self) -> bool:
         """End runs whose claim was saved although it seemed lost; False when that is not saved."""
-        known = {run.order.run_id for run in self._runs.values()}
+        known = {run.claim.run_id for run in self._runs.values()}
         try:
             self._find_interrupted(self.store.end_unknown(known))
         except RecordError as error:
@@ -418,101 +418,91 @@ class Station:
 
     # -- beginning --------------------------------------------------------------------------------
 
-    def _claim(self, order: line.ClaimRun) -> line.SocketInput:
+    def _claim(self, order: Order) -> line.SocketInput:
         """Claim the run in the records."""
-        socket = self.line.sockets[order.socket]
+        socket = order.socket
         try:
             life = self._life(order.serial)
-            claim = self.store.claim(
-                Order(
-                    order.serial,
-                    order.socket,
-                    self.recipe,
-                    order.operator,
-                    order.lot,
-                    order.reason,
-                    socket.is_virtual,
-                )
-            )
+            claim = self.store.claim(order, self.recipe)
         except ClaimRefusedError as error:
             is_changed = error.refusal is Refusal.RECIPE_CHANGED
             return line.NotClaimed(error.refusal.value, error.what, error.remedy, is_changed)
         except RecordError as error:
-            return self._not_saved(order.socket, order.serial, None, error)
-        day = self.clock.utc().astimezone().date()
-        run_order = RunOrder(claim.run_id, claim.kind, claim.serial, day, order.lot)
-        run_order = with_history(run_order, life, self.recipe, is_reworked=bool(order.reason))
+            return self._not_saved(socket, order.serial, None, error)
+        claim = with_history(claim, life, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
-        self._runs[order.socket] = ActiveRun(trace, self._now, order=run_order)
-        return line.Claimed()
+        number = self.line.sockets[socket].presence_number
+        claim = replace(claim, trace=trace, presence=number)
+        self._runs[socket] = ActiveRun(claim, self._now)
+        return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
         """What was done to a unit of this recipe's part. Raises RecordError."""
         lives, part = self.store.read.units(serial), self.recipe.recipe.part
         return next((life for life in lives if life.part == part), None)
 
-    def _begin(self, socket: str) -> None:
-        """Let the process of a socket work on what was claimed, if anything was."""
-        run = self._going(socket)
-        if run is None:
-            return
-        order, at = run.order, self.line.sockets[socket]
-        self.tell(RunStarted(socket, order.serial, order.run_id, order.kind, at.is_virtual))
-        if not self.supervisor.send(socket, Begin(order, run.trace, at.presence_number)):
+    def _begin(self, started: RunStarted) -> None:
+        """Let the process of a socket work on what was claimed."""
+        self.tell(started)
+        socket = started.socket
+        if not self.supervisor.send(socket, self._runs[socket].claim):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
     def _going(self, socket: str) -> ActiveRun | None:
         """The run of a socket, until its process has said its end."""
         run = self._runs.get(socket)
-        return run if run is not None and run.finished is None else None
+        return run if run is not None and run.reported is None else None
 
     # -- while a run goes on ----------------------------------------------------------------------
 
-    def _answer(self, socket: str, number: int, what: Intent | Done | StepReport) -> None:
+    def _answer(self, socket: str, asked: Ask) -> None:
         """Save something for the process, then reply."""
-        run = self._going(socket)
+        run, number = self._going(socket), asked.number
         if run is None:
             reply = Reply(number, error="The run is not one of this station.")
             self.supervisor.send(socket, reply)
             return
-        write_id, order = None, run.order
+        write_id, claim = None, run.claim
         try:
-            match what:
-                case Intent():
-                    write_id = self.store.intent(order.run_id, what.target, what.what, what.value)
-                case Done():
-                    self.store.verified(what.write_id, what.read_back)
-                case StepReport():
-                    self._save_step(socket, order, what)
+            match asked.what:
+                case Write(write_id=None) as write:
+                    write_id = self.store.intent(
+                        claim.run_id, write.target, write.what, write.value
+                    )
+                case Write(write_id=int() as done) as write:
+                    self.store.verified(WriteId(done), write.read_back)
+                case StepEnded() as step:
+                    self._save_step(socket, claim, step, asked.measurements)
         except RecordError as error:
             run.journal_error = _said(error)
-            self._feed(socket, self._not_saved(socket, order.serial, order.run_id, error))
+            self._feed(socket, self._not_saved(socket, claim.serial, claim.run_id, error))
             self.supervisor.send(socket, Reply(number, error=error.what))
         else:
             self.supervisor.send(socket, Reply(number, write_id))
 
-    def _save_step(self, socket: str, order: RunOrder, report: StepReport) -> None:
+    def _save_step(
+        self, socket: str, claim: Claim, step: StepEnded, measurements: Sequence[Measurement]
+    ) -> None:
         self.store.step(
-            order.run_id,
-            report.name,
-            report.state,
-            duration_s=report.duration_s,
-            code=report.code,
-            text=report.text,
-            measurements=report.measurements,
+            claim.run_id,
+            step.name,
+            step.state,
+            duration_s=step.duration_s,
+            code=step.code,
+            text=step.text,
+            measurements=measurements,
         )
-        told = {name: value for name, value in vars(report).items() if name != "measurements"}
-        self.tell(StepEnded(socket, order.serial, **told))
+        self.tell(replace(step, socket=socket, serial=claim.serial))
 
     # -- its end ----------------------------------------------------------------------------------
 
-    def _end(self, socket: str, finished: Finished) -> None:
+    def _end(self, socket: str, result: RunResult) -> None:
         """The run has ended: save the outcome, then publish it."""
         run = self._going(socket)
         if run is None:
             return
-        run.finished, run.ended_s = finished, self._now
-        self._feed(socket, line.Ended())
+        run.reported, run.ended_s = result, self._now
+        self._feed(socket, result)
         self._save(socket)
         self._carry_out()
 
@@ -523,53 +513,52 @@ class Station:
             return
         code = codes.PROCESS_HUNG if hung else codes.PROCESS_DIED
         text, duration_s = f"In {run.where}: {reason}.", self._now - run.begun_s
-        self._end(socket, Finished(RunResult(code.outcome, code.name, text, duration_s), None))
+        self._end(socket, RunResult(code.outcome, code.name, text, duration_s))
 
     def _save(self, socket: str) -> bool:
         """Save the outcome of a run and publish it; False when it is not saved."""
         run = self._runs[socket]
-        order = run.order
+        claim = run.claim
         try:
             result = save(self.store, run, self.clock.monotonic_s)
         except RecordError as error:
-            not_saved = self._not_saved(socket, order.serial, order.run_id, error)
+            not_saved = self._not_saved(socket, claim.serial, claim.run_id, error)
             self.line.feed(socket, not_saved, self._now)
             return False
         del self._runs[socket]
         code = CODES[result.code]
         text = verified_words(result) if result.outcome is RunState.PASS else result.text
-        self.tell(
-            RunEnded(
-                socket,
-                order.serial,
-                order.run_id,
-                order.kind,
-                result.outcome,
-                code.name,
-                text,
-                code.action,
-                max(result.duration_s, run.ended_s - run.begun_s),
-                tuple(result.verified.items()),
-                self.line.sockets[socket].is_virtual,
-            )
+        ended = RunEnded(
+            socket,
+            claim.serial,
+            claim.run_id,
+            claim.kind,
+            result.outcome,
+            code.name,
+            text,
+            code.action,
+            max(result.duration_s, run.ended_s - run.begun_s),
+            tuple(result.verified.items()),
+            self.line.sockets[socket].is_virtual,
         )
-        self.line.feed(socket, line.Saved(result.outcome, code.action), self._now)
+        self.tell(ended)
+        self.line.feed(socket, ended, self._now)
         with suppress(RecordError):
             self.tell(FiguresChanged(self.figures))
         if result.outcome is RunState.PASS:
-            self._print(socket, order)
+            self._print(socket, claim)
         return True
 
     # -- labels: nothing of them touches a verdict ------------------------------------------------
 
-    def _print(self, socket: str, order: RunOrder) -> None:
+    def _print(self, socket: str, claim: Claim) -> None:
         """Print the label of a unit whose PASS is on disk."""
         if self._labels is None or not self._labels.prints_each:
             return
         try:
-            run = self.store.read.run(order.run_id).run
+            run = self.store.read.run(claim.run_id).run
         except RecordError as error:
-            self._label_failed(socket, order.serial, _said(error))
+            self._label_failed(socket, claim.serial, _said(error))
             return
         if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
             self._labels.submit(self._label(socket, run))

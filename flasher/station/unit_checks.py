@@ -14,10 +14,10 @@ from flasher.host.items import Readable
 from flasher.host.write import WritePlan, field_changes
 from flasher.station import codes
 from flasher.station.codes import Code
-from flasher.station.messages import RunOrder, write_key
+from flasher.station.messages import write_key
 from flasher.station.recipe import Limit, Scan, fill
 from flasher.station.recipe_file import LoadedRecipe, codec_of, readable_of
-from flasher.station.records.model import Measurement, RunKind, StepName
+from flasher.station.records.model import Claim, Measurement, RunKind, StepName
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 NOT_IDENTIFIED: Final = "not identified before flashing"
@@ -86,9 +86,9 @@ class UnitReads:
     """What one run reads of its unit."""
 
     def __init__(
-        self, order: RunOrder, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
+        self, claim: Claim, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
     ) -> None:
-        self._order = order
+        self._claim = claim
         self._recipe = recipe
         self._scan = scan
         self._targets = {target.name: target for target in targets}
@@ -121,7 +121,7 @@ class UnitReads:
         """Read what must not change, and remember it. What an interrupted run of this unit read
         first holds before what is read now; a device that has no application cannot be asked.
         """
-        known = self._order.known_before
+        known = self._claim.known_before
         for target, readable in self._unchanged():
             if target in askable:
                 now = self._texts(target, readable)
@@ -172,9 +172,9 @@ class UnitReads:
             wanted = [name for name, _ in type(plan.content).LAYOUT if name in fields]
             found = ", ".join(fields[name][1] for name in wanted)
             expected = wanted_text(plan)
-            if self._order.kind is RunKind.VERIFY_ONLY:
+            if self._claim.kind is RunKind.VERIFY_ONLY:
                 # Made on another day, perhaps: what it was given then is what it must have.
-                expected = self._order.written_before.get(key, expected)
+                expected = self._claim.written_before.get(key, expected)
             measured.append(Measurement(key, text=found, expected=expected))
             if found != expected:
                 raise StepFailedError(

@@ -23,20 +23,13 @@ from flasher.errors import (
 )
 from flasher.station import codes
 from flasher.station.continuity import Continuity
-from flasher.station.events import OperatorPrompted, Progressed, StepStarted
-from flasher.station.messages import (
-    Journal,
-    JournalError,
-    RunEvent,
-    RunOrder,
-    RunResult,
-    StepReport,
-)
+from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
+from flasher.station.messages import Journal, JournalError, RunEvent, RunResult
 from flasher.station.power import PowerControl
 from flasher.station.presence import BLIND_S, TargetWatcher
 from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Measurement, RunState, StepName, StepState
+from flasher.station.records.model import Claim, Measurement, RunState, StepName, StepState
 from flasher.station.unit_steps import Act, UnitSteps
 from flasher.station.unit_target import StepFailedError, UnitTarget
 
@@ -81,7 +74,7 @@ class UnitRun:
 
     def __init__(  # noqa: PLR0913  what a run is made of
         self,
-        order: RunOrder,
+        claim: Claim,
         recipe: LoadedRecipe,
         connection: Connection,
         journal: Journal,
@@ -95,7 +88,7 @@ class UnitRun:
         was_missed: bool = False,
         was_silent: bool = False,
     ) -> None:
-        self._order = order
+        self._claim = claim
         self._recipe = recipe
         self._connection = connection
         self._clock = connection.clock
@@ -169,7 +162,7 @@ class UnitRun:
             ]
             self._hear_waiting = targets[0].hear_waiting
             return UnitSteps(
-                self._order,
+                self._claim,
                 self._recipe,
                 targets,
                 self._journal,
@@ -186,7 +179,10 @@ class UnitRun:
         """Try a step as often as the recipe says. Raises StepFailedError."""
         rule = self._recipe.recipe.rule(step)
         if act is None:
-            self._journal.step(StepReport(step, target, 1, StepState.SKIPPED, 0.0))
+            serial = self._claim.serial
+            self._journal.step(
+                StepEnded("", serial, step, 1, StepState.SKIPPED, 0.0, target=target)
+            )
             return
         self._step = step, target
         for try_number in range(1, rule.tries + 1):
@@ -208,7 +204,7 @@ class UnitRun:
         began_at = self._step_began_at = self._clock.now()
         self._told_at = float("-inf")
         self._step_ends_at = None if limit_s is None else began_at + limit_s
-        self._tell(StepStarted("", self._order.serial, step, try_number, target))
+        self._tell(StepStarted("", self._claim.serial, step, try_number, target))
         measured: list[Measurement] = []
         failed, text = None, ""
         try:
@@ -244,11 +240,10 @@ class UnitRun:
         state, code_name = StepState.PASS, ""
         if failed is not None:
             state, code_name, text = _STATES[failed.code.outcome], failed.code.name, failed.text
-        self._journal.step(
-            StepReport(
-                step, target, try_number, state, duration_s, code_name, text, tuple(measured)
-            )
+        ended = StepEnded(
+            "", self._claim.serial, step, try_number, state, duration_s, code_name, text, target
         )
+        self._journal.step(ended, measured)
         return failed
 
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
@@ -312,4 +307,4 @@ class UnitRun:
         passed_s = now - self._step_began_at
         left_s = passed_s / share * (1 - share) if share > 0 else None
         step, target = self._step
-        self._tell(Progressed("", self._order.serial, step, share, left_s, target))
+        self._tell(Progressed("", self._claim.serial, step, share, left_s, target))

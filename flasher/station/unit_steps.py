@@ -23,7 +23,7 @@ from flasher.host.write import WritePlan
 from flasher.i18n import text
 from flasher.protocol.fields import Content
 from flasher.station import codes
-from flasher.station.messages import Journal, RunOrder, flash_value, write_key
+from flasher.station.messages import Journal, flash_value, write_key
 from flasher.station.power import PowerControl
 from flasher.station.presence import PROBE_S
 from flasher.station.recipe import AfterRestart
@@ -34,6 +34,7 @@ from flasher.station.records.model import (
     FLASH,
     POWER_CYCLES,
     SERIAL_NUMBER,
+    Claim,
     Measurement,
     RunKind,
     StepName,
@@ -68,7 +69,7 @@ class UnitSteps:
 
     def __init__(
         self,
-        order: RunOrder,
+        claim: Claim,
         recipe: LoadedRecipe,
         targets: Sequence[UnitTarget],
         journal: Journal,
@@ -81,8 +82,8 @@ class UnitSteps:
         """How far each target was verified in this run."""
         self.left_behind = ""
         """The state that a device would be left in now, where that matters."""
-        self._order = order
-        self._is_verify_only = order.kind is RunKind.VERIFY_ONLY
+        self._claim = claim
+        self._is_verify_only = claim.kind is RunKind.VERIFY_ONLY
         self._recipe = recipe
         self._journal = journal
         self._power = power
@@ -91,10 +92,10 @@ class UnitSteps:
         self._identified: dict[str, Identified] = {}
         self._flashed: set[str] = set()
         """Targets that confirmed the complete image in this run."""
-        scan = recipe.scan(order.serial, order.day, order.lot)
+        scan = recipe.scan(claim.serial, claim.day, claim.lot)
         self._plans = [recipe.write_plan(write, scan) for write in recipe.recipe.write]
         self._written: set[str] = set()
-        self._reads = UnitReads(order, recipe, scan, targets)
+        self._reads = UnitReads(claim, recipe, scan, targets)
 
     def acts(self) -> Sequence[tuple[StepName, str, Act | None]]:
         """Every step in order, with its target where it has one of its own; None: not needed."""
@@ -158,7 +159,7 @@ class UnitSteps:
             if is_known and found.seen.version is None:
                 raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
             may_await_power = self._power is not None or target.goes_on
-            is_rescue = self._order.kind is RunKind.RECHECK and may_await_power
+            is_rescue = self._claim.kind is RunKind.RECHECK and may_await_power
             if target.is_silent(found) and not is_rescue:
                 raise StepFailedError(
                     codes.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
@@ -180,7 +181,7 @@ class UnitSteps:
         """
         for found in self._identified.values():
             own = found.serial_number
-            if own in ("", self._order.serial):
+            if own in ("", self._claim.serial):
                 continue
             try:
                 self._recipe.recipe.serial_number.read(own)
@@ -189,7 +190,7 @@ class UnitSteps:
                     continue  # it gets its number in this run
             raise StepFailedError(
                 codes.WRONG_UNIT,
-                f"The unit says that it is {own!a:.40}, the label says {self._order.serial!a:.40}.",
+                f"The unit says that it is {own!a:.40}, the label says {self._claim.serial!a:.40}.",
             )
 
     def _check(self, measured: list[Measurement]) -> str:
@@ -221,7 +222,7 @@ class UnitSteps:
         check_texts(firmware.hardware_versions, seen.hardware_version, codes.WRONG_HARDWARE)
         # Who failed after its flash runs the new version already.
         is_new = seen.firmware_version == loaded.version
-        if self._order.kind is RunKind.PRODUCTION and not is_new:
+        if self._claim.kind is RunKind.PRODUCTION and not is_new:
             check_texts(firmware.previous_versions, seen.firmware_version, codes.OLD_VERSION)
         return findings
 
@@ -234,9 +235,9 @@ class UnitSteps:
         name, found = target.name, self._identified[target.name]
         if (
             # An interrupted run had flashed it, and the device says the same: both have to agree.
-            self._order.kind is RunKind.RECHECK
+            self._claim.kind is RunKind.RECHECK
             and target.version_request is not None
-            and name in self._order.flashed_before
+            and name in self._claim.flashed_before
             and found.seen.firmware_version == target.loaded.version
         ):
             return "flashed before the interruption, and the device names the version"

@@ -17,8 +17,9 @@ import hashlib
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -29,17 +30,14 @@ from flasher.files import make_private
 from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes
+from flasher.station.events import StepEnded
 from flasher.station.messages import (
     Abort,
     AdapterDown,
     Ask,
     Beat,
-    Begin,
     CannotWork,
-    Done,
-    Finished,
     FromWorker,
-    Intent,
     JournalError,
     PresenceChanged,
     Quit,
@@ -47,15 +45,15 @@ from flasher.station.messages import (
     Reply,
     RunEvent,
     RunResult,
-    StepReport,
     ToWorker,
-    TraceFile,
     WorkerSetup,
+    Write,
+    packed,
 )
 from flasher.station.power import PowerCommand, PowerControl
 from flasher.station.presence import BLIND_S, Presence
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
-from flasher.station.records.model import RunState, WriteId
+from flasher.station.records.model import Claim, Measurement, RunState
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
@@ -97,7 +95,7 @@ class StationPipe:
         self._asked = 0
         self._looked_at = float("-inf")
         self._beat_at = float("-inf")
-        self._begin: Begin | None = None
+        self._claim: Claim | None = None
         self._replies: dict[int, Reply] = {}
         self.meanwhile: Callable[[], None] = lambda: None
         """Called again and again while it waits for the station."""
@@ -146,31 +144,32 @@ class StationPipe:
             self.look()
         return self.is_aborted or self.is_over
 
-    def take_begin(self) -> Begin | None:
-        """The order to run a unit, once."""
-        begin, self._begin = self._begin, None
-        if begin is not None:
+    def take_claim(self) -> Claim | None:
+        """The run to be made, once."""
+        claim, self._claim = self._claim, None
+        if claim is not None:
             self.is_aborted = False
-        return begin
+        return claim
 
     # -- the `Journal` of a run, which the station writes ------------------------------------------
 
-    def intent(self, target: str, what: str, value: str) -> WriteId:
-        write_id = self._ask(Intent(target, what, value)).write_id
+    def intent(self, target: str, what: str, value: str) -> Write:
+        write = Write(target, what, value)
+        write_id = self._ask(write).write_id
         if write_id is None:
             raise JournalError("The station did not say what it saved.")
-        return write_id
+        return replace(write, write_id=write_id)
 
-    def verified(self, write_id: WriteId, read_back: str | None) -> None:
-        self._ask(Done(write_id, read_back))
+    def verified(self, write: Write, read_back: str | None) -> None:
+        self._ask(replace(write, read_back=read_back))
 
-    def step(self, report: StepReport) -> None:
-        self._ask(report)
+    def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
+        self._ask(ended, measurements)
 
-    def _ask(self, what: Intent | Done | StepReport) -> Reply:
+    def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> Reply:
         """Wait until it is saved. Raises StationGoneError; JournalError when it is not."""
         self._asked += 1
-        self.send(Ask(self._asked, what))
+        self.send(Ask(self._asked, what, tuple(measurements)))
         give_up_at = self._now() + REPLY_LIMIT_S
         while self._asked not in self._replies:
             if self.is_gone:
@@ -186,8 +185,8 @@ class StationPipe:
 
     def _take(self, message: ToWorker) -> None:
         match message:
-            case Begin():
-                self._begin = message
+            case Claim():
+                self._claim = message
             case Reply():
                 self._replies[message.number] = message
             case Abort():
@@ -228,9 +227,9 @@ class Worker:
             self._pipe.send(PresenceChanged(is_there=False, is_certain=True))
         while not self._pipe.is_over:
             self._pipe.look()
-            begin = self._pipe.take_begin()
-            if begin is not None:
-                self._run(begin)
+            claim = self._pipe.take_claim()
+            if claim is not None:
+                self._run(claim)
             else:
                 self._watch()
 
@@ -294,10 +293,10 @@ class Worker:
 
     # -- a run ------------------------------------------------------------------------------------
 
-    def _run(self, begin: Begin) -> None:
+    def _run(self, claim: Claim) -> None:
         recorder: Recorder | None = None
         try:
-            with Recorder(begin.trace) as recorder:
+            with Recorder(claim.trace) as recorder:
                 recorder.channel = self._connection.channel
                 watchers, was_exchanged, was_missed, was_silent = None, False, False, False
                 if self._virtual is None:
@@ -306,11 +305,11 @@ class Worker:
                     if (change := presence.change(self._connection.clock.now())) is not None:
                         self._pipe.send(change)
                     watchers = presence.watchers
-                    was_exchanged = presence.exchanged_number > begin.presence
-                    was_missed = presence.missed_number > begin.presence
+                    was_exchanged = presence.exchanged_number > claim.presence
+                    was_missed = presence.missed_number > claim.presence
                     was_silent = presence.sees_units and presence.is_there is False
                 run = UnitRun(
-                    begin.order,
+                    claim,
                     self._recipe,
                     self._connection,
                     self._pipe,
@@ -332,13 +331,12 @@ class Worker:
         except Exception as error:  # noqa: BLE001  a bug must not cost the socket its process
             log_event(error)
             result = _error_result(codes.INTERNAL, f"{type(error).__name__}: {error}")
-        trace = None
         if recorder is not None and recorder.failure is None:
             with suppress(OSError):
-                trace = pack(begin.trace)
-        if trace is None and result.outcome is RunState.PASS:
+                result = replace(result, trace_sha256=pack(claim.trace))
+        if result.trace_sha256 is None and result.outcome is RunState.PASS:
             result = _error_result(codes.TRACE_NOT_SAVED, "The trace of the bus is not complete.")
-        self._pipe.send(Finished(result, trace))
+        self._pipe.send(result)
         if self._virtual is not None:
             self._virtual.run_ended()
         # What waits was said in the run, and says nothing of who is there now.
@@ -347,17 +345,17 @@ class Worker:
         self._watch_anew()
 
 
-def pack(path: Path) -> TraceFile:
-    """A trace compressed beside itself, with its hash; the plain one is deleted. Raises OSError."""
-    packed = path.with_name(path.name + ".gz")
-    make_private(packed)
-    with path.open("rb") as plain, packed.open("wb") as raw:
+def pack(path: Path) -> str:
+    """Compress a trace beside itself; its hash. The plain one is deleted. Raises OSError."""
+    made = packed(path)
+    make_private(made)
+    with path.open("rb") as plain, made.open("wb") as raw:
         # Without a name and time of its own: equal traces are equal files.
         with gzip.GzipFile(filename="", mode="wb", compresslevel=6, fileobj=raw, mtime=0) as out:
             shutil.copyfileobj(plain, out)
         raw.flush()
     path.unlink()
-    return TraceFile(packed, hashlib.sha256(packed.read_bytes()).hexdigest())
+    return hashlib.sha256(made.read_bytes()).hexdigest()
 
 
 def _error_result(code: codes.Code, text: str) -> RunResult:

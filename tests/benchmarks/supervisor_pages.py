@@ -30,12 +30,12 @@ from sqlalchemy import create_engine
 
 from flasher.protocol.spec import BMS
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.claims import Order
 from flasher.station.records.errors import ClaimRefusedError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     AuditEvent,
     Ending,
+    Order,
     RunFilter,
     RunId,
     RunState,
@@ -289,7 +289,7 @@ def _runs(store: Store, clock: FakeClock, recipe: LoadedRecipe, folder: Path) ->
         trace = write_trace(folder / "made.log.gz", said)
         began = time.perf_counter()
         try:
-            claim = store.claim(Order(serial, "A", recipe, "jo"))
+            claim = store.claim(Order(serial, "A", "jo"), recipe)
         except ClaimRefusedError:
             continue  # this number was drawn before
         claimed = time.perf_counter()

@@ -33,9 +33,9 @@ from flasher.image.image import Image
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import release_of
-from flasher.station.messages import RunOrder, RunResult
+from flasher.station.messages import RunResult
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.records.model import Claim, RunId, RunKind, RunState
 from flasher.station.unit_run import UnitRun
 from tests.campaigns.crossed_scans import Line, Scenario, line_of, make_plan
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
@@ -97,7 +97,7 @@ class Trial:
         with self.lock:
             self.units.put(self.names[0], self.port, self.own[0])
         self.journal.on_note = self._look_at_notes
-        order = RunOrder(RunId(1), RunKind.PRODUCTION, SERIAL, DAY)
+        order = Claim(RunId(1), RunKind.PRODUCTION, SERIAL, DAY)
         with connect("welling", holder=None, **bus_of(self.port)) as connection:
             result = UnitRun(
                 order, recipe, connection, self.journal, taps=(self._look_at_frame,)

@@ -19,9 +19,8 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
-from flasher.station.records.claims import Order
 from flasher.station.records.keys import Keeping
-from flasher.station.records.model import Claim, Ending, RunId, RunState, StepState, Verified
+from flasher.station.records.model import Claim, Ending, Order, RunId, RunState, StepState, Verified
 from flasher.station.records.store import Store
 from tests.station.traces import run_messages, write_trace
 
@@ -195,8 +194,8 @@ class Bench:
         reason: str = "",
         is_virtual: bool = False,
     ) -> Claim:
-        order = Order(serial, socket, self.recipe, "jo", lot, reason, is_virtual)
-        return self.store.claim(order)
+        order = Order(serial, socket, "jo", lot, reason, is_virtual)
+        return self.store.claim(order, self.recipe)
 
     def work(self, run_id: RunId) -> None:
         """What comes before the end of a good run."""

@@ -6,33 +6,42 @@ import hashlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from pathlib import Path
+from dataclasses import replace
 from typing import Any, TypeVar
 
-from flasher.station.events import SocketState, StationEvent
+from flasher.station.events import SocketState, StationEvent, StepEnded
 from flasher.station.label_printer import LabelPrinter
 from flasher.station.messages import (
     Ask,
-    Begin,
-    Done,
-    Finished,
     FromWorker,
-    Intent,
     PresenceChanged,
     Ready,
     Reply,
     RunResult,
-    StepReport,
     ToWorker,
-    TraceFile,
     WorkerSetup,
+    Write,
+    packed,
 )
 from flasher.station.people import Crew
-from flasher.station.records.model import Measurement, RunState, StepName, StepState, Verified
+from flasher.station.records.model import (
+    Claim,
+    Measurement,
+    RunState,
+    StepName,
+    StepState,
+    Verified,
+)
 from flasher.station.station import Station, StationOptions
 from tests.station.factory import Bench
 
 Event = TypeVar("Event")
+
+
+def tried(step: StepName) -> StepEnded:
+    """A good try of a step."""
+    target = "bms" if step is StepName.FLASH else ""
+    return StepEnded("", "", step, 1, StepState.PASS, 1.0, target=target)
 
 
 class ScriptedPort:
@@ -181,14 +190,16 @@ class LineBench:
 
     # -- what a process does ----------------------------------------------------------------------
 
-    def order(self, socket: str) -> Begin:
-        return next(m for m in reversed(self.ports[socket].heard) if isinstance(m, Begin))
+    def order(self, socket: str) -> Claim:
+        return next(m for m in reversed(self.ports[socket].heard) if isinstance(m, Claim))
 
-    def ask(self, socket: str, what: Intent | Done | StepReport) -> Reply:
+    def ask(
+        self, socket: str, what: Write | StepEnded, measurements: tuple[Measurement, ...] = ()
+    ) -> Reply:
         """Ask the station to save something; its reply."""
         port = self.ports[socket]
         number = 1 + sum(isinstance(message, Reply) for message in port.heard)
-        self.say(socket, Ask(number, what))
+        self.say(socket, Ask(number, what, measurements))
         reply = port.heard[-1]
         assert isinstance(reply, Reply)
         assert reply.number == number
@@ -196,23 +207,23 @@ class LineBench:
 
     def work(self, socket: str) -> None:
         """A good run, up to its last step."""
-        reply = self.ask(socket, Intent("bms", "flash", "V1"))
+        write = Write("bms", "flash", "V1")
+        reply = self.ask(socket, write)
         assert reply.write_id is not None, reply.error
-        self.ask(socket, Done(reply.write_id, "V1"))
-        measured = (Measurement("bms version", text="V1"),)
-        report = StepReport(StepName.FLASH, "bms", 1, StepState.PASS, 1.0, measurements=measured)
-        self.ask(socket, report)
+        self.ask(socket, replace(write, write_id=reply.write_id, read_back="V1"))
+        self.ask(socket, tried(StepName.FLASH), (Measurement("bms version", text="V1"),))
 
-    def trace(self, socket: str) -> TraceFile:
-        begin = self.order(socket)
-        path = Path(str(begin.trace) + ".gz")
-        self.bench.traced(begin.order.serial).replace(path)
-        return TraceFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    def trace(self, socket: str) -> str:
+        """Write the trace of its run; the hash."""
+        claim = self.order(socket)
+        path = packed(claim.trace)
+        self.bench.traced(claim.serial).replace(path)
+        return hashlib.sha256(path.read_bytes()).hexdigest()
 
     def end(self, socket: str, outcome: RunState = RunState.PASS, code: str = "OK") -> None:
         verified = {"bms": Verified.VERSION} if outcome is RunState.PASS else {}
-        result = RunResult(outcome, code, "what happened", 2.0, verified)
-        self.say(socket, Finished(result, self.trace(socket)))
+        trace = self.trace(socket)
+        self.say(socket, RunResult(outcome, code, "what happened", 2.0, verified, trace))
         if self.sees_units:
             self.say(socket, PresenceChanged(is_there=True, how="traffic"))
 

@@ -24,8 +24,9 @@ from flasher.station.events import (
 )
 from flasher.station.line import Line
 from flasher.station.messages import AdapterDown, PresenceChanged, Ready
-from flasher.station.records.model import RunState
+from flasher.station.records.model import Order, RunState
 from flasher.station.socket import Binding, Socket
+from tests.station.line_inputs import RESULT, begun, saved
 
 SOCKETS: Final = ("A", "B", "C")
 _LABEL: Final = re.compile(r"W[0-9]{4}")
@@ -158,7 +159,7 @@ class World:
         while effects := self.line.take():
             for effect in effects:
                 match effect:
-                    case line.ClaimRun(socket, serial):
+                    case Order(serial, socket):
                         self.claim(socket, serial)
                     case line.SaveAgain(sockets):
                         saved = [self.save(name) for name in sockets]
@@ -180,7 +181,7 @@ class World:
             bay.run = label
             self.seen["run"] += 1
             self.seen[self.way] += 1
-            self.line.feed(socket, line.Claimed(), self.now)
+            self.line.feed(socket, begun(socket, label), self.now)
             unit = bay.unit
             if unit is not None and not unit.is_asleep and not self.says_other(unit, label):
                 assert unit.label == label, f"{label} runs on the unit of {unit.label}"
@@ -201,7 +202,7 @@ class World:
             unit.has_passed = True
             unit.stored = label if unit.stores else ""
         self.open[name] = (label, outcome)
-        self.feed(name, line.Ended())
+        self.feed(name, RESULT)
         self.save(name)
         self.carry_out()
 
@@ -211,7 +212,7 @@ class World:
             return False
         label, outcome = self.open.pop(name)
         self.runs[label] = outcome
-        self.line.feed(name, line.Saved(outcome, "Scan the unit again."), self.now)
+        self.line.feed(name, saved(name, outcome, "Scan the unit again."), self.now)
         return True
 
     # -- the sockets' processes -------------------------------------------------------------------

@@ -13,10 +13,11 @@ import pytest
 from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
-from flasher.station.messages import PresenceChanged, Ready
+from flasher.station.messages import PresenceChanged, Ready, RunResult
 from flasher.station.records.model import RunState
 from flasher.station.socket import Binding, Occupancy, Phase, Socket, Source
 from tests.loops import each
+from tests.station.line_inputs import saved
 from tests.station.line_world import Walk, World
 
 pytestmark = pytest.mark.slow
@@ -79,12 +80,12 @@ def forget_a_removal(patch: pytest.MonkeyPatch) -> None:
 def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
     def ended(self: Line, socket: Socket, what: Any, now: float) -> None:
         Line._ended(self, socket, what, now)
-        Line._saved(self, socket, line.Saved(RunState.PASS, ""), now)
+        Line._saved(self, socket, saved(socket.name, RunState.PASS, ""), now)
         socket.shown = socket.view(None, is_only=False)
         self._tell(SocketChanged(socket.name, *socket.shown))
         socket.phase = Phase.SAVE
 
-    handle(patch, Phase.RUN, line.Ended, ended)
+    handle(patch, Phase.RUN, RunResult, ended)
 
 
 def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,6 @@ from flasher.protocol.wire import Message, encode, split
 from flasher.station.messages import PresenceChanged
 from flasher.station.presence import Presence
 from tests.loops import each
-from tests.station.factory import USUAL, make_recipe, target_table
 from tests.station.unit_bench import UnitBench
 
 TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
@@ -56,46 +55,6 @@ def test_a_boot_version_is_a_unit_that_was_switched_on(presence: Presence) -> No
     change = presence.change(1.0)
     assert change is not None
     assert change.how == "boot version"
-
-
-@each("frames", [1, 2])
-@each("has_two_targets", [False, True])
-def test_a_part_of_the_first_announcement_is_no_unit_that_is_exchanged_then(
-    tmp_path: Path, has_two_targets: bool, frames: int
-) -> None:
-    text = USUAL + target_table(WMC) if has_two_targets else USUAL
-    presence = Presence(make_recipe(tmp_path, text).targets)
-    presence.change(0.0)
-    presence.change(2.0)
-    messages = [BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)]
-    if has_two_targets:
-        messages.append(BootVersion("WMC", "V1.0.0").to_message(WMC.answer_id))
-    for message in messages:
-        parts = split(message.can_id, encode(message))
-        assert len(parts) == 3
-        assert hear(presence, parts[:frames], 3.0) is None
-        whole = hear(presence, parts[frames:], 3.001)
-        if message.can_id == BMS.answer_id:
-            assert whole is not None
-            assert (whole.how, whole.is_power_up, whole.is_in_bootloader) == (
-                "boot version", True, True,
-            )  # fmt: skip
-        else:
-            assert whole is None
-        assert presence.exchanged_number == 0, "it was put in, and in the place of nothing"
-
-
-@each("later_s", [0.01, 0.2, 0.88, 0.91])
-def test_the_targets_of_a_unit_announce_themselves_one_after_another(
-    tmp_path: Path, later_s: float
-) -> None:
-    presence = Presence(make_recipe(tmp_path, USUAL + target_table(WMC)).targets)
-    announce(presence, 3.0, 3.05, 3.1)
-    message = BootVersion("WMC", "V1.0.0").to_message(WMC.answer_id)
-    change = hear(presence, split(WMC.answer_id, encode(message)), 3.1 + later_s)
-    is_later = later_s > 0.9
-    assert (change is not None and change.is_power_up) == is_later, "its controller was exchanged"
-    assert announce(presence, 4.3 + later_s) == [(True, True)], "another unit"
 
 
 def test_own_frames_and_those_of_others_are_no_unit(presence: Presence) -> None:

@@ -19,15 +19,15 @@ from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, Mode
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
-from flasher.station import line
 from flasher.station.events import ScanRefused, SocketState, StationEvent
 from flasher.station.line import Line
 from flasher.station.messages import AdapterDown, Ready
 from flasher.station.presence import Presence
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import RunState
+from flasher.station.records.model import Order, RunState
 from flasher.station.socket import Socket, Source
 from tests.loops import each
+from tests.station.line_inputs import RESULT, begun, saved
 from tests.station.unit_bench import UnitBench
 
 STEP_S: Final = 0.05
@@ -109,22 +109,22 @@ class Floor:
     def carry_out(self) -> None:
         while effects := self.line.take():
             for effect in effects:
-                if isinstance(effect, line.ClaimRun):
+                if isinstance(effect, Order):
                     unit = self.units.get(effect.socket)
                     assert unit is None or unit.label == effect.serial, (
                         f"{effect.serial} runs on the unit of {unit.label}"
                     )
                     self.runs.append((effect.serial, effect.socket))
                     self.busy[effect.socket] = effect.serial
-                    self.line.feed(effect.socket, line.Claimed(), self.now)
+                    self.line.feed(effect.socket, begun(effect.socket, effect.serial), self.now)
                 elif isinstance(effect, StationEvent):
                     self.events.append(effect)
 
     def end_run(self, name: str, outcome: RunState = RunState.PASS) -> None:
         del self.busy[name]
         self.presences[name].begin()
-        self.line.feed(name, line.Ended(), self.now)
-        self.line.feed(name, line.Saved(outcome, "Take it out."), self.now)
+        self.line.feed(name, RESULT, self.now)
+        self.line.feed(name, saved(name, outcome, "Take it out."), self.now)
         self.carry_out()
 
     def fail(self, name: str, outage_s: float) -> None:

@@ -30,14 +30,10 @@ from flasher.station.messages import (
     AdapterDown,
     Beat,
     CannotWork,
-    Done,
-    Finished,
-    Intent,
     PresenceChanged,
     Ready,
     RunResult,
-    StepReport,
-    TraceFile,
+    Write,
     flash_value,
 )
 from flasher.station.records.errors import DiskFullError, RecordsLockedError
@@ -46,13 +42,12 @@ from flasher.station.records.model import (
     RunKind,
     RunState,
     StepName,
-    StepState,
     UnitState,
     Verified,
     WriteId,
 )
 from tests.station.factory import SERIAL, USUAL, Bench
-from tests.station.line_bench import LineBench
+from tests.station.line_bench import LineBench, tried
 
 OTHER = "W2605003"
 THIRD = "W2605004"
@@ -71,7 +66,7 @@ def test_a_unit_is_scanned_connected_run_and_shown(line: LineBench) -> None:
     assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
     line.arrive("A")
     assert line.state("A") is SocketState.RUNNING
-    assert line.order("A").order.serial == SERIAL
+    assert line.order("A").serial == SERIAL
     line.work("A")
     line.end("A")
     ended = line.last(RunEnded)
@@ -127,7 +122,7 @@ def test_the_next_label_waits_until_the_finished_unit_is_out(line: LineBench) ->
     line.scan("SOCKET A")
     line.scan(OTHER)
     line.arrive("A")
-    assert line.order("A").order.serial == OTHER
+    assert line.order("A").serial == OTHER
 
 
 def test_steps_are_told_when_they_are_saved(line: LineBench) -> None:
@@ -162,7 +157,7 @@ def test_two_waiting_units_need_a_chosen_socket(line: LineBench) -> None:
     asked = f"Scan the card of the socket that {SERIAL} is in, or goes into."
     assert line.last(OperatorPrompted).text == asked
     line.scan("socket b")
-    assert line.order("B").order.serial == SERIAL
+    assert line.order("B").serial == SERIAL
     assert line.state("A") is SocketState.SCAN
 
 
@@ -180,7 +175,7 @@ def test_a_label_that_is_scanned_while_sockets_start_goes_to_no_unit(bench: Benc
     assert line.of(RunStarted) == []
     line.scan("SOCKET B")
     line.scan(OTHER)
-    assert line.order("B").order.serial == OTHER
+    assert line.order("B").serial == OTHER
 
 
 def test_silence_is_no_empty_socket(bench: Bench) -> None:
@@ -199,7 +194,7 @@ def test_a_unit_that_says_its_own_number_needs_no_card(line: LineBench) -> None:
     line.arrive("A")
     line.arrive("B", OTHER)
     line.scan(OTHER)
-    assert line.order("B").order.serial == OTHER
+    assert line.order("B").serial == OTHER
 
 
 def test_a_unit_in_another_socket_than_named_is_not_begun(line: LineBench) -> None:
@@ -212,7 +207,7 @@ def test_a_unit_in_another_socket_than_named_is_not_begun(line: LineBench) -> No
     assert line.of(RunStarted) == []
     line.scan("SOCKET B")
     line.scan(SERIAL)
-    assert line.order("B").order.serial == SERIAL, "what the message says is accepted"
+    assert line.order("B").serial == SERIAL, "what the message says is accepted"
 
 
 def test_another_unit_in_the_named_socket_is_not_begun(line: LineBench) -> None:
@@ -322,7 +317,7 @@ def test_the_unit_of_an_interrupted_run_is_asked_for_where_it_was(bench: Bench) 
     line.arrive("A")
     assert line.of(RunStarted) == []
     line.scan("SOCKET B")
-    assert line.order("B").order.kind is RunKind.RECHECK, "also where nothing is heard of it"
+    assert line.order("B").kind is RunKind.RECHECK, "also where nothing is heard of it"
 
 
 def test_green_goes_when_it_may_be_another_unit(line: LineBench) -> None:
@@ -363,7 +358,7 @@ def test_a_socket_may_be_chosen_first(line: LineBench) -> None:
     line.scan(SERIAL)
     assert line.state("B") is SocketState.SCAN
     line.arrive("B")
-    assert line.order("B").order.serial == SERIAL
+    assert line.order("B").serial == SERIAL
 
 
 def test_a_unit_that_is_not_seen_is_run_after_a_while_where_a_person_put_it(
@@ -425,7 +420,7 @@ def test_a_label_behind_a_refused_socket_goes_to_no_other(line: LineBench) -> No
     assert line.state("B") is SocketState.SCAN
     line.scan("SOCKET B")
     line.scan(OTHER)
-    assert line.order("B").order.serial == OTHER
+    assert line.order("B").serial == OTHER
 
 
 def test_a_double_scan_is_one_scan(line: LineBench) -> None:
@@ -454,7 +449,7 @@ def test_a_scan_during_a_run_is_for_the_next_socket(line: LineBench) -> None:
     line.scan("SOCKET A")
     assert line.last(ScanRefused).code == "SOCKET_BUSY"
     line.arrive("B")
-    assert line.order("B").order.serial == OTHER
+    assert line.order("B").serial == OTHER
 
 
 def test_the_same_unit_cannot_be_in_two_sockets(line: LineBench) -> None:
@@ -552,9 +547,9 @@ def test_a_run_of_which_a_part_is_not_saved_cannot_pass(
 
         patch.setattr(bench.store, operation, fail)
         replies = [
-            line.ask("A", Intent("bms", "flash", "V1")),
-            line.ask("A", Done(WriteId(1), "V1")),
-            line.ask("A", StepReport(StepName.FLASH, "bms", 1, StepState.PASS, 1.0)),
+            line.ask("A", Write("bms", "flash", "V1")),
+            line.ask("A", Write("bms", "flash", "V1", WriteId(1), "V1")),
+            line.ask("A", tried(StepName.FLASH)),
         ]
     assert [bool(reply.error) for reply in replies].count(True) >= 1
     # Even a process that would claim a PASS does not get one.
@@ -579,7 +574,7 @@ def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -
     bench.store.database.close()
     # A database with room left in its last page saves some more, and then no more.
     for _ in range(200):
-        if line.ask("A", Intent("bms", "flash", "V" * 200)).error:
+        if line.ask("A", Write("bms", "flash", "V" * 200)).error:
             break
     line.end("A")
     assert SocketState.PASS not in {view.state for view in line.station.line.sockets.values()}
@@ -638,7 +633,7 @@ def test_a_claim_that_was_saved_although_it_seemed_lost_keeps_no_unit_from_being
     line.scan("RESUME")
     line.scan(SERIAL)
     line.scan("SOCKET A")
-    assert line.order("A").order.kind is RunKind.RECHECK
+    assert line.order("A").kind is RunKind.RECHECK
     line.work("A")
     line.end("A")
     assert line.last(RunEnded).outcome is RunState.PASS
@@ -648,16 +643,15 @@ def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> Non
     line.scan(SERIAL)
     line.arrive("A")
     line.work("A")
-    good = line.trace("A")
-    result = RunResult(RunState.PASS, "OK", "", 1.0, {"bms": Verified.VERSION})
-    line.say("A", Finished(result, TraceFile(good.path, "0" * 64)))
+    line.trace("A")
+    line.say("A", RunResult(RunState.PASS, "OK", "", 1.0, {"bms": Verified.VERSION}, "0" * 64))
     assert line.last(RunEnded).code == "TRACE_NOT_SAVED"
 
 
 def test_a_pass_that_the_records_know_better_is_none(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")
-    line.ask("A", Intent("bms", "flash", "V1"))  # never verified
+    line.ask("A", Write("bms", "flash", "V1"))  # never verified
     line.end("A")
     ended = line.last(RunEnded)
     assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
@@ -700,7 +694,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.arrive("A")
     line.scan(SERIAL)
     line.scan("SOCKET A")
-    assert line.order("A").order.kind is RunKind.RECHECK
+    assert line.order("A").kind is RunKind.RECHECK
 
 
 def test_a_process_that_cannot_work_is_not_started_again(line: LineBench) -> None:
@@ -758,7 +752,7 @@ def test_what_a_dead_station_left_is_found_at_the_start(bench: Bench) -> None:
     line.scan(SERIAL)
     line.scan("SOCKET A")
     assert bench.store.read.run(run_id).run.state is RunState.INTERRUPTED
-    assert line.order("A").order.kind is RunKind.RECHECK
+    assert line.order("A").kind is RunKind.RECHECK
 
 
 def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench: Bench) -> None:
@@ -771,21 +765,21 @@ def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench
     line = LineBench(bench)
     line.scan(SERIAL)
     line.scan("SOCKET A")
-    assert line.order("A").order.flashed_before == {"bms"}
+    assert line.order("A").flashed_before == {"bms"}
 
 
 def test_a_flash_before_the_unit_may_have_changed_is_not_relied_on(bench: Bench) -> None:
     line = LineBench(bench)
     line.scan(SERIAL)
     line.arrive("A")
-    run_id = line.order("A").order.run_id
+    run_id = line.order("A").run_id
     target = bench.recipe.targets[0]
     value = flash_value(target.version, target.image.sha256)
     bench.store.verified(bench.store.intent(run_id, "bms", "flash", value), target.version)
     line.end("A", RunState.ERROR, "UNIT_CHANGED")
     line.scan(SERIAL)
     line.scan("SOCKET A")
-    again = line.order("A").order
+    again = line.order("A")
     assert again.run_id != run_id
     assert (again.kind, again.flashed_before) == (RunKind.RECHECK, frozenset())
 
@@ -883,11 +877,10 @@ def test_what_must_not_change_is_held_over_a_fail_but_not_for_a_reworked_unit(
             line.arrive("A")
         else:
             line.scan("SOCKET A")
-        known = dict(line.order("A").order.known_before)
+        known = dict(line.order("A").known_before)
         read = (Measurement("before bms model", text=model),)
-        report = StepReport(StepName.CHECK, "", 1, StepState.PASS, 1.0, measurements=read)
-        line.ask("A", report)
-        line.ask("A", Intent("bms", "flash", "V1"))
+        line.ask("A", tried(StepName.CHECK), read)
+        line.ask("A", Write("bms", "flash", "V1"))
         line.end("A", RunState.FAIL, "TRANSFER_FAILED")
     assert known == ({} if reason else {"bms model": "BM36"})
 
@@ -911,8 +904,7 @@ def test_a_pass_of_a_first_run_that_flashed_nothing_is_none(line: LineBench) -> 
     line.scan(SERIAL)
     line.arrive("A")
     read = (Measurement("bms version", text="V1"),)
-    report = StepReport(StepName.VERIFY, "", 1, StepState.PASS, 1.0, measurements=read)
-    line.ask("A", report)
+    line.ask("A", tried(StepName.VERIFY), read)
     line.end("A")
     ended = line.last(RunEnded)
     assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")

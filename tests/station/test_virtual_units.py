@@ -12,9 +12,9 @@ from flasher.bus.link import VirtualClock
 from flasher.errors import UsageError
 from flasher.station.adapters import resolve, worker_setups
 from flasher.station.config import MockUnits, mock_config
-from flasher.station.messages import PresenceChanged, RunOrder, RunResult, VirtualUnits
+from flasher.station.messages import PresenceChanged, RunResult, VirtualUnits
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import RunId, RunKind
+from flasher.station.records.model import Claim, RunId, RunKind
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import (
     Health,
@@ -83,7 +83,7 @@ def run_one(folder: Path, wanted: Health) -> RunResult:
     socket = VirtualSocket(recipe, VirtualUnits(MIXED, speed=0))
     serial = next(s for n in range(999) if health_of(MIXED, s := f"W2605{n:03d}") is wanted)
     assert socket.arrive(serial) is wanted
-    order = RunOrder(RunId(1), RunKind.PRODUCTION, serial, DAY)
+    order = Claim(RunId(1), RunKind.PRODUCTION, serial, DAY)
     return UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
 
 
@@ -143,7 +143,7 @@ def test_a_unit_has_its_label_inside_where_the_recipe_writes_no_number(tmp_path:
     recipe = make_recipe(tmp_path, USUAL)
     socket = VirtualSocket(recipe, VirtualUnits(MockUnits(), speed=0))
     socket.arrive("W2605002")
-    order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
+    order = Claim(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
     result = UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
     assert result.code == "OK", result.text
 
@@ -154,7 +154,7 @@ def test_a_unit_has_its_label_inside_where_the_recipe_writes_no_number(tmp_path:
 def run_in(
     socket: VirtualSocket, recipe: LoadedRecipe, serial: str, notes: Notes | None = None
 ) -> RunResult:
-    order = RunOrder(RunId(1), RunKind.PRODUCTION, serial, DAY)
+    order = Claim(RunId(1), RunKind.PRODUCTION, serial, DAY)
     result = UnitRun(order, recipe, socket.connection, notes or Notes(), power=socket).run()
     socket.run_ended()
     return result

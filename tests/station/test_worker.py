@@ -29,22 +29,21 @@ from flasher.station.messages import (
     AdapterDown,
     Ask,
     Beat,
-    Begin,
-    Finished,
     FromWorker,
-    Intent,
     JournalError,
     PresenceChanged,
     Quit,
     Ready,
     Reply,
-    RunOrder,
+    RunResult,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
+    Write,
+    packed,
 )
 from flasher.station.presence import SILENCE_S
-from flasher.station.records.model import RunId, RunKind, RunState, WriteId
+from flasher.station.records.model import Claim, RunId, RunKind, RunState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
@@ -81,6 +80,10 @@ class FakeChannel:
         return [message for message in self.sent if isinstance(message, kind)]
 
 
+def claim(serial: str, trace: Path, presence: int = 0) -> Claim:
+    return Claim(RunId(1), RunKind.PRODUCTION, serial, DAY, trace=trace, presence=presence)
+
+
 class Socket:
     """A worker with virtual units, and a station that says yes to everything."""
 
@@ -98,17 +101,16 @@ class Socket:
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         match message:
             case PresenceChanged(True, _, label):
-                order = RunOrder(RunId(1), RunKind.PRODUCTION, label, DAY)
-                channel.waiting.append(Begin(order, self.trace))
+                channel.waiting.append(claim(label, self.trace))
             case Ask(number):
                 channel.waiting.append(Reply(number, WriteId(number), self.error))
-            case Finished():
+            case RunResult():
                 channel.waiting.append(Quit())
 
-    def work(self) -> Finished | None:
+    def work(self) -> RunResult | None:
         worker = Worker(self.setup, self.recipe, self.line, self.virtual.connection, self.virtual)
         worker.work()
-        ended = self.channel.of(Finished)
+        ended = self.channel.of(RunResult)
         return ended[-1] if ended else None
 
 
@@ -116,9 +118,9 @@ def test_a_unit_that_comes_is_run_and_its_trace_is_closed(tmp_path: Path) -> Non
     socket = Socket(tmp_path)
     ended = socket.work()
     assert ended is not None
-    assert ended.result.outcome is RunState.PASS, ended.result.text
-    assert ended.trace is not None
-    lines = gzip.decompress(ended.trace.path.read_bytes()).decode("ascii").splitlines()
+    assert ended.outcome is RunState.PASS, ended.text
+    assert ended.trace_sha256 is not None
+    lines = gzip.decompress(packed(socket.trace).read_bytes()).decode("ascii").splitlines()
     assert len(lines) > 50
     assert not socket.trace.exists()
     assert isinstance(socket.channel.sent[0], Ready)
@@ -131,7 +133,7 @@ def test_it_does_nothing_before_the_reply(tmp_path: Path) -> None:
     socket.error = "RECORD NOT SAVED: the disk is full."
     ended = socket.work()
     assert ended is not None
-    assert ended.result.code == "RECORD_NOT_SAVED"
+    assert ended.code == "RECORD_NOT_SAVED"
     device = socket.virtual.devices["bms"].device
     assert device.erase_count == 0
 
@@ -159,13 +161,17 @@ def test_a_person_aborts_between_two_messages(tmp_path: Path) -> None:
 
     def abort(channel: FakeChannel, message: FromWorker) -> None:
         Socket.answer(socket, channel, message)
-        if isinstance(message, Ask) and isinstance(message.what, Intent):
+        if (
+            isinstance(message, Ask)
+            and isinstance(message.what, Write)
+            and not message.what.write_id
+        ):
             channel.waiting.append(Abort())
 
     socket.channel._answer = abort
     ended = socket.work()
     assert ended is not None
-    assert ended.result.outcome is RunState.ABORTED
+    assert ended.outcome is RunState.ABORTED
 
 
 def test_a_trace_that_cannot_be_written_is_no_pass(tmp_path: Path) -> None:
@@ -173,7 +179,7 @@ def test_a_trace_that_cannot_be_written_is_no_pass(tmp_path: Path) -> None:
     socket.trace = tmp_path / "not there" / "run-1.log"
     ended = socket.work()
     assert ended is not None
-    assert (ended.result.code, ended.trace) == ("TRACE_NOT_SAVED", None)
+    assert (ended.code, ended.trace_sha256) == ("TRACE_NOT_SAVED", None)
 
 
 def test_a_bug_in_a_run_does_not_end_the_process(
@@ -187,7 +193,7 @@ def test_a_bug_in_a_run_does_not_end_the_process(
     monkeypatch.setattr("flasher.station.worker.UnitRun.run", fall)
     ended = socket.work()
     assert ended is not None
-    assert (ended.result.outcome, ended.result.code) == (RunState.ERROR, "INTERNAL")
+    assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
 
 
 def test_a_station_that_does_not_save_in_time_is_not_waited_for() -> None:
@@ -303,19 +309,18 @@ class RealSocket(Socket):
 
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         if isinstance(message, PresenceChanged):
-            if message.is_there and message.serial is not None and not channel.of(Finished):
+            if message.is_there and message.serial is not None and not channel.of(RunResult):
                 self.begin()
         else:
             super().answer(channel, message)
 
     def begin(self) -> None:
-        order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
-        self.channel.waiting.append(Begin(order, self.trace))
+        self.channel.waiting.append(claim("W2605002", self.trace))
 
-    def work(self) -> Finished | None:
+    def work(self) -> RunResult | None:
         connection = Connection(self.bus.link(), self.clock, "a bus")
         Worker(self.setup, self.recipe, self.line, connection).work()
-        ended: Finished = self.channel.of(Finished)[-1]
+        ended: RunResult = self.channel.of(RunResult)[-1]
         return ended
 
 
@@ -376,7 +381,7 @@ class Visitor:
 def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
     ended = RealSocket(tmp_path).work()
     assert ended is not None
-    assert ended.result.outcome is RunState.PASS, ended.result.text
+    assert ended.outcome is RunState.PASS, ended.text
 
 
 class PulledAfterItsRun(RealSocket):
@@ -385,7 +390,7 @@ class PulledAfterItsRun(RealSocket):
     pulled_at = gone_at = inf
 
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
-        if not channel.of(Finished):
+        if not channel.of(RunResult):
             super().answer(channel, message)
         elif isinstance(message, PresenceChanged) and message.is_there:
             self.bus.detach(self.bus._devices[0].engine)
@@ -415,7 +420,7 @@ class InBootloader(RealSocket):
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         if not isinstance(message, PresenceChanged):
             super().answer(channel, message)
-        elif not channel.of(Finished):
+        elif not channel.of(RunResult):
             self.begin()
 
 
@@ -430,8 +435,7 @@ class StandsStill(InBootloader):
             until = self.clock.now() + 1.0
             while self.clock.now() < until:
                 self.bus.advance(until)
-            order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
-            channel.waiting.append(Begin(order, self.trace, message.number))
+            channel.waiting.append(claim("W2605002", self.trace, message.number))
         elif not isinstance(message, PresenceChanged):
             super().answer(channel, message)
 
@@ -439,8 +443,8 @@ class StandsStill(InBootloader):
 def test_an_order_from_before_a_pause_of_this_computer_is_not_carried_out(tmp_path: Path) -> None:
     ended = StandsStill(tmp_path).work()
     assert ended is not None
-    assert ended.result.code == "NOT_OBSERVED", ended.result.text
-    assert "did not listen before the run began" in ended.result.text
+    assert ended.code == "NOT_OBSERVED", ended.text
+    assert "did not listen before the run began" in ended.text
 
 
 class SlowRecords(InBootloader):
@@ -471,7 +475,7 @@ def test_it_listens_while_the_station_saves(tmp_path: Path) -> None:
     """A slow disk is no pause: a unit in its bootloader is seen to stay."""
     ended = SlowRecords(tmp_path).work()
     assert ended is not None
-    assert ended.result.code == "OK", ended.result.text
+    assert ended.code == "OK", ended.text
 
 
 class Exchanged(RealSocket):
@@ -482,8 +486,8 @@ class Exchanged(RealSocket):
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         if isinstance(message, PresenceChanged) and message.serial is not None:
             if self.numbers:
-                order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
-                self.channel.waiting.append(Begin(order, self.trace, self.numbers[self.known]))
+                number = self.numbers[self.known]
+                self.channel.waiting.append(claim("W2605002", self.trace, number))
             else:
                 (old,) = (each.engine for each in self.bus._devices)
                 self.bus.detach(old)
@@ -504,8 +508,8 @@ def test_an_order_that_crosses_the_report_of_an_exchange_is_not_carried_out(
 ) -> None:
     ended = Exchanged(tmp_path).knowing(0).work()
     assert ended is not None
-    assert ended.result.code == "UNIT_CHANGED", ended.result.text
-    assert "before the run began" in ended.result.text
+    assert ended.code == "UNIT_CHANGED", ended.text
+    assert "before the run began" in ended.text
 
 
 @each("gap_s", [0.3, 0.5, 1.0, 3.5])
@@ -520,10 +524,10 @@ def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(
     socket.gap_s, socket.pulled_after_s = gap_s, pulled_after_s
     ended = socket.work()
     assert ended is not None
-    assert ended.result.outcome is not RunState.PASS
+    assert ended.outcome is not RunState.PASS
     # Nobody answers, and nobody comes as long as the run waits.
     codes = ("UNIT_CHANGED", "NO_ANSWER") if gap_s > 0.5 else ("UNIT_CHANGED",)
-    assert ended.result.code in codes, ended.result.text
+    assert ended.code in codes, ended.text
     assert socket.other.device.program_count == 0
 
 
@@ -539,7 +543,7 @@ class Empty(RealSocket):
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         if not isinstance(message, PresenceChanged):
             super().answer(channel, message)
-        elif not message.is_there and not channel.of(Finished):
+        elif not message.is_there and not channel.of(RunResult):
             self.other = Visitor(self.unit("NONE"), self.clock.now() + self.after_s)
             self.bus.attach(self.other)
             self.begin()
@@ -556,8 +560,8 @@ def test_a_run_is_not_for_the_unit_that_comes_after_it_began(
     socket.after_s = after_s
     ended = socket.work()
     assert ended is not None
-    assert ended.result.code == "UNIT_CHANGED", ended.result.text
-    assert "was silent when the run began" in ended.result.text
+    assert ended.code == "UNIT_CHANGED", ended.text
+    assert "was silent when the run began" in ended.text
     assert socket.other.device.program_count == 0
 
 
@@ -577,4 +581,4 @@ def test_a_slow_start_of_a_run_is_no_pause_of_a_unit_in_its_bootloader(
     monkeypatch.setattr(UnitRun, "_steps", steps)
     ended = socket.work()
     assert ended is not None
-    assert ended.result.outcome is RunState.PASS, ended.result.text
+    assert ended.outcome is RunState.PASS, ended.text

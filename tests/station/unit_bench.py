@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +14,18 @@ from flasher.mock.faults import FaultInjector
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
-from flasher.station.messages import JournalError, RunEvent, RunOrder, RunResult, StepReport, Texts
+from flasher.station.events import StepEnded
+from flasher.station.messages import JournalError, RunEvent, RunResult, Write
 from flasher.station.power import PowerControl
-from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
+from flasher.station.records.model import (
+    Claim,
+    Measurement,
+    RunId,
+    RunKind,
+    StepName,
+    StepState,
+    WriteId,
+)
 from flasher.station.unit_run import UnitRun
 from flasher.station.worker import IDLE_S
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
@@ -36,12 +45,19 @@ values = ["made {date}"]
 NEW_UNIT = DeviceProfile(serial_number="NONE", application_area_bytes=8192)
 
 
+@dataclass(frozen=True)
+class Report(StepEnded):
+    """A try of a step, as it was recorded."""
+
+    measurements: tuple[Measurement, ...] = ()
+
+
 @dataclass
 class Notes:
     """A journal in a list; `fails_at` is the number of the note that cannot be saved."""
 
     rows: list[tuple[str, ...]] = field(default_factory=list)
-    reports: list[StepReport] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
     fails_at: int | None = None
     on_note: Callable[[], None] = lambda: None
 
@@ -51,16 +67,16 @@ class Notes:
         self.rows.append(row)
         self.on_note()
 
-    def intent(self, target: str, what: str, value: str) -> WriteId:
+    def intent(self, target: str, what: str, value: str) -> Write:
         self._note("intent", target, what)
-        return WriteId(len(self.rows))
+        return Write(target, what, value, WriteId(len(self.rows)))
 
-    def verified(self, write_id: WriteId, read_back: str | None) -> None:
+    def verified(self, write: Write, read_back: str | None) -> None:
         self._note("verified", str(read_back))
 
-    def step(self, report: StepReport) -> None:
-        self._note("step", report.name, report.state.value, report.code)
-        self.reports.append(report)
+    def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
+        self._note("step", ended.name, ended.state.value, ended.code)
+        self.reports.append(Report(**vars(ended), measurements=tuple(measurements)))
 
 
 class UnitBench:
@@ -104,11 +120,11 @@ class UnitBench:
         kind: RunKind = RunKind.PRODUCTION,
         serial: str = SERIAL,
         *,
-        known_before: Texts | None = None,
+        known_before: Mapping[str, str] | None = None,
         flashed_before: frozenset[str] = frozenset(),
-        written_before: Texts | None = None,
+        written_before: Mapping[str, str] | None = None,
     ) -> RunResult:
-        order = RunOrder(
+        claim = Claim(
             RunId(1),
             kind,
             serial,
@@ -119,7 +135,7 @@ class UnitBench:
             written_before or {},
         )
         self.unit_run = UnitRun(
-            order,
+            claim,
             self.recipe,
             self.connection,
             self.journal,
@@ -147,7 +163,7 @@ class UnitBench:
     def _is_cancelled(self) -> bool:
         return self.is_cancelled()
 
-    def step(self, name: StepName, target: str = "") -> StepReport:
+    def step(self, name: StepName, target: str = "") -> Report:
         """The last try of a step."""
         found = [r for r in self.journal.reports if (r.step, r.target) == (name, target)]
         return found[-1]

@@ -4,7 +4,7 @@ so that two sockets cannot both take the last place of a lot.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import PurePath
 from typing import Any, Final
@@ -21,6 +21,7 @@ from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
     Claim,
+    Order,
     RunId,
     RunKind,
     RunState,
@@ -36,70 +37,47 @@ CLOCK_TOLERANCE: Final = timedelta(minutes=5)
 """Network time may set the clock back a little."""
 
 
-@dataclass(frozen=True)
-class Order:
-    """A run to be claimed."""
-
-    serial: str
-    socket: str
-    loaded: LoadedRecipe
-    operator: str
-    lot: str = ""
-    reason: str = ""
-    is_virtual: bool = False
-
-    @property
-    def part(self) -> str:
-        return self.loaded.recipe.part
-
-    @property
-    def is_golden(self) -> bool:
-        """True for a unit that tests the station."""
-        rule = self.loaded.recipe.golden
-        return rule is not None and self.serial in rule.serial_numbers
-
-    def checked(self, now: datetime) -> Order:
-        """The order with the lot that its serial number names. Raises ClaimRefusedError,
-        UsageError.
-        """
-        try:
-            scan = self.loaded.scan(self.serial, now.astimezone().date(), self.lot)
-        except ValueError as error:
-            raise ClaimRefusedError(
-                Refusal.WRONG_SERIAL,
-                text("No serial number of this recipe: {why}.", why=str(error)),
-                remedy=text("Scan the label of the unit again."),
-            ) from error
-        if not self.loaded.is_unchanged():
-            path = printable(str(self.loaded.path))
-            raise ClaimRefusedError(
-                Refusal.RECIPE_CHANGED,
-                text("The recipe {path}, or a file that it names, was changed.", path=path),
-                remedy=text("Check it with `flasher station check`, then start the station again."),
-            )
-        if not self.operator.strip() or not self.socket.strip():
-            raise UsageError("A run needs an operator and a socket.")
-        return replace(self, lot=scan.lot)
+def checked(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
+    """The order with the lot that its serial number names. Raises ClaimRefusedError, UsageError."""
+    try:
+        scan = loaded.scan(order.serial, now.astimezone().date(), order.lot)
+    except ValueError as error:
+        raise ClaimRefusedError(
+            Refusal.WRONG_SERIAL,
+            text("No serial number of this recipe: {why}.", why=str(error)),
+            remedy=text("Scan the label of the unit again."),
+        ) from error
+    if not loaded.is_unchanged():
+        path = printable(str(loaded.path))
+        raise ClaimRefusedError(
+            Refusal.RECIPE_CHANGED,
+            text("The recipe {path}, or a file that it names, was changed.", path=path),
+            remedy=text("Check it with `flasher station check`, then start the station again."),
+        )
+    if not order.operator.strip() or not order.socket.strip():
+        raise UsageError("A run needs an operator and a socket.")
+    return replace(order, lot=scan.lot)
 
 
 class Claiming:
     """The claim of one run, in the transaction of `trail`."""
 
-    def __init__(self, trail: Trail, order: Order, now: datetime) -> None:
+    def __init__(self, trail: Trail, order: Order, loaded: LoadedRecipe, now: datetime) -> None:
         """Raises ClaimRefusedError when the clock is behind the records."""
-        self._trail, self._order, self._now = trail, order, now
+        self._trail, self._order, self._loaded, self._now = trail, order, loaded, now
+        self._part = loaded.recipe.part
         self._connection = connection = trail.connection
         self._check_clock()
         station_id = named(connection, schema.station, name=trail.station)
-        self._unit_id = named(connection, schema.unit, part=order.part, serial=order.serial)
+        self._unit_id = named(connection, schema.unit, part=self._part, serial=order.serial)
         self._socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
         self._lot_id: int | None = None
         if order.lot:
-            self._lot_id = named(connection, schema.lot, part=order.part, name=order.lot)
+            self._lot_id = named(connection, schema.lot, part=self._part, name=order.lot)
 
     def begin(self, monotonic_s: float) -> Claim:
         """Begin the run when every rule allows it. Raises ClaimRefusedError."""
-        order, loaded, connection = self._order, self._order.loaded, self._connection
+        order, loaded, connection = self._order, self._loaded, self._connection
         self._check_free()
         self._check_nature()
         last = connection.execute(
@@ -151,11 +129,11 @@ class Claiming:
         digests = digests_of(connection, [run_id])[run_id]
         data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
         self._trail.append(self._now, chain.CLAIMED, data, run_id)
-        return Claim(RunId(run_id), kind, order.serial)
+        return Claim(RunId(run_id), kind, order.serial, self._now.astimezone().date(), order.lot)
 
     def _recipe_id(self) -> int:
         """The recipe's row; it holds the whole text, so that it can be read years later."""
-        loaded, rule = self._order.loaded, self._order.loaded.recipe
+        loaded, rule = self._loaded, self._loaded.recipe
         query = select(recipe.c.id).where(recipe.c.sha256 == loaded.sha256)
         found = self._connection.execute(query).scalar_one_or_none()
         if found is not None:
@@ -246,7 +224,8 @@ class Claiming:
 
     def _kind(self, before: UnitState) -> RunKind:
         """What kind of run it is. Raises ClaimRefusedError."""
-        if self._order.is_golden:
+        golden = self._loaded.recipe.golden
+        if golden is not None and self._order.serial in golden.serial_numbers:
             return RunKind.GOLDEN
         self._check_golden()
         kind = RunKind.PRODUCTION
@@ -258,7 +237,7 @@ class Claiming:
         return kind
 
     def _check_golden(self) -> None:
-        order, rule = self._order, self._order.loaded.recipe.golden
+        order, rule = self._order, self._loaded.recipe.golden
         if rule is None:
             return
         query = (
@@ -269,7 +248,7 @@ class Claiming:
                 run.c.kind == RunKind.GOLDEN.value,
                 run.c.is_virtual == order.is_virtual,
                 run.c.state == RunState.PASS.value,
-                recipe.c.part == order.part,
+                recipe.c.part == self._part,
             )
         )
         last = self._connection.execute(query).scalar_one()
@@ -284,7 +263,7 @@ class Claiming:
 
     def _repeated(self) -> RunKind:
         """The kind of run for a unit that has passed."""
-        order, rule = self._order, self._order.loaded.recipe.duplicate
+        order, rule = self._order, self._loaded.recipe.duplicate
         if rule is Duplicate.VERIFY_ONLY:
             return RunKind.VERIFY_ONLY
         if rule is Duplicate.BLOCK:
@@ -305,7 +284,7 @@ class Claiming:
         return RunKind.REFLASH
 
     def _check_lot(self) -> None:
-        order, rule = self._order, self._order.loaded.recipe.lot
+        order, rule = self._order, self._loaded.recipe.lot
         if self._lot_id is None and rule.required:
             raise ClaimRefusedError(
                 Refusal.LOT_NEEDED,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Final, NewType, Protocol
@@ -159,12 +159,39 @@ class StepState(LowerCaseInJson, StrEnum):
 
 
 @dataclass(frozen=True)
+class Order:
+    """A run to be claimed."""
+
+    serial: str
+    socket: str
+    operator: str
+    lot: str = ""
+    reason: str = ""
+    is_virtual: bool = False
+
+
+@dataclass(frozen=True)
 class Claim:
-    """A run that has begun; it is on disk."""
+    """A run that has begun; it is on disk. The process of its socket works on it."""
 
     run_id: RunId
     kind: RunKind
     serial: str
+    day: date
+    lot: str = ""
+    # The station adds the following for the process of the socket.
+    known_before: Mapping[str, str] = field(default_factory=dict)
+    """What must not change, as earlier runs read it first, by the name of its measurement."""
+    flashed_before: frozenset[str] = frozenset()
+    """Targets whose last flash, of this very image, was read back."""
+    written_before: Mapping[str, str] = field(default_factory=dict)
+    """What the unit's last PASS wrote, by target and item ("bms serial-number")."""
+    trace: Path = Path()
+    """Where the trace goes."""
+    presence: int = 0
+    """The number of the last change of presence that the station knows: the label was given to
+    the unit of which that is true.
+    """
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
     store = Store.open("records.sqlite", station="line-2", clock=SystemClock())
     store.recover()
-    claim = store.claim(Order(serial, "A", recipe, operator="jo"))
+    claim = store.claim(Order(serial, "A", "jo"), recipe)
     write = store.intent(claim.run_id, "bms", "flash", "V1r0r4_20220512")
     ... the act ...
     store.verified(write, "V1r0r4_20220512")
@@ -29,9 +29,10 @@ from typing import Any, Final, Self
 from sqlalchemy import func, select, update
 
 from flasher.errors import FlasherError
+from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
-from flasher.station.records.claims import Claiming, Order
+from flasher.station.records.claims import Claiming, checked
 from flasher.station.records.database import (
     Database,
     locate,
@@ -59,6 +60,7 @@ from flasher.station.records.model import (
     Ending,
     Examination,
     Measurement,
+    Order,
     RunExamination,
     RunId,
     RunState,
@@ -214,16 +216,16 @@ class Store:
             self.files.forget_spooled(run_id)
         return found
 
-    def claim(self, order: Order) -> Claim:
+    def claim(self, order: Order, recipe: LoadedRecipe) -> Claim:
         """Begin a run of a unit, when every rule allows it; nothing is recorded when not.
 
         Raises ClaimRefusedError, RecordError (before `recover` too).
         """
         now = self._clock.utc()
-        order = order.checked(now)
+        order = checked(order, recipe, now)
         # One claim at a time, of all stations: two must not find the last place of a lot free.
         with self.signer.writing("claims") as trail:
-            return Claiming(trail, order, now).begin(self._clock.monotonic_s())
+            return Claiming(trail, order, recipe, now).begin(self._clock.monotonic_s())
 
     # -- while it runs ----------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import COMMAND_SIZE, HEADER, MODE_SIZE, PREFIX_SIZE, WELLING, Mode
-from flasher.station.messages import Ask, Finished, FromWorker, ToWorker, WorkerSetup
+from flasher.station.messages import Ask, FromWorker, RunResult, ToWorker, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.worker import StationGoneError, StationPipe, work_on
 
@@ -111,7 +111,7 @@ class Pipe:
             raise OSError("the station is gone")
         self.to_station.append(message)
         self._on_sent(message)
-        if isinstance(message, Ask | Finished):
+        if isinstance(message, Ask | RunResult):
             self._bus.stop()  # the station answers at once
 
     def recv(self) -> Any:

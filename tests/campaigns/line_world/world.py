@@ -35,7 +35,7 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
-from flasher.station.messages import Finished, FromWorker, WorkerSetup
+from flasher.station.messages import FromWorker, RunResult, WorkerSetup
 from flasher.station.presence import SILENCE_S
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import RunFilter, RunState, StepName
@@ -339,7 +339,7 @@ class World:
                 bay.step, bay.is_complete = message.step, False
             case Progressed(step=StepName.FLASH, share=1.0):
                 bay.is_complete = True
-            case Finished():
+            case RunResult():
                 bay.is_working = False
 
     def _take(self, event: StationEvent) -> None:

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import event
 
-from flasher.station.records.claims import Order
-from flasher.station.records.model import RunFilter, RunState
+from flasher.station.records.model import Order, RunFilter, RunState
 from flasher.station.records.newest import Cut
 from flasher.station.records.overview import Overview
 from tests.benchmarks import bulk_records
@@ -72,7 +71,7 @@ def runs(**chosen: Any) -> Callable[[Bench], object]:
 def claim(bench: Bench) -> None:
     serial = f"W27{bench._traces:05}"
     bench.traced(serial)
-    bench.store.claim(Order(serial, "A", bench.recipe, "jo"))
+    bench.store.claim(Order(serial, "A", "jo"), bench.recipe)
     bench.store.end_unknown(())
 
 

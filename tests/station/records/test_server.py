@@ -13,7 +13,6 @@ import psycopg
 import pytest
 
 from flasher.station.records import server
-from flasher.station.records.claims import Order
 from flasher.station.records.errors import (
     ClaimRefusedError,
     RecordError,
@@ -21,7 +20,7 @@ from flasher.station.records.errors import (
     Refusal,
     StationBusyError,
 )
-from flasher.station.records.model import AuditEvent, Claim, RunState
+from flasher.station.records.model import AuditEvent, Claim, Order, RunState
 from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.postgres import Server
@@ -139,8 +138,8 @@ def test_a_station_that_lost_its_name_to_another_writes_no_more(
                 )
             second.recover()
             with pytest.raises(StationBusyError):
-                first.claim(Order(SERIAL, "A", bench.recipe, "jo"))
-            assert second.claim(Order(SERIAL, "A", bench.recipe, "jo")).serial == SERIAL
+                first.claim(Order(SERIAL, "A", "jo"), bench.recipe)
+            assert second.claim(Order(SERIAL, "A", "jo"), bench.recipe).serial == SERIAL
 
 
 def test_of_two_stations_that_claim_one_unit_one_gets_it(bench: Bench) -> None:
@@ -153,9 +152,8 @@ def test_of_two_stations_that_claim_one_unit_one_gets_it(bench: Bench) -> None:
         said: list[Claim | Refusal] = []
         for number in range(10):
             try:
-                said.append(
-                    store.claim(Order(f"W26051{number:02}", f"{number}", bench.recipe, "jo", "L1"))
-                )
+                order = Order(f"W26051{number:02}", f"{number}", "jo", "L1")
+                said.append(store.claim(order, bench.recipe))
             except ClaimRefusedError as error:
                 said.append(error.refusal)
         return said

@@ -10,7 +10,7 @@ import pytest
 
 from flasher.errors import UsageError
 from flasher.station.recipe import Golden
-from flasher.station.records.claims import Order, is_due
+from flasher.station.records.claims import is_due
 from flasher.station.records.errors import (
     ClaimRefusedError,
     NotFoundError,
@@ -19,6 +19,7 @@ from flasher.station.records.errors import (
     StationBusyError,
 )
 from flasher.station.records.model import (
+    Order,
     RunFilter,
     RunId,
     RunKind,
@@ -223,7 +224,7 @@ def test_wrong_scans_and_a_changed_recipe_begin_nothing(bench: Bench) -> None:
 
 def test_a_run_needs_an_operator_and_a_socket(bench: Bench) -> None:
     with pytest.raises(UsageError, match="operator"):
-        bench.store.claim(Order(SERIAL, "A", bench.recipe, " "))
+        bench.store.claim(Order(SERIAL, "A", " "), bench.recipe)
 
 
 def test_shifts_start_by_the_clock_on_the_wall() -> None:
@@ -271,7 +272,7 @@ def test_a_station_exists_once_and_claims_only_after_it_looked_back(bench: Bench
         with pytest.raises(StationBusyError, match=r"station.* already"):
             second.recover()
         with pytest.raises(RecordError, match="not the station"):
-            second.claim(Order(SERIAL, "B", bench.recipe, "jo"))
+            second.claim(Order(SERIAL, "B", "jo"), bench.recipe)
     bench.store.close()
     bench.store = bench.opened()
     bench.store.recover()
