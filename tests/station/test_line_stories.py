@@ -228,6 +228,11 @@ STORIES = {
         " @6.0 label by=jo unit=1 ; @8.8 card by=jo unit=1 ; @9.0 label by=jo unit=1 ;"
         " @10.0 pull unit=1"
     ),
+    "a number that the unit does not tell": (
+        "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 number=other answers=false ;"
+        " person name=jo source=mounted ; @11.8 put unit=2 socket=A ; @27.0 label by=jo unit=2 ;"
+        " @27.5 pull unit=2 ; @31.5 put unit=2 socket=A"
+    ),
     "pulled before the process of its socket stands still": (
         "line sockets=2 ; unit label=1 pace=slow ; person name=mo ; @3.0 put unit=1 socket=B ;"
         " @4.0 card by=mo unit=1 ; @5.0 label by=mo unit=1 ; @32.0 pull unit=1 ;"
@@ -407,6 +412,15 @@ UNDETECTABLE = {
             "line sockets=2 ; unit label=2 application=new ; unit label=5 answers=false ;"
             " person name=jo ; @3.0 card by=jo unit=5 socket=B ; @3.5 label by=jo unit=5 ;"
             " @4.0 put unit=5 socket=B ; @12.0 pull unit=5 ; @13.0 put unit=2 socket=B"
+        ),
+    ),
+    "starts with a maker's number, and answers nothing": (
+        COMPLETE,
+        (
+            "line sockets=2 ; unit label=2 number=maker answers=false ;"
+            " unit label=4 application=new ; person name=jo source=jo ;"
+            " @51.2 put unit=2 socket=B ; @51.23 card by=jo unit=2 ; @51.24 label by=jo unit=2 ;"
+            " @58.8 pull unit=2 ; @59.1 put unit=4 socket=B"
         ),
     ),
     "without power": (

@@ -46,8 +46,8 @@ class _Run:
 
     label: str
     unit: PaperUnit
-    number: str
-    """What the unit said that it is."""
+    number: str | None
+    """What the unit says that it is; None when it answers nothing."""
     had_application: bool
     operations: list[tuple[PaperUnit, int]]
     """All units that were in its socket, and how often each had been erased or written then."""
@@ -68,7 +68,7 @@ class _Run:
 class Promises:
     """Promises by the labels and sockets that they are about; raises Violation."""
 
-    def __init__(self, number_of: Callable[[PaperUnit], str]) -> None:
+    def __init__(self, number_of: Callable[[PaperUnit], str | None]) -> None:
         self._number_of = number_of
         self._sources: dict[str, str] = {}
         """Where each label was scanned last."""
@@ -157,11 +157,11 @@ class Promises:
         if socket in self._runs:
             self._runs[socket].operations.append((unit, unit.operations))
 
-    def pulled(self, socket: str, *, answers: bool, was_calm: bool) -> None:
+    def pulled(self, socket: str, *, was_calm: bool) -> None:
         """`was_calm`: it was in the socket and heard for some time before the run."""
         self.touched(socket)
         run = self._runs.get(socket)
-        if run is None or not answers:
+        if run is None or run.number is None:
             return
         if (run.is_identified or was_calm) and not run.is_flashed:
             run.was_running = (
@@ -173,7 +173,7 @@ class Promises:
         another one; empty where it has not reported anything yet.
         """
         run = self._runs.get(socket)
-        if run is None or step is None:
+        if run is None or run.number is None or step is None:
             return frozenset()
         if step in _AFTER_FLASH:
             return frozenset({run.number, run.label})
@@ -189,11 +189,12 @@ class Promises:
         if run is None:
             return
         label = run.label
-        says_other = run.number.startswith("W") and run.number != label
+        own = run.number or ""
+        says_other = own.startswith("W") and own != label
         if run.is_flashed and run.had_application and says_other:
             raise Violation(
                 "TOUCHED",
-                f"a unit that says that it is {run.number} was flashed as {label}",
+                f"a unit that says that it is {own} was flashed as {label}",
                 event.socket,
             )
         if run.is_flashed and not run.had_application and label not in self._carded:

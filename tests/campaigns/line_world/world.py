@@ -202,7 +202,7 @@ class World:
         """Labels whose PASS was shown."""
         people = (*setup.people, stories.Person(name=CAREFUL, source=CAREFUL))
         self.people = {each.name: PersonAtWork(each.name, each.source) for each in people}
-        self.promises = Promises(lambda unit: _stored(unit).number)
+        self.promises = Promises(self._told_number)
         self.station: Station | None = None
         self._station_at: float | None = None
         """When a station that died is started again."""
@@ -474,8 +474,7 @@ class World:
         if self._holds(bay):
             return False
         if self.setup.line.tells:
-            answers = self._setup_of(act.unit).answers
-            self.promises.pulled(bay.name, answers=answers, was_calm=_is_calm(bay))
+            self.promises.pulled(bay.name, was_calm=_is_calm(bay))
         else:
             self.promises.touched(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
@@ -498,6 +497,11 @@ class World:
 
     def _setup_of(self, unit: int) -> stories.UnitSetup:
         return next(each for each in self.setup.units if each.label == unit)
+
+    def _told_number(self, unit: PaperUnit) -> str | None:
+        """What a unit answers that it is; None when it answers nothing."""
+        number = next(number for number, each in self.units.items() if each is unit)
+        return _stored(unit).number if self._setup_of(number).answers else None
 
     def where(self, unit: int) -> Bay | None:
         """The socket that a unit is in."""
