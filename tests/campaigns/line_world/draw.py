@@ -32,7 +32,7 @@ def setup_of(chance: random.Random) -> Story:
     units = []
     for label in range(1, sockets + chance.choice((1, 2)) + 1):
         number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 0.5))[0]
-        firmware = "new" if chance.random() < 0.4 else "old"
+        firmware = "new" if chance.random() < 0.5 else "old"
         units.append(
             stories.UnitSetup(
                 label=label,
@@ -108,7 +108,7 @@ class Teller:
             self._serve: 8.0,
             self._exchange: 3.0,
             self._exchange_in_step: 3.0,
-            self._exchange_complete: 2.0,
+            self._exchange_complete: 6.0,
             self._swap: 2.0,
             self._clear: 5.0,
             self._take_out_again: 1.5,
@@ -190,40 +190,47 @@ class Teller:
         wait = self.chance.choice((self.chance.uniform(0.0, 0.15), self.chance.uniform(0.1, 0.9)))
         yield wait, stories.Label(by=name, unit=unit)
 
-    def _exchange_in_step(self, _name: str) -> Iterator[Step]:
+    def _exchange_in_step(self, name: str) -> Iterator[Step]:
         """Another unit into a socket, at a certain step of its run."""
-        bay = self.chance.choice(list(self.world.bays.values()))
-        is_at_its_end = self.chance.random() < 0.35
-        step = StepName.FLASH
-        if not is_at_its_end:
-            step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
-        if not (yield from self._await(bay, step, is_complete=is_at_its_end)):
+        yield from self._keep_busy(name)
+        step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
+        bay = yield from self._await(step)
+        if bay is None:
             return
         # The step began up to 0.1 s ago.
         yield self.chance.choice((0.0, self.chance.uniform(0.0, 0.3))), None
         if bay.unit is not None:
-            yield from self._put_another(bay, is_new=is_at_its_end)
+            yield from self._put_another(bay)
 
-    def _await(self, bay: Bay, step: StepName, *, is_complete: bool) -> Generator[Step, None, bool]:
-        """Wait for a step of a socket's run; False when it does not come."""
+    def _keep_busy(self, name: str) -> Iterator[Step]:
+        """Begin a run where none goes on."""
+        if not self._bays(full=True, working=True):
+            yield from self._serve(name)
+
+    def _await(
+        self, step: StepName, *, is_complete: bool = False
+    ) -> Generator[Step, None, Bay | None]:
+        """Wait for a step of a run: the socket in which it comes."""
         give_up_at = self.world.now + 10.0
-        while not (bay.is_working and bay.step is step and bay.is_complete >= is_complete):
-            if self.world.now > give_up_at:
-                return False
+        while self.world.now <= give_up_at:
+            for bay in self.world.bays.values():
+                if bay.is_working and bay.step is step and bay.is_complete >= is_complete:
+                    return bay
             yield 0.1, None
-        return True
+        return None
 
-    def _exchange_complete(self, _name: str) -> Iterator[Step]:
+    def _exchange_complete(self, name: str) -> Iterator[Step]:
         """A unit whose image is complete, for one that runs that firmware already."""
-        bay = self.chance.choice(list(self.world.bays.values()))
-        if not (yield from self._await(bay, StepName.FLASH, is_complete=True)):
+        new = {e.label for e in self.world.setup.units if e.application == "new"}
+        if not new & {*self._on_table()}:
             return
-        unit = None if bay.unit is None else self._setup(self._number(bay))
-        others = [self._setup(each) for each in self._on_table()]
-        others = [e for e in others if e.application == "new"]
-        if unit is not None and others:
+        yield from self._keep_busy(name)
+        bay = yield from self._await(StepName.FLASH, is_complete=True)
+        others = [self._setup(each) for each in self._on_table() if each in new]
+        if bay is not None and bay.unit is not None and others:
+            unit = self._setup(self._number(bay))
             other = self.chance.choice([e for e in others if e.number != unit.number] or others)
-            yield 0.0, stories.Pull(unit=unit.label)
+            yield self.chance.uniform(0.0, 0.4), stories.Pull(unit=unit.label)
             yield self.chance.choice(_GAPS_S), stories.Put(unit=other.label, socket=bay.name)
 
     def _take_out_again(self, name: str) -> Iterator[Step]:
@@ -284,14 +291,10 @@ class Teller:
         if bay.unit is not None:
             yield from self._put_another(bay)
 
-    def _put_another(self, bay: Bay, *, is_new: bool = False) -> Iterator[Step]:
-        """`is_new`: rather one that runs the recipe's firmware already."""
+    def _put_another(self, bay: Bay) -> Iterator[Step]:
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
         others = [each for each in self._on_table() if each != before] or [before]
-        if is_new:
-            new = {e.label for e in self.world.setup.units if e.application == "new"}
-            others = [each for each in others if each in new] or others
         unit = before if self.chance.random() < 0.1 else self.chance.choice(others)
         yield self.chance.choice(_GAPS_S), stories.Put(unit=unit, socket=bay.name)
 
