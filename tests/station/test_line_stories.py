@@ -238,6 +238,17 @@ STORIES = {
         " @4.0 card by=mo unit=1 ; @5.0 label by=mo unit=1 ; @32.0 pull unit=1 ;"
         " @33.0 stall socket=B seconds=4.0 ; @36.5 look"
     ),
+    "the label of an empty socket is scanned twice": (
+        "line sockets=1 ; unit label=3 ; unit label=4 ; person name=al ;"
+        " @13.0 label by=al unit=3 ; @21.0 card by=al unit=3 socket=A ;"
+        " @21.5 label by=al unit=3 ; @22.0 put unit=4 socket=A"
+    ),
+    "silent since the process of its socket began": (
+        "line sockets=2 ; unit label=1 pace=slow ; unit label=3 ; person name=jo ;"
+        " @3.0 put unit=1 socket=B ; @3.5 card by=jo unit=1 socket=B ;"
+        " @7.0 label by=jo unit=1 ; @8.0 worker socket=B ; @10.0 card by=jo unit=1 ;"
+        " @10.5 pull unit=1 ; @10.78 put unit=3 socket=B ; @11.0 label by=jo unit=1"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
@@ -430,23 +441,6 @@ UNDETECTABLE = {
             " @2.0 dip socket=B seconds=4.0 ; @3.0 put unit=1 socket=B ;"
             " @3.1 card by=mo unit=1 socket=B ; @3.5 pull unit=1 ; @4.0 put unit=2 socket=B ;"
             " @7.0 label by=mo unit=1"
-        ),
-    ),
-    "the label of an empty socket is scanned twice": (
-        SILENT,
-        (
-            "line sockets=1 ; unit label=3 ; unit label=4 ; person name=al ;"
-            " @13.0 label by=al unit=3 ; @21.0 card by=al unit=3 socket=A ;"
-            " @21.5 label by=al unit=3 ; @22.0 put unit=4 socket=A"
-        ),
-    ),
-    "silent since the process of its socket began": (
-        SILENT,
-        (
-            "line sockets=2 ; unit label=1 pace=slow ; unit label=3 ; person name=jo ;"
-            " @3.0 put unit=1 socket=B ; @3.5 card by=jo unit=1 socket=B ;"
-            " @7.0 label by=jo unit=1 ; @8.0 worker socket=B ; @10.0 card by=jo unit=1 ;"
-            " @10.5 pull unit=1 ; @10.78 put unit=3 socket=B ; @11.0 label by=jo unit=1"
         ),
     ),
     "a target that tells nothing, when its image is complete": (

@@ -33,7 +33,7 @@ class Pulled:
     step: StepName | None
     """Of the run; None: none went on."""
     was_silent: bool
-    """Its socket had heard nothing for some time, before the run began if there was one."""
+    """It had sent nothing for some time, before the run began if there was one."""
     is_mute: bool = False
     """Its application answers no question."""
 

@@ -18,7 +18,6 @@ from sqlalchemy import event
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.table import BootloaderState
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Command
 from flasher.station.events import (
     LineResumed,
@@ -119,8 +118,6 @@ class Bay:
     """Since when the same unit is in it, and the station runs."""
     blind_until: float = float("-inf")
     """Its process stands still, or has no adapter."""
-    launched_at: float = 0.0
-    """When its process began to listen."""
     emptied_at: float = float("-inf")
     disturbed_at: float = 0.0
     """When a hand, a failure or sleep last touched its unit or its process."""
@@ -323,7 +320,7 @@ class World:
     def _launch(self, setup: WorkerSetup) -> Process:
         bay = self.bays[setup.socket]
         bay.is_working = False
-        bay.changed_at = bay.disturbed_at = bay.launched_at = self.now
+        bay.changed_at = bay.disturbed_at = self.now
         bay.process = Process(
             setup, self.bench.recipe, bay.bus, lambda message: self._sent(bay, message)
         )
@@ -426,10 +423,6 @@ class World:
         is_new = engine.profile.factory_version == BMS_VERSION
         is_new = is_new or engine.stored_image == IMAGES[BMS].data
         if self.setup.line.tells:
-            if bay.run and bay.emptied_at < bay.run_at:
-                # The run waits for the first unit that is heard.
-                awaited = Pulled(bay.run, bay.run_at, BootloaderState.OFF, None, was_silent=True)
-                self.exchanges.pull(bay.name, awaited)
             known = self.promises.numbers_known(bay.name, bay.step if bay.is_working else None)
             number = _stored(unit).number
             is_alike = number in known if known else not number.startswith("W")
@@ -485,7 +478,7 @@ class World:
             self.now,
             unit.engine.state,
             bay.step if bay.is_working else None,
-            was_silent=bay.spoke_at < max(awaited_at - SILENCE_S, bay.launched_at),
+            was_silent=bay.spoke_at < awaited_at - SILENCE_S,
             is_mute=not self._setup_of(act.unit).answers,
         )
         self.exchanges.pull(bay.name, pulled)
