@@ -297,11 +297,14 @@ class Continuity:
         """Its power came, and it was heard before, or had been silent."""
         if self._has_acted or now <= self._supplied_until:
             return
+        # A unit is held from its identification on; before that, another one may be put in.
+        if self._goes_on and (self._is_identified or self.watcher.request is None):
+            return
         if not was_heard:
             self._lose("was silent when the run began, and announces its bootloader now")
         elif self.watcher.is_in_bootloader:
-            self._lose_by_restart("although this run had not restarted it")
-        elif not self._goes_on:
+            self._lose("announced its bootloader although this run had not restarted it")
+        else:
             self._lose("only announced its bootloader before, and runs an application now")
 
     def _take_announcement(self, now: float) -> None:
