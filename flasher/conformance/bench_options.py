@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from flasher import api
 from flasher.bus.fallback import Fallback
-from flasher.conformance.profile import ConformanceProfile, load_profile
 from flasher.conformance.real import (
     HOST_UNCERTAINTY_S,
     PowerControl,
@@ -24,11 +23,13 @@ from flasher.errors import UsageError
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plausible import check_plausible
-from flasher.mock.profile import DeviceProfile
 from flasher.procedures import check_sample
-from flasher.protocol.spec import WELLING
+from flasher.protocol.spec import WELLING, Target
 from flasher.protocol.text import printable
-from flasher.settings.device_model import set_options
+
+if TYPE_CHECKING:
+    from flasher.conformance.profile import ConformanceProfile
+    from flasher.mock.profile import DeviceProfile
 
 _ECHO_OPTIONS: Final[Mapping[str, Mapping[str, Any]]] = {
     "socketcan": {"receive_own_messages": True},
@@ -41,11 +42,12 @@ echo. For other interfaces the end of a frame is calculated from its length.
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """A bench as the user describes it, with file names. `bus` and `fallback` are arguments of
-    `api.connect`; `choices` are KEY=VALUE options of the device model.
+    """A bench as the user describes it, with file names, by options of the command line or of
+    pytest. `bus` and `fallback` are arguments of `api.connect`; `choices` are KEY=VALUE options of
+    the device model.
     """
 
-    target: str
+    target: str | Target | None
     is_mock: bool = False
     subject: str | None = None
     """A bootloader compiled for this computer: a program, a shared library or MODULE:FACTORY."""
@@ -66,11 +68,18 @@ class BenchOptions:
         """True for the device model and for a bootloader that runs on this computer."""
         return self.is_mock or self.subject is not None
 
+    @property
+    def device(self) -> Target:
+        """The target. Raises UsageError."""
+        return api.as_target(self.target or "")
+
 
 @contextmanager
 def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProfile]]:
     """Open the device under test and its profile. Raises UsageError, ImageError and BusError."""
     check_bench(options)
+    from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
+
     profile = None if options.profile is None else load_profile(options.profile)
     images = [_image(path, options) for path in (options.good_image, options.second_image)]
     good, second = (None if image is None else image.data for image in images)
@@ -88,9 +97,8 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     if options.subject is not None:
         from flasher.conformance.dut.subject import open_subject  # noqa: PLC0415  only here
 
-        target = api.as_target(options.target).name
         with open_subject(
-            options.subject, target, profile, good_image=good, second_image=second
+            options.subject, options.device.name, profile, good_image=good, second_image=second
         ) as (compiled, profile):
             _check_size(compiled.good_image, profile)
             yield compiled, profile
@@ -120,7 +128,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
         yield (
             RealSubject(
                 port,
-                api.as_target(options.target).name,
+                options.device.name,
                 good,
                 name=f"the device on {printable(connection.name)}",
                 second_image=second,
@@ -163,6 +171,7 @@ def check_bench(options: BenchOptions) -> None:
 def device_profile(choices: Sequence[str]) -> DeviceProfile:
     """Build the device model's profile from KEY=VALUE choices. Raises UsageError."""
     from flasher.conformance.mock import MOCK_PROFILE  # noqa: PLC0415  only for the mock
+    from flasher.settings.device_model import set_options  # noqa: PLC0415
 
     return set_options(MOCK_PROFILE, choices)
 
@@ -186,7 +195,7 @@ def _mock(
 
     choices, variant = device_profile(options.choices), options.variant
     subject = mock.MockSubject(
-        api.as_target(options.target).name,
+        options.device.name,
         profile=choices,
         make_device=None if variant is None else mock.variant_maker(variant),
         name="the built-in mock" + (f", variant {variant}" if variant else ""),

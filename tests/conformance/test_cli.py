@@ -8,18 +8,22 @@ import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from flasher.cli.bench.conformance import exit_code
+from flasher.cli.bench.conformance import conformance, exit_code
+from flasher.cli.framework import Option
 from flasher.conformance.bench import Bench
+from flasher.conformance.bench_options import BenchOptions
 from flasher.conformance.cases import rs
 from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
 from flasher.conformance.simulated import SimulatedPort
 from flasher.errors import BusError, ExitCode
+from pytest_flasher import BENCH_OPTIONS
 from tests.cli.conftest import SAMPLES, Flasher
 
 from .bench import PROFILE, fails_once, passes_once, run_case
@@ -60,7 +64,7 @@ def test_the_replay_has_what_is_about_the_bench_and_nothing_about_the_run(
     def mock_instead(_options: object) -> Iterator[tuple[MockSubject, ConformanceProfile]]:
         yield MockSubject(), PROFILE
 
-    monkeypatch.setattr("flasher.conformance.bench_options.open_bench", mock_instead)
+    monkeypatch.setattr("flasher.cli.bench.conformance_bench.open_bench", mock_instead)
     monkeypatch.chdir(tmp_path)
     words = shlex.split(
         "conformance -t bms --profile 'my p.toml' --case RS-04 -i socketcan --seed 9 --repeat 2 "
@@ -365,3 +369,16 @@ def test_the_profile_of_the_mock_is_what_the_mock_is_judged_by(
     assert load_profile(path).choice("tx_02") == "nak_next"
     run = flasher(*MOCK, *choice, "--profile", path, "--case", "UP-04")
     assert run.code == 0
+
+
+def test_command_line_pytest_and_bench_have_the_same_options() -> None:
+    panels = ("device", "device under test", "without hardware")
+    own = [each for each in conformance.params if isinstance(each, Option) and each.panel in panels]
+    assert {each.name for each in own} == {each.name for each in fields(BenchOptions)} - {
+        "bus",
+        "fallback",
+    }
+    others = {"--interface", "--channel", "--bitrate", "--bus-kwarg", "--seed"}
+    assert {name.replace("--btl-", "--") for name in BENCH_OPTIONS} - others == {
+        each.opts[-1] for each in own
+    }

@@ -18,9 +18,9 @@ from flasher.cli import values
 from flasher.cli.bench import conformance_explore, conformance_init
 from flasher.cli.bench.conformance_bench import (
     OUTPUT_OPTIONS,
-    BenchChoices,
     bench_options,
     confirm_wear,
+    described,
     opened,
     set_option,
 )
@@ -46,6 +46,7 @@ from flasher.cli.framework import (
 )
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
+from flasher.conformance.bench_options import BenchOptions
 from flasher.conformance.catalogue import (
     BRING_UP,
     CASES,
@@ -250,7 +251,7 @@ _choices = option_set(
 @bench_options
 @_choices
 @adapter_options
-def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
+def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) -> int:
     """Test a bootloader against the protocol, case by case: on a device on a bench, or on the
     built-in device model. Every case begins with a device that runs the known-good image; at the
     end that image is flashed once more and verified. The device is erased and written many times.
@@ -260,15 +261,15 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
     from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
 
-    described = bench.described(bus)
+    bench = described(bench, bus)
     _check_files(chosen)
     wear = chosen.selection.wears(chosen.upgrades)
-    if wear and not described.is_simulated:
+    if wear and not bench.is_simulated:
         named = ", ".join(f"{case_id} {count} times" for case_id, count in wear.items())
         confirm_wear(f"the device is erased and written: {named}", is_agreed=chosen.yes)
     started_at = datetime.now(UTC).isoformat(timespec="seconds")
     with (
-        opened(described, output) as (subject, profile, stopped),
+        opened(bench, output) as (subject, profile, stopped),
         progress(output) as observer,
     ):
         missing = bench_gaps(missing_requirements(subject, profile), chosen.selection.chosen())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -14,12 +14,11 @@ from flasher.cli.options import Bus, allow_implausible_option, target_option
 from flasher.cli.output import Output
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.terminal import agrees, can_ask
-from flasher.conformance.real import HOST_UNCERTAINTY_S
+from flasher.conformance.bench_options import BenchOptions, check_bench, open_bench
+from flasher.conformance.real import HOST_UNCERTAINTY_S, DevicePowerCommand, ReadbackCommand
 from flasher.errors import ErrorCode, UsageError
-from flasher.protocol.spec import Target
 
 if TYPE_CHECKING:
-    from flasher.conformance.bench_options import BenchOptions
     from flasher.conformance.profile import ConformanceProfile
     from flasher.conformance.subject import Subject
 
@@ -27,71 +26,34 @@ OUTPUT_OPTIONS: Final = ("--json", "--events", "--verbose", "--quiet", "--log-fi
 """What a command that runs something again leaves out."""
 
 
-@dataclass(frozen=True)
-class BenchChoices:
-    """The device under test."""
-
-    target: Target | None
-    profile: str | None
-    good_image: str | None
-    second_image: str | None
-    allow_implausible: bool
-    power_cmd: str | None
-    readback_cmd: str | None
-    uncertainty: float
-    mock: bool
-    subject: str | None
-    variant: str | None
-    choices: tuple[str, ...]
-
-    def described(self, bus: Bus) -> BenchOptions:
-        """The bench. Raises UsageError for one that makes no sense."""
-        from flasher.conformance.bench_options import BenchOptions, check_bench  # noqa: PLC0415
-        from flasher.conformance.real import DevicePowerCommand, ReadbackCommand  # noqa: PLC0415
-
-        if self.target is None:
-            raise UsageError(
-                "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
-            )
-        for name, value in {"--variant": self.variant, "--set": self.choices}.items():
-            if value and not self.mock:
-                raise UsageError(f"{name} works with --mock only.")
-        without = "--mock" if self.mock else "--subject" if self.subject else ""
-        bench_only = {"--power-cmd": self.power_cmd, "--readback-cmd": self.readback_cmd}
-        for name, value in bench_only.items():
-            if value and without:
-                raise UsageError(f"{name} works without {without} only.")
-        bench = BenchOptions(
-            target=self.target.name,
-            is_mock=self.mock,
-            subject=self.subject,
-            variant=self.variant,
-            choices=self.choices,
-            profile=self.profile,
-            good_image=self.good_image,
-            second_image=self.second_image,
-            allow_implausible=self.allow_implausible,
-            bus=bus.config,
-            fallback=None if without else bus.fallback,
-            power=None if self.power_cmd is None else DevicePowerCommand(self.power_cmd),
-            readback=None if self.readback_cmd is None else ReadbackCommand(self.readback_cmd),
-            uncertainty_s=self.uncertainty,
+def described(bench: BenchOptions, bus: Bus) -> BenchOptions:
+    """The bench with its adapter. Raises UsageError for options that contradict each other."""
+    if bench.target is None:
+        raise UsageError(
+            "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
         )
-        check_bench(bench)
-        return bench
+    for name, value in {"--variant": bench.variant, "--set": bench.choices}.items():
+        if value and not bench.is_mock:
+            raise UsageError(f"{name} works with --mock only.")
+    without = "--mock" if bench.is_mock else "--subject" if bench.subject else ""
+    for name, command in {"--power-cmd": bench.power, "--readback-cmd": bench.readback}.items():
+        if command and without:
+            raise UsageError(f"{name} works without {without} only.")
+    bench = replace(bench, bus=bus.config, fallback=None if without else bus.fallback)
+    check_bench(bench)
+    return bench
 
 
 @contextmanager
 def opened(
-    described: BenchOptions, output: Output
+    bench: BenchOptions, output: Output
 ) -> Iterator[tuple[Subject, ConformanceProfile, Stop]]:
     """The device, its profile, and whether the user has enough of it."""
-    from flasher.conformance.bench_options import open_bench  # noqa: PLC0415  much is loaded
 
     def stopping() -> None:
         output.progress("stopping: the device gets its good image back; press again to end at once")
 
-    with open_bench(described) as (subject, profile), stop_on_signal(stopping) as stopped:
+    with open_bench(bench) as (subject, profile), stop_on_signal(stopping) as stopped:
         yield subject, profile, stopped
 
 
@@ -124,7 +86,7 @@ set_option: Final = _without_hardware(
 )  # fmt: skip
 bench_options: Final = option_set(
     "bench",
-    BenchChoices,
+    BenchOptions,
     target_option(required=False),
     _bench(
         "--profile", metavar="FILE", type=values.FilePath("toml"), brief=True,
@@ -134,19 +96,20 @@ bench_options: Final = option_set(
     _image("--second-image", help="another one, smaller, of another version"),
     allow_implausible_option("device under test"),
     _bench(
-        "--power-cmd", metavar="COMMAND",
+        "--power-cmd", "power", type=DevicePowerCommand, metavar="COMMAND",
         help="command that switches the device, as 'relay 3 {on|off}'",
     ),
     _bench(
-        "--readback-cmd", metavar="COMMAND",
+        "--readback-cmd", "readback", type=ReadbackCommand, metavar="COMMAND",
         help="command that dumps the application area, as 'dump {file}'",
     ),
     _bench(
-        "--uncertainty", type=values.seconds, default=HOST_UNCERTAINTY_S, metavar="SECONDS",
+        "--uncertainty", "uncertainty_s", type=values.seconds, default=HOST_UNCERTAINTY_S,
+        metavar="SECONDS",
         help="how far the adapter's and the computer's times may be off",
     ),
     _without_hardware(
-        "--mock", is_flag=True, brief=True,
+        "--mock", "is_mock", is_flag=True, brief=True,
         help="test the device model in this process; takes no time",
     ),
     _without_hardware(

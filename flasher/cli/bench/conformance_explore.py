@@ -16,15 +16,16 @@ from flasher.cli import values
 from flasher.cli.bar import Bar
 from flasher.cli.bench.conformance_bench import (
     OUTPUT_OPTIONS,
-    BenchChoices,
     bench_options,
     confirm_wear,
+    described,
     opened,
 )
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
+from flasher.conformance.bench_options import BenchOptions
 from flasher.conformance.results import ExploreResult
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
@@ -75,7 +76,7 @@ _what = partial(option, panel="what is run, and how")
 def explore(
     output: Output,
     bus: Bus,
-    bench: BenchChoices,
+    bench: BenchOptions,
     *,
     steps: int,
     seed: str,
@@ -88,14 +89,14 @@ def explore(
     """
     from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
 
-    described = bench.described(bus)
+    bench = described(bench, bus)
     check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
-    if not (described.is_simulated or replay):
+    if not (bench.is_simulated or replay):
         erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
         said = f"{steps} steps erase and write the device about {erases} times"
         confirm_wear(said, is_agreed=yes)
     with (
-        opened(described, output) as (subject, profile, stopped),
+        opened(bench, output) as (subject, profile, stopped),
         Bar(output, leave=False, unit=" steps") as bar,
     ):
         explorer = Explorer(

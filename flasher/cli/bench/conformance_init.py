@@ -10,9 +10,9 @@ from typing import Final
 from flasher.cli import values
 from flasher.cli.bar import Bar
 from flasher.cli.bench.conformance_bench import (
-    BenchChoices,
     bench_options,
     confirm_wear,
+    described,
     opened,
 )
 from flasher.cli.documents import document_of
@@ -20,6 +20,7 @@ from flasher.cli.files import check_new, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
+from flasher.conformance.bench_options import BenchOptions
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
@@ -86,7 +87,7 @@ _what = partial(option, panel="what is written")
 @_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
 @adapter_options
 def init(
-    output: Output, bus: Bus, bench: BenchChoices, *, file: Path | None, force: bool, yes: bool
+    output: Output, bus: Bus, bench: BenchOptions, *, file: Path | None, force: bool, yes: bool
 ) -> int:
     """Ask a device everything that a profile says, on the bus alone, and write the profile with
     what was seen. The good image runs before and after it.
@@ -94,16 +95,16 @@ def init(
     from flasher.conformance.init import UPGRADES, ask_device  # noqa: PLC0415  much is loaded
     from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
 
-    described = bench.described(bus)
-    path = file or Path(f"{described.target}.toml")
+    bench = described(bench, bus)
+    path = file or Path(f"{bench.device.name}.toml")
     check_new(path, _OUTPUT, force=force)
     # What the bench knows of its device besides has to be seen like everything else.
     start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
-    if not described.is_simulated:
+    if not bench.is_simulated:
         said = f"the questions erase and write the device about {UPGRADES} times"
         confirm_wear(said, is_agreed=yes)
     with (
-        opened(described, output) as (subject, _, stopped),
+        opened(bench, output) as (subject, _, stopped),
         Bar(output, leave=False, unit=" questions") as bar,
     ):
         asked = ask_device(subject, start, stopped=stopped, progress=bar.move_to)
