@@ -49,7 +49,7 @@ BENCH_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "--btl-set": ("KEY=VALUE", "with --btl-mock: a choice of it; repeatable", _SEVERAL),
     "--btl-seed": ("SEED", "decides all that is left to chance", {"default": "1"}),
 }
-"""What says which device is tested, and how: metavar (none for a flag), help, and more."""
+"""Options that select and describe the device: metavar (none for a flag), help, and arguments."""
 _RUN_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "--btl-suite": ("", "collect the cases of the conformance suite too", _FLAG),
     "--btl-quick": ("", "of the suite only what takes under a minute", _FLAG),
@@ -61,14 +61,13 @@ _RUN_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The options, which all begin with --btl."""
     group = parser.getgroup("btl", "bootloader under test (flasher conformance)")
     for name, (metavar, text, more) in (BENCH_OPTIONS | _RUN_OPTIONS).items():
         group.addoption(name, help=text, **({"metavar": metavar} if metavar else {}), **more)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the markers; everything else only where a bench is named."""
+    """Declare the markers; register the hooks only when a device is given."""
     for line in _MARKERS:
         config.addinivalue_line("markers", line)
     if _is_active(config):
@@ -81,7 +80,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _is_active(config: pytest.Config) -> bool:
-    """True when the command line names a device under test."""
+    """True when the command line selects a device under test."""
     return any(config.getoption(f"btl_{name}") for name in ("mock", "subject", "target"))
 
 
@@ -90,15 +89,15 @@ def _is_active(config: pytest.Config) -> bool:
 
 @pytest.fixture(scope="session")
 def btl_power_control() -> Callable[[bool], None] | None:
-    """To be overridden, in the conftest.py of the root directory: a function that switches the
-    device on (True) or off, in place of --btl-power-cmd.
+    """Override in the root directory's conftest.py: a function that switches the device on (True)
+    or off, instead of --btl-power-cmd.
     """
     return None
 
 
 @pytest.fixture(scope="session")
 def btl_readback_control() -> Callable[[], bytes] | None:
-    """To be overridden as `btl_power_control`: a function that yields the application area."""
+    """Override like `btl_power_control`: a function that returns the application area."""
     return None
 
 
@@ -108,8 +107,8 @@ def btl_run(
     btl_power_control: Callable[[bool], None] | None,
     btl_readback_control: Callable[[], bytes] | None,
 ) -> Iterator[PluginRun]:
-    """The run on the one device: opened with the first test that needs it; at the end the good
-    image is flashed and verified.
+    """The run on the device: opened by the first test that needs it; flashes and verifies the good
+    image at the end.
     """
     if not _is_active(request.config):
         pytest.skip("no device under test: give --btl-target with an adapter, or --btl-mock")
@@ -121,25 +120,25 @@ def btl_run(
 
 @pytest.fixture(scope="session")
 def btl_device(btl_run: PluginRun) -> Subject:
-    """The device under test: its images, and what this bench can do to it."""
+    """The device under test: its images and capabilities."""
     return btl_run.subject
 
 
 @pytest.fixture(scope="session")
 def btl_bus(btl_device: Subject) -> BusPort:
-    """The way to the bus: single frames, with their times."""
+    """The bus of the device: single frames with their times."""
     return btl_device.port
 
 
 @pytest.fixture(scope="session")
 def btl_profile(btl_run: PluginRun) -> ConformanceProfile:
-    """What the product is judged by."""
+    """The product's profile."""
     return btl_run.profile
 
 
 @pytest.fixture(scope="session")
 def btl_measurements(btl_run: PluginRun) -> Measurements:
-    """The times of the whole session, by name."""
+    """Times measured in the session, by name."""
     return btl_run.measurements
 
 
@@ -148,8 +147,8 @@ def btl_measurements(btl_run: PluginRun) -> Measurements:
 
 @pytest.fixture
 def btl_bench(request: pytest.FixtureRequest, btl_run: PluginRun) -> Iterator[Bench]:
-    """What a case works with. The good image's application runs before the test and after it; a
-    check that failed fails the test, even where the test went on.
+    """Bench for one test. The good image's application runs before and after the test; a failed
+    check fails the test, even if the test continued.
     """
     node: Any = request.node
     yield from btl_run.bench_for(node)
@@ -165,7 +164,7 @@ def btl_power(btl_bench: Bench) -> Callable[[bool], None]:
 
 @pytest.fixture
 def btl_trace(btl_bench: Bench) -> BenchTrace:
-    """The frames of this test so far, and how to save them."""
+    """The frames of this test so far; can be saved to a file."""
     from flasher.conformance.plugin import BenchTrace  # noqa: PLC0415
 
     return BenchTrace(btl_bench)

@@ -1,6 +1,6 @@
-"""The catalogue: what a case is, which cases there are, and which of them a run has.
+"""Catalogue of the cases: registration by `@case(...)`, selection, and what a bench cannot judge.
 
-A case registers itself with `@case(...)`; how to write one stands in `flasher.conformance.cases`.
+`flasher.conformance.cases` explains how to write a case.
 """
 
 from __future__ import annotations
@@ -38,15 +38,13 @@ GROUPS: Final = {
     "SO": "soak",
     "SP": "speed",
 }
-"""The groups in the order of the catalogue, with their titles."""
+"""Groups in catalogue order, with their titles."""
 WEAR: Final = {"SO-01": 1000, "SP-01": 50, "SP-02": 60}
-"""Cases of the groups that run only when they, or their groups, are named: how often each one has
-the device upgraded, unless it is told otherwise.
-"""
+"""Cases that run only when they or their groups are named, with the default number of upgrades."""
 NOT_IMPLEMENTED: Final[dict[str, str]] = {
     "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line",
 }
-"""Case of the bootloader to the reason why software cannot run it; reported as unsupported."""
+"""Bootloader cases that software cannot run, with the reason; reported as unsupported."""
 HOST_CASES: Final = (
     *("RS-06", "RS-07", "RS-08", "RS-09"),
     "UP-07",
@@ -58,7 +56,7 @@ HOST_CASES: Final = (
     "SE-02",
     "CO-03",
 )
-"""Cases of the host: they run against flasher's own host, in the project's tests."""
+"""Cases of the host, which run against flasher's own host in the project's tests."""
 QUICK: Final = (
     BRING_UP,
     *("FR-02", "FR-03", "FR-04", "FR-08", "FR-09"),
@@ -69,36 +67,36 @@ QUICK: Final = (
     *("EN-02", "EN-07", "EN-08"),
     "BU-06",
 )
-"""What a quick run has: of every group that needs no minutes, what takes least on the bus."""
+"""Cases of a quick run: those that take the least time on the bus."""
 
 
 class Requirement(Enum):
-    """What a case needs, or does; the value is how reports and options name it."""
+    """What a case needs or does; reports and options use the value."""
 
     POWER = "power"
     """Switches the device off and on."""
     READBACK = "readback"
-    """Reads the flash back past the protocol."""
+    """Reads the flash by other means than the protocol."""
     IMAGE_READBACK = "image-readback"
-    """Compares the flash with the image that runs, by readback or by the memory over the bus."""
+    """Compares the flash with the running image, by readback or by memory queries over the bus."""
     BUS_OFF = "bus-off"
-    """Makes the device's CAN controller go off the bus."""
+    """Forces the device's CAN controller into bus-off."""
     TIMED_CUT = "timed-cut"
-    """Cuts the power at the very moment of a flash operation or a frame."""
+    """Cuts the power at the moment of a flash operation or a frame."""
     SECOND_IMAGE = "second-image"
     """Needs a second good image, smaller than the first one."""
     CHECKSUM = "checksum"
-    """Needs a product whose images carry a checksum of their own (profile, en_04)."""
+    """Needs images that contain a checksum (profile key en_04)."""
     DESTRUCTIVE = "destructive"
-    """Erases the application, or may; it is put back after the case."""
+    """May erase the application, which is restored after the case."""
     LONG = "long"
-    """Takes more than some seconds on a real bus."""
+    """Takes more than a few seconds on a real bus."""
     TIMING = "timing"
-    """Judges times: what the adapter's time stamps are worth decides."""
+    """Judges times, so the accuracy of the adapter's time stamps matters."""
     ERROR_FRAMES = "error-frames"
     """Sends error frames."""
     VERSION = "version"
-    """Needs an application that tells its version."""
+    """Needs an application that reports its version."""
 
 
 DESTRUCTIVE: Final = Requirement.DESTRUCTIVE
@@ -110,8 +108,8 @@ CaseScript = Callable[["Bench"], None]
 
 @dataclass(frozen=True)
 class Case:
-    """One case of the catalogue. `clause` names what it is judged by, as `clauses` lists it;
-    `choices` are the keys of the profile that decide.
+    """One case of the catalogue. `clause` names keys of `clauses.CLAUSES`; `choices` are the
+    profile keys that decide its verdict.
     """
 
     id: str
@@ -123,7 +121,7 @@ class Case:
     requires: frozenset[Requirement] = frozenset()
     choices: tuple[str, ...] = ()
     limit_s: float = 300.0
-    """The case is ended after this time on the bench's clock."""
+    """Time limit of the case on the bench's clock."""
 
 
 CASES: Final[dict[str, Case]] = {}
@@ -133,8 +131,8 @@ CASES: Final[dict[str, Case]] = {}
 def case(
     case_id: str, title: str, *, clause: str, requires: Collection[Requirement] = (), **more: Any
 ) -> Callable[[CaseScript], CaseScript]:
-    """Register the function below as a case, with the fields of `Case`. Raises ValueError for an id
-    that is taken and a clause that does not exist.
+    """Register the decorated function as a case with the fields of `Case`. Raises ValueError for a
+    duplicate id or an unknown clause.
     """
 
     def register(run: CaseScript) -> CaseScript:
@@ -149,23 +147,23 @@ def case(
 
 
 def group_of(case_id: str) -> str:
-    """The first part of an id: "TX" of "TX-03"."""
+    """The group of a case id: "TX" for "TX-03"."""
     return case_id.partition("-")[0]
 
 
 def known_cases() -> tuple[str, ...]:
-    """The ids of all cases, implemented or not."""
+    """Ids of all cases, including those not implemented."""
     return (*CASES, *NOT_IMPLEMENTED)
 
 
 def catalogue_order(case_ids: Iterable[str]) -> list[str]:
-    """Case ids in the order of the catalogue."""
+    """Sort case ids into catalogue order."""
     groups = list(GROUPS)
     return sorted(case_ids, key=lambda case_id: (groups.index(group_of(case_id)), case_id))
 
 
 def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
-    """What a report says about a case, implemented or not."""
+    """The texts of a case for reports."""
     case = CASES.get(case_id)
     deviation = profile.deviations.get(case_id, "")
     if case is None:
@@ -190,8 +188,8 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
 
 @dataclass(frozen=True)
 class Selection:
-    """Cases to run: those of `cases` and of `groups`, all but those of `WEAR` when both are empty;
-    of a `quick` run, those of `QUICK` and of `cases`. None of `excluded`, cases or groups, is run.
+    """Which cases to run: `cases` and `groups`, or all except `WEAR` when both are empty; with
+    `quick` only `QUICK` and `cases`; never `excluded` cases or groups.
     """
 
     cases: tuple[str, ...] = ()
@@ -200,7 +198,7 @@ class Selection:
     excluded: tuple[str, ...] = ()
 
     def has(self, case_id: str) -> bool:
-        """True for a case that is to be run; one that is named is, however long it takes."""
+        """True when the case is to be run; a case named in `cases` runs however long it takes."""
         if case_id in self.excluded or group_of(case_id) in self.excluded:
             return False
         if case_id in self.cases:
@@ -211,11 +209,11 @@ class Selection:
         return is_named and (not self.quick or case_id in QUICK)
 
     def chosen(self) -> list[str]:
-        """The ids of all cases to be run, in the order of the catalogue."""
+        """Ids of the cases to run, in catalogue order."""
         return [case_id for case_id in catalogue_order(known_cases()) if self.has(case_id)]
 
     def wears(self, upgrades: int | None = None) -> dict[str, int]:
-        """Those of `WEAR` that are to be run, with how often each one has the device upgraded."""
+        """Selected cases of `WEAR`, with their number of upgrades."""
         return {case_id: upgrades or count for case_id, count in WEAR.items() if self.has(case_id)}
 
     def check(self) -> None:
@@ -251,7 +249,7 @@ MISSING_ON_BARE_BENCH: Final = {
     ),
     Requirement.ERROR_FRAMES: ("an adapter that sends error frames", _SIMULATED),
 }
-"""What a bench of device, adapter and good image lacks, each with what adds it."""
+"""What a bench of device, adapter and good image lacks: text, and the option that adds it."""
 _LACKS: Final = {
     **MISSING_ON_BARE_BENCH,
     Requirement.CHECKSUM: (
@@ -267,7 +265,7 @@ FULL_BENCH: Final = (
     *(Requirement.POWER, Requirement.READBACK, Requirement.IMAGE_READBACK),
     Requirement.SECOND_IMAGE,
 )
-"""What can be added to a bench with a real device."""
+"""Requirements that can be added to a bench with a real device."""
 _IN_PART: Final = {
     Requirement.SECOND_IMAGE: ("EN-01", "EN-07", "SO-01"),
     Requirement.TIMED_CUT: ("PW-01",),
@@ -279,13 +277,13 @@ _IN_PART: Final = {
     ),
     Requirement.VERSION: ("SE-01", "SP-01"),
 }
-"""Cases that are judged in part without something."""
+"""Cases that are judged only in part without a requirement."""
 _WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01", "SP-01")
-"""Destructive cases that do not look into the flash; of all others, some part compares it."""
+"""Destructive cases that do not read the flash; all others compare it in some part."""
 
 
 def missing_requirements(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
-    """What this bench does not have."""
+    """Requirements that this bench does not meet."""
     has = {
         Requirement.POWER: subject.has_power,
         Requirement.READBACK: subject.has_readback,
@@ -301,7 +299,7 @@ def missing_requirements(subject: Subject, profile: ConformanceProfile) -> list[
 
 
 def bench_gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[Gap, ...]:
-    """What a bench that lacks this cannot judge of the `chosen` cases."""
+    """List which of the `chosen` cases a bench without `lacks` cannot judge, fully or in part."""
     cases = [CASES[case_id] for case_id in chosen if case_id in CASES]
     run = [case for case in cases if not case.requires.intersection(lacks)]
     found = []
@@ -315,7 +313,7 @@ def bench_gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[G
 
 
 def full_verdict_needs(case_id: str) -> tuple[str, ...]:
-    """What a bench needs to judge all of a case, beside what it needs to run it."""
+    """Requirements for judging the whole case, in addition to those for running it."""
     case = CASES.get(case_id)
     found = [need for need, case_ids in _IN_PART.items() if case_id in case_ids]
     compares = case is not None and DESTRUCTIVE in case.requires and case_id not in _WITHOUT_FLASH
@@ -325,7 +323,7 @@ def full_verdict_needs(case_id: str) -> tuple[str, ...]:
 
 
 def why_unsupported(case: Case, subject: Subject, profile: ConformanceProfile) -> str:
-    """Why this bench cannot run a case; empty when it can."""
+    """Why this bench cannot run a case; "" when it can."""
     lacks = [
         _LACKS[need][0] for need in missing_requirements(subject, profile) if need in case.requires
     ]

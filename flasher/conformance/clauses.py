@@ -1,5 +1,5 @@
-"""The clauses that cases are judged by, each with its content in this project's words: those of the
-vendor's document under its own numbers, and the readings of what it leaves open.
+"""Clauses that the cases refer to, in this project's words: the vendor document's, by its own
+numbers, and this project's readings R1 to R28 of what the document leaves open.
 """
 
 from __future__ import annotations
@@ -7,9 +7,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 ROBUSTNESS: Final = "robustness, not in the document"
-"""Label of a case that no clause asks for; what the product does is a choice in the profile, or it
-only has to stay reachable.
-"""
+"""Label of a case without a clause: the profile decides, or the device must stay reachable."""
 _DOCUMENT: Final = {
     "2.1": "CAN 2.0A: classic frames of up to 8 bytes with 11-bit ids, at 250 kbit/s",
     "2.2.1, table 1": "a message is header 55 AA, mode, length, command, data, CRC, tail F0",
@@ -56,16 +54,16 @@ _DOCUMENT: Final = {
 
 
 class ClauseReading(NamedTuple):
-    """How this project reads a place where the documents are silent or contradict themselves."""
+    """This project's reading of a place where the documents are silent or contradictory."""
 
     asks: str
     why: str
     suite: tuple[str, ...] = ()
-    """Keys of the suite's profile that change it."""
+    """Suite profile keys that change it."""
     host: tuple[str, ...] = ()
-    """Keys of the host's profile (`flasher profile`) that change it."""
+    """Host profile keys (`flasher profile`) that change it."""
     model: tuple[str, ...] = ()
-    """Choices of the device model (`flasher mock --set`) that change it."""
+    """Device model options (`flasher mock --set`) that change it."""
 
 
 READINGS: Final = {
@@ -290,13 +288,13 @@ CLAUSES: Final = {
     **{number: reading.asks for number, reading in READINGS.items()},
     ROBUSTNESS: "no clause asks for it, but a bootloader on a real bus meets it",
 }
-"""Every clause with its content."""
+"""Text of every clause by its label."""
 
 
 def clause_texts(clause: str) -> dict[str, str]:
-    """The clauses that a case names ("Welling 5.2, table 8 (A10B); R9") with their contents.
+    """Texts of the clauses that a case names ("Welling 5.2, table 8 (A10B); R9").
 
-    Raises ValueError for one that does not exist.
+    Raises ValueError for an unknown clause.
     """
     named = clause.split("; ")
     unknown = [label for label in named if label not in CLAUSES]

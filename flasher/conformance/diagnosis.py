@@ -1,4 +1,4 @@
-"""What was heard of a device that could not be upgraded, and which change would make it fit."""
+"""Diagnosis of a device that could not be upgraded, from the received frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CRC_AT: Final = slice(-5, -1)
 
 
 class _Crc(NamedTuple):
-    """A way to compute the CRC field; the defaults are the document's."""
+    """A way to compute the CRC field; the defaults follow the document."""
 
     start: int = 0xFFFF_FFFF
     is_widened: bool = True
@@ -26,7 +26,7 @@ class _Crc(NamedTuple):
     inverts: bool = False
 
     def of(self, can_id: int, body: bytes) -> bytes:
-        """The field for a message; `body` is mode to last data byte."""
+        """Compute the CRC field of a message; `body` is mode to last data byte."""
         head = b"\x55\xaa" if self.has_header else b""
         own_id = b"" if self.id_order == "none" else can_id.to_bytes(2, self.id_order)  # type: ignore[arg-type]
         value = crc(head + own_id + body, start=self.start, steps=4 if self.is_widened else 1)
@@ -35,7 +35,7 @@ class _Crc(NamedTuple):
 
     @property
     def differences(self) -> list[str]:
-        """How it differs from the document's."""
+        """Differences from the document, as text."""
         differs = {
             "a start value of 0": self.start == 0,
             "one step of the table a byte, in the place of four": not self.is_widened,
@@ -62,12 +62,12 @@ _CRCS: Final = sorted(
     ),
     key=lambda each: len(each.differences),
 )
-"""From the document's to those that differ from it most."""
+"""All variants, the one closest to the document first."""
 
 
 def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool = True) -> list[str]:
-    """What was received, and what would make it fit, in sentences; the likeliest cause first. A
-    device that `has_wires` may be silent because of them.
+    """Explain what was received and which change would fix it, the likeliest cause first. With
+    `has_wires`, silence may be a wiring problem.
     """
     heard = [(entry.frame, entry.at_s) for entry in trace if not entry.sent]
     frames = [frame for frame, _ in heard if not frame.is_error]
@@ -91,13 +91,13 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
 
 
 def _with_counts(texts: Iterable[str]) -> str:
-    """The most frequent ones, with their numbers."""
+    """The most frequent texts with their counts."""
     found = Counter(texts).most_common(_SHOWN)
     return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in found)
 
 
 def _diagnose_senders(frames: Sequence[RawFrame], encoder: Encoder) -> str:
-    """Nothing came on the id that has to answer."""
+    """No frame arrived on the id of the device's answers: explain which ids were seen instead."""
     own = f"{encoder.to_tool:03X}"
     extended = [frame.can_id for frame in frames if frame.is_extended]
     if any(encoder.to_tool in (can_id, can_id >> 18) for can_id in extended):
@@ -113,7 +113,7 @@ def _diagnose_senders(frames: Sequence[RawFrame], encoder: Encoder) -> str:
 
 
 def _diagnose_framing(damaged: Sequence[Received], own: str) -> str:
-    """Messages came that are none: which other form makes messages of all of them."""
+    """Damaged messages arrived: find a framing or CRC variant that fits all of them."""
     raws = [message.raw for message in damaged]
     if any(raw.startswith(_OTHER_HEADER) for raw in raws):
         return f"{own} speaks; its messages begin with AA 55, in the place of 55 AA"
@@ -139,7 +139,7 @@ def _diagnose_framing(damaged: Sequence[Received], own: str) -> str:
 
 
 def _diagnose_protocol(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
-    """The messages are whole; what about them does not belong to the protocol."""
+    """Intact messages arrived: list what contradicts the protocol."""
     names = {one.boot_name for one in messages if one.kind is MessageKind.BOOT_VERSION}
     for other in encoder.others():
         if other.boot_name in names:

@@ -1,7 +1,7 @@
-"""Two runs compared: what got better, worse, slower, what is new and what is gone.
+"""Comparison of two runs: changed verdicts, changed times, new and missing cases.
 
-Reads the files of `--json-report` (or the output of `--json`). A case that was run several times
-counts with its worst verdict.
+Reads files of `--json-report` or output of `--json`. A case that was repeated counts with its worst
+verdict.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.text import printable
 
 THRESHOLD_PERCENT: Final = 10.0
-"""A median or 95th percentile that grew by more is slower, if it grew by more than what the two
-measurements may be off together."""
+"""A median or 95th percentile counts as slower when it grew by more than this and by more than the
+uncertainty of both measurements together.
+"""
 _NOT_JUDGED: Final = frozenset({CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN})
 _RANKS: Final = {verdict: rank for rank, verdict in enumerate(CaseVerdict)} | {CaseVerdict.INFO: 0}
 _CONDITIONS: Final = ("target", "bitrate_bps", "seed", "timestamp_source", "profile_source")
@@ -27,20 +28,20 @@ _CONDITIONS: Final = ("target", "bitrate_bps", "seed", "timestamp_source", "prof
 
 @dataclass(frozen=True)
 class VerdictChange:
-    """A case whose verdict is another one in the newer run."""
+    """A case whose verdict changed."""
 
     id: str
     title: str
     before: CaseVerdict | None
-    """None (null) where it was not judged."""
+    """None (null) when the case was not judged."""
     after: CaseVerdict | None
     reason: str
-    """What the newer run says of it."""
+    """Reason given by the newer run."""
 
 
 @dataclass(frozen=True)
 class TimeChange:
-    """A measured time that changed beyond the threshold."""
+    """A measured time that changed by more than the threshold."""
 
     name: str
     figure: str
@@ -50,20 +51,20 @@ class TimeChange:
 
     @property
     def percent(self) -> float:
-        """By how much it grew; negative for a faster one."""
+        """Change in percent; negative when faster."""
         return (self.after_s / self.before_s - 1) * 100 if self.before_s else float("inf")
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Two runs compared."""
+    """Difference between two runs."""
 
     threshold_percent: float
     better: Sequence[VerdictChange]
     worse: Sequence[VerdictChange]
     new: Sequence[VerdictChange]
     gone: Sequence[VerdictChange]
-    """Judged in the older run, not in the newer one."""
+    """Judged in the older run but not in the newer one."""
     less: Sequence[VerdictChange]
     """Passed in full in the older run, in part in the newer one."""
     more: Sequence[VerdictChange]
@@ -71,11 +72,11 @@ class Difference:
     faster: Sequence[TimeChange]
     unchanged: int
     conditions: Sequence[str]
-    """What else differs between the runs."""
+    """Other differences between the runs."""
 
     @property
     def is_worse(self) -> bool:
-        """True when a case that was judged in both runs got worse, or a new one fails."""
+        """True when a case judged in both runs got worse or a new case fails."""
         return bool(self.worse) or any(
             change.after in (CaseVerdict.FAIL, CaseVerdict.ERROR) for change in self.new
         )
@@ -121,7 +122,7 @@ def _not_a_report(
 def compare(
     old: RunReport, new: RunReport, threshold_percent: float = THRESHOLD_PERCENT
 ) -> Difference:
-    """What is different in `new`."""
+    """Compare `new` with `old`."""
     before, after = _judged(old), _judged(new)
     titles = {case.id: case.title for case in (*old.cases, *new.cases)}
     reasons = reasons_of(new)

@@ -1,7 +1,6 @@
-"""The report of a run as a self-contained page: verdict, matrix of the cases, what went wrong with
-the decoded frames, how the measured times are spread.
+"""HTML report of a run: verdict, cases, decoded frames of failures, distribution of times.
 
-What could grow with a run is cut here; the template `conformance.html` arranges it.
+Limits everything that grows with a run; the template `conformance.html` does the layout.
 """
 
 from __future__ import annotations
@@ -25,23 +24,22 @@ from flasher.report import chart
 from flasher.report.base import Status, render_page
 
 CHECKS_SHOWN: Final = 12
-"""Checks of a case that have a line: those that did not pass first."""
+"""Checks to list per case, those that did not pass first."""
 MESSAGES_BAD: Final = 80
-"""Messages that a case that went wrong shows, the last ones before its first failed check."""
+"""Messages to show of a failed case, up to its first failed check."""
 MESSAGES_GOOD: Final = 20
-"""Messages that another case shows, from its beginning."""
+"""Messages to show of other cases, from the start."""
 HISTOGRAM_LEAST: Final = 5
-"""Fewer values than this are told by the table alone."""
+"""Smallest number of values that gets a histogram."""
 TRACES_OPEN: Final = 5
-"""With more cases that went wrong, their traces are folded; on paper they are then left out."""
+"""With more failed cases than this, their traces are collapsed and not printed."""
 FRAMES_BAD: Final = 300
-"""Frames that a case that went wrong shows as they are, the last ones before its first failed
-check."""
+"""Raw frames to show of a failed case, up to its first failed check."""
 FRAMES_IN_PART: Final = 60
-"""Frames that another case shows that did not pass in full, from its beginning."""
+"""Raw frames to show of other cases that did not pass in full, from the start."""
 _INFOS_SHOWN: Final = 20
 _CLOCK_S: Final = 1e-6
-"""No clock tells apart what differs by less: there is nothing to draw."""
+"""Times that differ by less than this are equal: no histogram."""
 _COLOURS: Final = {
     CaseVerdict.PASS: Status.GOOD,
     CaseVerdict.PASS_IN_PART: Status.GOOD,
@@ -59,11 +57,11 @@ _CHECK_COLOURS: Final = {
     CheckOutcome.UNSUPPORTED: Status.NEUTRAL,
     CheckOutcome.PASS: Status.GOOD,
 }
-"""Outcomes with their colours, in the order in which checks are listed."""
+"""Colours of outcomes, in the order in which checks are listed."""
 
 
 class CaseView(NamedTuple):
-    """A result with its case, as far as the page shows them."""
+    """A result with its case, prepared for the template."""
 
     text: CaseText
     result: CaseResult
@@ -74,7 +72,7 @@ class CaseView(NamedTuple):
     infos: Sequence[str]
     trace: Excerpt
     raw: str
-    """Frames as they were on the bus; of a case that did not pass in full."""
+    """Raw frames of a case that did not pass in full."""
     in_part: bool
 
 
@@ -83,7 +81,7 @@ class TimesView(NamedTuple):
 
     times: Times
     histograms: dict[str, chart.Histogram]
-    """A drawing for each width; empty where there is nothing to draw."""
+    """One drawing for each width; empty without a histogram."""
 
 
 def html_page(report: RunReport) -> str:
@@ -110,7 +108,7 @@ def html_page(report: RunReport) -> str:
 
 
 def comparison_page(found: SideBySide) -> str:
-    """The page of several runs beside each other."""
+    """Render the page that compares several runs."""
     return render_page(
         "side_by_side.html",
         found=found,

@@ -1,7 +1,7 @@
-"""The report of a run as JSON: what `--json` and `--json-report` give, and `diff` reads.
+"""JSON report of a run: output of `--json` and `--json-report`, input of `diff`.
 
-What a clock says is in `started_at`, in keys that end in `_s` and in the histograms of these: two
-runs with one seed differ in nothing else. Frames are not in it, they go into trace files.
+Only `started_at`, keys that end in `_s` and histograms depend on the clock; otherwise two runs with
+the same seed are equal. Frames are in separate trace files.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The judge: checks and measurements of one case, and the verdict that follows from them.
+"""Judge of one case: records checks and measurements, and derives the verdict.
 
-A failed check is recorded and the case goes on; `require` and `expect` end it, as what follows
-would judge nothing.
+After a failed `check` the case continues; `require` and `expect` end it when the rest depends on
+them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flasher.conformance.wire import MessageKind, Received, describe
 
 
 class Times:
-    """Names of the times that more than one case or question measures."""
+    """Names of measured times that several cases or questions use."""
 
     FEEDBACK: Final = "reset to general feedback"
     FIRST: Final = "reset to first boot version"
@@ -40,7 +40,7 @@ class Times:
 
 
 class Judge:
-    """Judges what the tester of a case receives."""
+    """Judges the messages that the tester of a case receives."""
 
     def __init__(self, tester: BusTester) -> None:
         self.checks: list[Check] = []
@@ -51,7 +51,6 @@ class Judge:
 
     @property
     def verdict(self) -> CaseVerdict:
-        """The verdict that follows from what was recorded."""
         outcomes = {check.outcome for check in self.checks}
         if CheckOutcome.FAIL in outcomes:
             return CaseVerdict.FAIL
@@ -67,7 +66,7 @@ class Judge:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Checks inside the `with` belong to this step ("size 128")."""
+        """Context manager that names the step for the checks inside it ("size 128")."""
         before, self._step = self._step, f"{self._step}, {name}" if self._step else name
         try:
             yield
@@ -77,35 +76,33 @@ class Judge:
     # -- checks -----------------------------------------------------------------------------------
 
     def check(self, ok: bool, expected: str, got: object) -> bool:  # noqa: FBT001
-        """Record whether something is as expected; returns `ok`."""
+        """Record a check; returns `ok`."""
         self._record(CheckOutcome.PASS if ok else CheckOutcome.FAIL, expected, str(got))
         return ok
 
     def require(self, ok: bool, expected: str, got: object) -> None:  # noqa: FBT001
-        """The same, but a failure ends the case: raises CaseStopped."""
+        """Record a check; a failure ends the case by CaseStopped."""
         if not self.check(ok, expected, got):
             raise CaseStopped(expected)
 
     def succeed(self, expected: str, got: object) -> None:
-        """Record a check that passed."""
         self.check(True, expected, got)  # noqa: FBT003
 
     def fail(self, expected: str, got: object) -> None:
-        """Record a failed check."""
         self.check(False, expected, got)  # noqa: FBT003
 
     def require_received(
         self, received: Received | None, expected: str, within_s: float
     ) -> Received:
-        """The message that was waited for; records that there is none and raises CaseStopped."""
+        """Return `received`; records a failed check and raises CaseStopped when it is None."""
         if received is None:
             self.fail(expected, f"nothing within {within_s:g} s")
             raise CaseStopped(expected)
         return received
 
     def await_message(self, kind: MessageKind, *, within_s: float | None = None) -> Received:
-        """The next message of `kind`, others skipped, by default within the profile's limit for
-        that kind; without one the case ends.
+        """Wait for a message of `kind`, skipping others, by default for the profile's limit for it.
+        Ends the case without one.
         """
         limit_s = self._tester.limit_s(kind) if within_s is None else within_s
         received = self._tester.wait_for(kind, within_s=limit_s)
@@ -119,9 +116,9 @@ class Judge:
         number: int | None = None,
         ignoring: Sequence[MessageKind] = (),
     ) -> Received:
-        """The next message has to be of `kind` (with that packet number) and come `within_s`, by
-        default the profile's limit for that kind; messages of the kinds `ignoring` do not count.
-        Another message, or none, ends the case.
+        """Require that the next message is of `kind` (with this packet number) and arrives
+        `within_s`, by default the profile's limit for it. Messages of the kinds `ignoring` are
+        skipped; any other message or none ends the case.
         """
         expected = kind.value if number is None else f"{kind.value} {number}"
         limit_s = self._tester.limit_s(kind) if within_s is None else within_s
@@ -140,22 +137,24 @@ class Judge:
         ignoring: Sequence[MessageKind] = (),
         why: str = "no answer",
     ) -> bool:
-        """Nothing is heard for that long (`limits.silence_s`), but for the kinds `ignoring`."""
+        """Check that no message arrives for `for_s` (default: `limits.silence_s`), except the kinds
+        `ignoring`.
+        """
         silence_s = self._tester.profile.limit("silence_s") if for_s is None else for_s
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
 
     def check_only(self, received: Sequence[Received], *kinds: MessageKind, why: str) -> bool:
-        """Nothing but messages of these kinds was received."""
+        """Check that only messages of these kinds were received."""
         others = [one for one in received if one.kind not in kinds]
         return self.check(not others, why, describe(others))
 
     def unsupported(self, what: str, why: str) -> None:
-        """Record that a part of the case cannot be judged here; the other parts go on."""
+        """Record that this bench cannot judge a part of the case; the case continues."""
         self._record(CheckOutcome.UNSUPPORTED, what, why)
 
     def info(self, text: str) -> None:
-        """Record what was observed, without judging it."""
+        """Record an observation without judging it."""
         self.infos.append(text)
 
     # -- times ------------------------------------------------------------------------------------
@@ -167,7 +166,7 @@ class Judge:
     def check_time(
         self, name: str, value_s: float, *, low_s: float = 0.0, high_s: float | None = None
     ) -> None:
-        """Measure a time and judge it; within the uncertainty of a limit it is inconclusive."""
+        """Record and judge a time; inconclusive when it is within the uncertainty of a limit."""
         self.measure(name, value_s)
         unsure_s = self._tester.port.uncertainty_s
         limits = [limit for limit in (low_s or None, high_s) if limit is not None]
@@ -180,8 +179,8 @@ class Judge:
         self.check(low_s <= value_s and (high_s is None or value_s <= high_s), expected, got)
 
     def check_measured(self, name: str, *, low_s: float = 0.0, high_s: float | None = None) -> None:
-        """Judge all times of that name that this case has measured, in one check, which tells how
-        they are spread. Without any it fails.
+        """Judge all recorded times of this name in one check that reports their distribution. Fails
+        without any.
         """
         values_s = sorted(one.value_s for one in self.measurements if one.name == name)
         expected = f"{name} {_range_ms(low_s, high_s)}"
@@ -204,7 +203,7 @@ class Judge:
 
 
 def _spread(ranked_s: Sequence[float]) -> str:
-    """How times, in ascending order, are spread. A percentile is one of them: the nearest rank."""
+    """Distribution of sorted times as text. Percentiles use the nearest rank."""
     count = len(ranked_s)
     parts = [("min", 0.0), ("median", 0.5), ("p95", 0.95), ("p99", 0.99), ("max", 1.0)]
     shown = [

@@ -1,7 +1,7 @@
-"""The device model as a subject: a simulated bus on a virtual clock, so that no time is spent.
+"""Subject for the device model, on a simulated bus with a virtual clock.
 
-This module and `real` are the edges where the suite meets the rest of flasher; what makes or judges
-bytes does not import them.
+Only this module and `real` depend on the rest of flasher; code that makes or judges bytes does not
+import them.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import encode, split
 
 AREA_BYTES: Final = 256 * 1024
-"""The mock's application area: large enough for every case, small enough to be filled."""
+"""Size of the mock's application area: enough for every case, and quick to fill."""
 MOCK_PROFILE: Final = DeviceProfile(application_area_bytes=AREA_BYTES)
 _SPACING_TOLERANCE_S: Final = 0.005
-"""An announcement of the model waits for a few frames of others at the most."""
+"""An announcement of the model waits for at most a few frames of others."""
 _SOON_S: Final = 0.05
-"""An end of transfer that follows complete at once takes less."""
+"""Longest time from complete to an immediately following end of transfer."""
 _WINDOW_TOLERANCE_S: Final = 0.0005
-"""The model's clock is exact; only the time on the wire of the announcement is rounded."""
+"""The model's clock is exact; only the announcement's time on the wire is rounded."""
 
 
 def model_image(version: str, size_bytes: int) -> bytes:
-    """An image that the device model runs: `version` in it, its own checksum at its end."""
+    """Make an image for the device model, with `version` and its own checksum in it."""
     return with_checksum(f"conformance {version}".encode("ascii") + b"\0", size_bytes)
 
 
@@ -45,7 +45,7 @@ SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
 
 
 class MockSubject(SimulatedSubject[MockDevice]):
-    """A device model, or a variant of it, with power, readback and the faults of a bus.
+    """A device model or a variant of it, with power, readback and bus faults.
 
     `make_device` gets the target's name and the profile (`variant_maker` for a variant). `others`
     are further engines on the same bus.
@@ -84,14 +84,16 @@ class MockSubject(SimulatedSubject[MockDevice]):
 
 
 def device_maker(kind: Callable[..., MockDevice]) -> Callable[[str, DeviceProfile], MockDevice]:
-    """What makes a device of that kind for a subject."""
+    """Return a function that makes a device of this class for a subject."""
     return lambda target, profile: kind(
         TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile
     )
 
 
 def variant_maker(name: str) -> Callable[[str, DeviceProfile], MockDevice]:
-    """What makes a deliberately wrong device. Raises UsageError for a name that is none."""
+    """Return a function that makes a deliberately wrong device. Raises UsageError for an unknown
+    name.
+    """
     return device_maker(partial(make, find(name)))
 
 
@@ -111,7 +113,7 @@ _MODEL_OPTIONS: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "en_03": ("after_complete", {}),
     "en_04": ("image_checksum", {}),
 }
-"""Key of the suite to the model's option and the values that are called differently."""
+"""Suite key to the model's option, and the values whose names differ."""
 _FIXED_CHOICES: Final = {
     "fr_01": "accepted",
     "fr_02": "found",
@@ -123,18 +125,18 @@ _FIXED_CHOICES: Final = {
     "up_04_burst": "accepted",
     "tx_08": "ignored",
 }
-"""What the model does whatever its options are."""
+"""Choices of the model that no option changes."""
 
 
 def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
-    """The conformance profile of a device model with these choices."""
+    """Make the conformance profile of a device model with these options."""
     given: dict[str, Value] = dict(_FIXED_CHOICES)
     for key, (option, renamed) in _MODEL_OPTIONS.items():
         value = str(getattr(device, option))
         given[key] = renamed.get(value, value)
     if device.start_delay_s < _SOON_S:  # its application may run by then
         given["en_02"] = "either"
-    # The model's window begins when it queues an announcement, the suite's when it has arrived.
+    # The model's window starts when it queues an announcement, the suite's when it has arrived.
     target = TARGETS["bms"]
     announcement = BootVersion(target.boot_name, device.boot_version).to_message(target.answer_id)
     frames = split(announcement.can_id, encode(announcement))

@@ -1,6 +1,6 @@
-"""A patient host, written for the suite and not taken from flasher's own: it upgrades the device
-from any state, repeats what is lost, judges nothing, and says how it ended. It also finds out
-whether an application runs.
+"""Reference host of the suite, independent of flasher's own: upgrades the device from any state,
+repeats lost messages and reports the result without judging it. Also detects whether an application
+runs.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
 ATTEMPTS: Final = 3
 _QUERY_PERIOD_S: Final = 0.2
-"""The tool repeats a query at this interval (4.3)."""
+"""Interval at which the tool repeats a query (4.3)."""
 _QUERY_TRIES: Final = 5
-"""A query stops after 1 s (4.3)."""
+"""Tries of a query within 1 s (4.3)."""
 UPDATE_SPACING_S: Final = 0.03
-"""Update commands are at least this far apart; a boot version that comes sooner after one was sent
-before it (R2).
+"""Minimum gap between update commands; a boot version that arrives sooner was sent before the
+command (R2).
 """
 _QUIET_S: Final = 0.05
-"""After a repetition the bus is quiet for so long before the next message (R10)."""
+"""Required silence on the bus after a repetition (R10)."""
 _SETTLE_S: Final = 0.3
-"""Beyond window and burst, until a started application listens."""
+"""Extra time after burst and window until a started application listens."""
 _BLIND_S: Final = 1.0
-"""A device that was reset and announces nothing for so long may be in the midst of a transfer."""
+"""A device that announces nothing for this long after a reset may be in a transfer."""
 UPDATES_MAX: Final = 50
 _WINDOW_MAX_S: Final = 1.0
-"""How long the window lasts at the most where the profile does not know it (up_04)."""
+"""Longest window to assume when the profile does not define it (up_04)."""
 LEFTOVER_S: Final = 0.06
-"""A boot version so soon after request transfer was sent before it (R11)."""
+"""A boot version this soon after request transfer was sent before it (R11)."""
 _PACKET_ANSWERS: Final = (
     MessageKind.ACK,
     MessageKind.NAK,
@@ -48,14 +48,14 @@ _PACKET_ANSWERS: Final = (
 
 
 class UpgradeResult(NamedTuple):
-    """How an upgrade ended; `reason` is empty for a good end."""
+    """Result of an upgrade; `reason` is "" on success."""
 
     ok: bool
     reason: str = ""
 
 
 class PatientHost:
-    """Upgrades the device, and asks its application, through the tester of a case."""
+    """Upgrades the device and queries its application through the tester of a case."""
 
     def __init__(self, tester: BusTester) -> None:
         self._tester = tester
@@ -64,7 +64,7 @@ class PatientHost:
 
     @property
     def burst_s(self) -> float:
-        """How long announcements and the window last together at the most."""
+        """Longest duration of announcements and window together."""
         limit, count = self._profile.limit, self._profile.number("versions")
         spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
         window_s = limit("window_s") + limit("window_tolerance_s")
@@ -75,9 +75,9 @@ class PatientHost:
     # -- application ------------------------------------------------------------------------------
 
     def application_version(self, within_s: float = 1.0) -> str | None:
-        """The firmware version that the application tells; None when it does not answer.
+        """Firmware version reported by the application; None when it does not answer.
 
-        Raises Unsupported for a target without such a query.
+        Raises Unsupported for a target without a version query.
         """
         heard = self.version_answer(within_s)
         return None if heard is None else heard.firmware
@@ -85,7 +85,7 @@ class PatientHost:
     def version_answer(
         self, within_s: float, *, every_s: float = _QUERY_PERIOD_S
     ) -> Received | None:
-        """The first answer to the version query, which is sent `every_s`. Raises as above."""
+        """Query the version every `every_s` and return the first answer. Raises Unsupported."""
         if not self._encoder.has_version_query:
             raise Unsupported("the document has no version query for this target")
         tester, kind = self._tester, MessageKind.VERSION_INFORMATION
@@ -96,7 +96,7 @@ class PatientHost:
             if heard is None:
                 unanswered += 1
                 continue
-            # An application slower than the queries: none of its answers may come later on.
+            # Collect the answers to earlier queries, so that none of them arrives later.
             late_s = _QUERY_PERIOD_S + _QUIET_S
             while unanswered and tester.wait_for(kind, within_s=late_s) is not None:
                 unanswered -= 1
@@ -104,10 +104,10 @@ class PatientHost:
         return None
 
     def application_runs(self, within_s: float | None = None) -> bool:
-        """True when an application answers `within_s` (`limits.start_s`).
+        """True when an application answers `within_s` (default: `limits.start_s`).
 
-        Without a version query, general feedback to a reset is the sign; the device then passes
-        through its bootloader, which is waited for.
+        Without a version query, general feedback to a reset shows it; the device then runs through
+        its bootloader, which is awaited.
         """
         limit_s = self._profile.limit("start_s") if within_s is None else within_s
         if self._encoder.has_version_query:
@@ -119,12 +119,12 @@ class PatientHost:
                 tester.send(self._encoder.reset())
                 runs = tester.wait_for(MessageKind.FEEDBACK) is not None
             if runs or tester.now >= deadline:
-                # What is sent before the burst that the reset may have begun is over would be lost.
+                # A message sent before the end of a burst that the reset started would be lost.
                 if tester.wait_for(MessageKind.BOOT_VERSION) is not None:
                     tester.wait(self.burst_s + _SETTLE_S)
                     tester.forget()
                 return runs
-            # The reset may have begun a burst (RS-02): another one in it would do so again.
+            # The reset may have started a burst (RS-02), which another reset would restart.
             quiet_s = self.burst_s + _SETTLE_S
             while (
                 tester.wait_for(MessageKind.BOOT_VERSION, within_s=quiet_s)
@@ -133,7 +133,7 @@ class PatientHost:
                 pass
 
     def read_memory(self, start: int, size_bytes: int) -> bytes | None:
-        """The memory from `start` on, as the application tells it; None when it does not."""
+        """Read memory of the application from `start` on; None when it does not answer."""
         tester, found = self._tester, b""
         end = start + size_bytes
         while len(found) < size_bytes:
@@ -155,16 +155,16 @@ class PatientHost:
         return found
 
     def send_packet(self, image: bytes, number: int) -> Sent:
-        """Send a packet of `image` and wait for nothing."""
+        """Send a packet of `image` without waiting for an answer."""
         return self._tester.send(self._encoder.packet_of(image, number))
 
     # -- upgrade ----------------------------------------------------------------------------------
 
     def upgrade(self, image: bytes, *, reset: bool = True, blind: bool = False) -> UpgradeResult:
-        """Upgrade the device as a patient tool does, from whatever state it is in.
+        """Upgrade the device from any state.
 
         Without `reset` it waits for a device that announces itself. With `blind` a silent device
-        gets the update command all the same: it may be in the midst of a transfer.
+        gets an update command too, as it may be in a transfer.
         """
         ended = UpgradeResult(ok=False, reason="no boot version")
         self._tester.forget()
@@ -197,9 +197,7 @@ class PatientHost:
         return False
 
     def request_or_version(self, asked_at: float, within_s: float) -> Received | None:
-        """What follows an update command: request transfer, or a boot version that is far enough
-        behind it (R2); None after `within_s`.
-        """
+        """Wait for request transfer, or for a boot version sent after the update command (R2)."""
         not_before = asked_at + UPDATE_SPACING_S
         return self._tester.wait_for(
             MessageKind.REQUEST,
@@ -209,7 +207,7 @@ class PatientHost:
         )
 
     def transfer(self, image: bytes) -> UpgradeResult:
-        """All packets and the end, after request transfer; repeats what is lost."""
+        """Send all packets and end of transfer, repeating lost messages."""
         began_at = self._tester.now
         for number in range(1, packet_count(len(image)) + 1):
             trouble = self.deliver_packet(image, number, began_at)
@@ -218,7 +216,9 @@ class PatientHost:
         return self.deliver_end(image)
 
     def deliver_end(self, image: bytes) -> UpgradeResult:
-        """End of transfer until there is a final answer, or the version of `image` is told."""
+        """Send end of transfer until a final answer, or until the application reports the version
+        of `image`.
+        """
         refusals = 0
         for _ in range(END_TRIES):
             self._tester.send(self._encoder.end())
@@ -234,8 +234,8 @@ class PatientHost:
         return UpgradeResult(ok=True)
 
     def deliver_packet(self, image: bytes, number: int, began_at: float) -> str:
-        """Send a packet until it is acknowledged; returns what went wrong in the end, or "". The
-        transfer began at `began_at`, with request transfer.
+        """Send a packet until it is acknowledged; returns what went wrong, or "". `began_at` is the
+        time of request transfer.
         """
 
         def is_stale(one: Received) -> bool:
@@ -246,7 +246,7 @@ class PatientHost:
         last = "no answer"
         for tries in range(1, PACKET_TRIES + 1):
             self.send_packet(image, number)
-            # It may erase once more, for an update command that was sent twice (R25, R16).
+            # A repeated update command may cause a second erase (R25, R16).
             kinds = (*_PACKET_ANSWERS, MessageKind.REQUEST) if number == 1 else _PACKET_ANSWERS
             heard = self._tester.wait_for(*kinds, unlike=is_stale)
             if heard is None and number == 1 and tries == PACKET_TRIES - 1:
@@ -261,7 +261,7 @@ class PatientHost:
             by_profile = is_next and tries > 1 and self._profile.choice("tx_02") != "ack"
             if not by_profile and heard.kind is not MessageKind.ACK:
                 continue
-            # The other copies are answered too; the next message waits until that is over.
+            # Wait until the answers to all copies have arrived.
             quiet_after = PACKET_TRIES if tries > 1 else 0
             while quiet_after and self._tester.next_message(_QUIET_S) is not None:
                 quiet_after -= 1

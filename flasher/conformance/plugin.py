@@ -1,5 +1,5 @@
-"""The half of the pytest plugin `pytest_flasher` that is loaded where a device is named: the run on
-that device, the bench of each test, and the hooks that collect the suite.
+"""Hooks and fixtures of the pytest plugin `pytest_flasher` that are loaded only when a device is
+given: the run on the device, the bench of each test, the collection of the suite.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ from flasher.trace.figures import Distribution
 from pytest_flasher import BENCH_OPTIONS
 
 LIMIT_S: Final = 300.0
-"""A test of the user's own is ended after this time on the bench's clock."""
+"""Time limit of a user's own test on the bench's clock."""
 SUITE: Final = "btl"
-"""What the cases stand under: btl::TX-03."""
+"""Parent of the cases in test ids: btl::TX-03."""
 _MARKS: Final = {
     Requirement.DESTRUCTIVE: "destructive",
     Requirement.POWER: "needs_power",
@@ -72,27 +72,26 @@ _MARKS: Final = {
 _MS: Final = 1000
 _MESSAGES: Final = 20
 _FRAMES: Final = 40
-"""What a report of pytest shows of the frames of a test that did not pass."""
+"""Messages and frames of a failed test that pytest's report shows."""
 _NO_FILE_NAME: Final = re.compile(r"[^\w.-]+")
 
 
 class Measurements:
-    """Times by name. `times[name]` are the values in seconds, in order."""
+    """Times by name; `times[name]` lists them in seconds."""
 
     def __init__(self) -> None:
         self.times: dict[str, list[float]] = {}
 
     def record(self, name: str, value_s: float) -> None:
-        """Add a time of one's own."""
+        """Add a time of the user's own."""
         self.times.setdefault(name, []).append(value_s)
 
     def add(self, measurements: Iterable[Measurement]) -> None:
-        """Add what a case measured."""
         for one in measurements:
             self.record(one.name, one.value_s)
 
     def of(self, name: str) -> Distribution:
-        """How the times of a name are spread. Raises KeyError for one that was not measured."""
+        """Distribution of the times of a name. Raises KeyError when none was measured."""
         return distribution(Measurement(name, value, 0.0) for value in self.times[name])
 
 
@@ -108,13 +107,13 @@ class BenchTrace:
         return self._bench.tester.trace
 
     def save(self, path: Path) -> None:
-        """Write them as a candump log."""
+        """Write the frames as a candump log."""
         make_private(path)
         path.write_bytes(candump(self.frames))
 
 
 class PluginRun:
-    """The run of a pytest session, on one device."""
+    """The run of a pytest session on one device."""
 
     def __init__(
         self, subject: Subject, profile: ConformanceProfile, config: pytest.Config
@@ -161,11 +160,11 @@ class PluginRun:
                 pytest.fail(f"{said}\n{details}", pytrace=False)
 
     def report(self) -> RunReport:
-        """What came of the cases of the suite so far."""
+        """Report of the suite's cases so far."""
         return self._run.report(catalogue_order(self._run.judged))
 
     def bench_for(self, node: pytest.Item) -> Iterator[Bench]:
-        """The bench of one test, with the device in the known state before and after it."""
+        """The bench of one test; restores the device before and after it."""
         if node.get_closest_marker("needs_power") and not self.subject.has_power:
             pytest.skip("needs power control")
         self._begin()
@@ -181,7 +180,7 @@ class PluginRun:
             pytest.fail(f"the device is not reachable afterwards: {trouble}", pytrace=False)
 
     def save_failed(self, node: pytest.Item, bench: Bench) -> None:
-        """Keep the frames of a test of the user's own that failed."""
+        """Save the frames of a user's own test that failed."""
         result = CaseResult(
             node.name,
             CaseVerdict.FAIL,
@@ -194,8 +193,8 @@ class PluginRun:
         _report(node, result)
 
     def finish(self) -> None:
-        """Flash and verify the good image and write the reports; fails the last test where the
-        image is not back.
+        """Flash and verify the good image and write the reports. Fails the last test when the image
+        could not be restored.
         """
         final = self._run.finish() if self._has_begun else FINAL_IMAGE_OK
         report = self.report()
@@ -217,7 +216,7 @@ class PluginRun:
             pytest.fail(f"the good image at the end: {final}", pytrace=False)
 
     def _write(self, option: str, made: Callable[[], bytes], name: str = "") -> None:
-        """Write what is `made` to the file that an option names, or to a file in its folder."""
+        """Write the content to the file of an option, or to file `name` in its directory."""
         given = self._config.getoption(f"btl_{option}")
         if given is None:
             return
@@ -231,7 +230,7 @@ class PluginRun:
             pytest.fail(f"{path} cannot be written: {error.strerror}", pytrace=False)
 
     def _replay(self, case_id: str) -> str:
-        """The command that runs a case again."""
+        """Command line that repeats a case."""
         words = ["pytest"]
         for name, (_, _, more) in BENCH_OPTIONS.items():
             value = self._config.getoption(name[2:].replace("-", "_"))
@@ -255,7 +254,7 @@ def open_run(
     power: Callable[[bool], None] | None,
     readback: Callable[[], bytes] | None,
 ) -> Iterator[PluginRun]:
-    """The run on the device that the options name; what is wrong with them fails the tests."""
+    """Open the run on the device of the options; invalid options fail the tests."""
     try:
         with open_bench(_options(config, power, readback)) as (subject, profile):
             check_deviations(profile, known_cases())
@@ -267,7 +266,7 @@ def open_run(
 
 
 def _report(node: pytest.Item, result: CaseResult) -> None:
-    """Add to the report of a test what was not tried, and the frames of what did not pass."""
+    """Add untried parts, and the frames of a failure, to the report of a test."""
     said = [f"not tried: {part}" for part in result.not_tried]
     if said:
         node.add_report_section("call", "conformance", "\n".join([result.verdict.text, *said]))
@@ -310,7 +309,7 @@ def _options(
 
 
 class Hooks:
-    """Collects the suite, and lets the checks of a bench decide about its test."""
+    """Collects the suite and fails tests whose bench recorded failed checks."""
 
     def __init__(self, config: pytest.Config) -> None:
         if config.getoption("numprocesses", None):
@@ -325,7 +324,7 @@ class Hooks:
     def pytest_collection_modifyitems(
         self, session: pytest.Session, config: pytest.Config, items: list[pytest.Item]
     ) -> None:
-        """Put the cases behind the tests that were found, where -k and -m see them."""
+        """Append the cases to the collected tests, so that -k and -m apply to them."""
         if config.getoption("btl_suite"):
             chosen = Selection(quick=config.getoption("btl_quick")).chosen()
             suite = _Suite.from_parent(session, name=SUITE, nodeid=SUITE)
@@ -333,7 +332,7 @@ class Hooks:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_pyfunc_call(self, pyfuncitem: pytest.Function) -> Iterator[None]:
-        """A test with a bench fails by the checks that failed, whatever else it did."""
+        """Fail a test by the failed checks of its bench, even if the test continued after them."""
         bench = pyfuncitem.funcargs.get("btl_bench")
         run = pyfuncitem.funcargs.get("btl_run")
         self._run = run if isinstance(run, PluginRun) else self._run
@@ -353,7 +352,7 @@ class Hooks:
         return result
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """What is known of the device at the end, what the bench could not judge, and the times."""
+        """Report the final state of the device, what the bench could not judge, and the times."""
         if self._run is None:
             return
         report, measurements = self._run.report(), self._run.measurements
@@ -375,7 +374,7 @@ class Hooks:
 
 
 class _Suite(pytest.Collector):
-    """The parent of the cases, which the hook makes."""
+    """Parent of the cases, which the hook creates."""
 
     def collect(self) -> list[pytest.Item | pytest.Collector]:
         return []

@@ -72,7 +72,7 @@ class Limits(Table):
     """How far that spacing may be off."""
     window_s: Limit = 0.05
     """From the burst's last boot version to the window's end (UP-04); with up_04 either it lasts at
-    least so long, and 1 s at the most.
+    least this long, and at most 1 s.
     """
     window_tolerance_s: Limit = 0.002
     """How far the window's end may be off."""
@@ -91,7 +91,7 @@ class Limits(Table):
     refused_s: Limit = 2.0
     """From a refused image to the next boot version."""
     silence_s: Limit = 0.7
-    """How long the bus is watched before it counts as silent."""
+    """How long the bus must be quiet to count as silent."""
 
 
 class DeviceFacts(Table):
@@ -100,10 +100,10 @@ class DeviceFacts(Table):
     application_bytes: Annotated[int, NumberRange(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
     """Size of the application area."""
     largest_image_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
-    """The largest image that is taken."""
+    """The largest image that the device accepts."""
     application_address: Annotated[int, NumberRange(ge=0, le=0xFFFF_FFFF)] = 0
-    """Where the application area begins in the memory that a BMS tells (4308), by which the flash
-    is compared on a bench without readback; 0: unknown.
+    """Start of the application area in the memory that a BMS reports (4308), to compare the flash
+    on a bench without readback; 0: unknown.
     """
     reset_command: Annotated[int, NumberRange(ge=0, le=0xFFFF)] = RESET
     """Command that restarts into the bootloader (R3)."""
@@ -112,7 +112,7 @@ class DeviceFacts(Table):
     versions: Annotated[int, NumberRange(ge=1, le=100)] = 4
     """Boot versions in a burst."""
     buffer_bytes: Annotated[int, NumberRange(ge=0, le=IMAGE_BYTES_MAX)] = 0
-    """What it has acknowledged and may not have written yet, until the end of transfer."""
+    """Acknowledged bytes that may not be written to flash until the end of transfer."""
 
     @model_validator(mode="after")
     def _check_together(self) -> DeviceFacts:
@@ -126,8 +126,8 @@ class DeviceFacts(Table):
 
 
 class ProfileKeys(Table):
-    """A file without its rationales. Keys named after a case (`tx_02`) are the choices that the
-    catalogue marks P.
+    """Keys of a profile file without rationales. Keys named after a case (`tx_02`) are the choices
+    that the catalogue marks P.
     """
 
     fr_01: Literal["either", "accepted", "rejected"] = "either"
@@ -135,7 +135,7 @@ class ProfileKeys(Table):
     fr_02: Literal["either", "found", "lost"] = "either"
     """Junk in the same CAN frame before a message: the message is found, or lost."""
     fr_04: Literal["either", "rescanned", "dropped"] = "either"
-    """What follows a wrong tail in the same CAN frame is looked at again, or dropped."""
+    """Bytes after a wrong tail in the same CAN frame are scanned again, or dropped."""
     fr_07: Literal["either", "ignored", "rejected"] = "either"
     """A last CAN frame padded to 8 bytes."""
     fr_10: Literal["either", "silence"] = "either"
@@ -143,25 +143,25 @@ class ProfileKeys(Table):
     rs_02: Literal["either", "ignored", "restarts"] = "either"
     """Reset that reaches the announcing bootloader (R18)."""
     rs_03: Literal["either", "announces", "listens"] = "either"
-    """After the burst, with no application to start: announces on, or listens silently (R14)."""
+    """After the burst, without an application: keeps announcing, or listens silently (R14)."""
     up_02: Literal["either", "silence", "nak"] = "either"
     """Answer to an update command that is rejected."""
     up_03: Literal["either", "feedback", "silence"] = "either"
     """Answer of the running application to upgrade messages (R17)."""
     up_04: Literal["either", "rejected", "accepted"] = "either"
-    """Update command just after the window's end; either: nobody knows when that is."""
+    """Update command just after the window's end; either: its end is unknown."""
     up_04_burst: Literal["either", "accepted", "rejected"] = "either"
-    """Update command between the announcements of a burst, not behind the last one (R2)."""
+    """Update command between the announcements of a burst, not after the last one (R2)."""
     up_05: Literal["either", "once", "each"] = "either"
     """Update command twice before request transfer: one of these, or one for each (R25)."""
     up_08: Literal["either", "starts_over", "rejected"] = "either"
     """Update command in the middle of a transfer."""
     tx_01: Literal["either", "nak_expected", "nak_received", "silence"] = "either"
-    """Answer to a damaged or impossible packet: NAK with the number wanted, NAK with the number it
-    names, or nothing; either: one or the other, packet by packet.
+    """Answer to a damaged or impossible packet: NAK with the number expected, NAK with the number
+    received, or nothing; either: may differ from packet to packet.
     """
     tx_01_lost_frame: Literal["either", "nak", "silence"] = "either"
-    """Answer to a packet of which a frame is lost."""
+    """Answer to a packet with a lost frame."""
     tx_02: Literal["either", "ack", "nak_next"] = "either"
     """The packet stored last, again: ACK n, or NAK n+1 (R10)."""
     tx_03: Literal["either", "ack", "nak", "silence"] = "either"
@@ -169,13 +169,13 @@ class ProfileKeys(Table):
     tx_08: Literal["either", "ignored", "rejected"] = "either"
     """Last packet: other bytes than FF beyond the size."""
     tx_12: Literal["either", "announces", "waits"] = "either"
-    """A pause in the transfer longer than limits.pause_s: announces again, or waits on."""
+    """A pause in the transfer longer than limits.pause_s: announces again, or keeps waiting."""
     tx_13: Literal["either", "ignored", "restarts"] = "either"
     """Reset during a transfer."""
     en_02: Literal["either", "same_answer", "silence"] = "either"
     """End of transfer again, once answered."""
     en_03: Literal["either", "starts", "restarts"] = "either"
-    """After complete: starts the application at once, or through the bootloader (R11)."""
+    """After complete: starts the application directly, or through the bootloader (R11)."""
     en_04: Literal["none", "crc32"] = "none"
     """Checksum inside the product's images; crc32: the last four bytes are the CRC-32 of the rest,
     little-endian (R7).
@@ -199,15 +199,15 @@ def profile_keys() -> dict[str, Key]:
 
 
 def choice_words(name: str) -> list[str]:
-    """What a choice can be, besides `either`."""
+    """Values of a choice besides `either`."""
     return [word for word in profile_keys()[name].choices if word != "either"]
 
 
 @dataclass(frozen=True)
 class ConformanceProfile:
-    """What differs from the defaults, by path (`tx_02`, `limits.erase_s`), with the rationales.
+    """Values that differ from the defaults, by path (`tx_02`, `limits.erase_s`), with rationales.
 
-    `deviations` is case id to reason. Raises UsageError with everything that is wrong.
+    `deviations` maps case ids to reasons. Raises UsageError listing all errors.
     """
 
     given: Mapping[str, Value] = field(default_factory=dict)
@@ -223,33 +223,33 @@ class ConformanceProfile:
         _READER.read(document, self.source)
 
     def choice(self, name: str) -> str:
-        """The choice of that name ("tx_02"). Raises KeyError for one that does not exist."""
+        """The choice `name` ("tx_02"). Raises KeyError for an unknown one."""
         return str(self.value(name))
 
     def allows(self, name: str, word: str) -> bool:
-        """True where an answer that is this word of a choice is right."""
+        """True when the choice `name` is `word` or "either"."""
         return self.choice(name) in (word, "either")
 
     def limit(self, name: str) -> float:
-        """The time of that name in the table `limits` ("erase_s"), in seconds."""
+        """Time `name` of the table `limits` ("erase_s"), in seconds."""
         return float(self.value(f"limits.{name}"))
 
     def number(self, name: str) -> int:
-        """The number of that name in the table `device` ("largest_image_bytes")."""
+        """Number `name` of the table `device` ("largest_image_bytes")."""
         return int(self.value(f"device.{name}"))
 
     def text(self, name: str) -> str:
-        """The text of that name in the table `device` ("reset_data")."""
+        """Text `name` of the table `device` ("reset_data")."""
         return str(self.value(f"device.{name}"))
 
     def value(self, path: str) -> Value:
-        """The value of any key by its path. Raises KeyError."""
+        """Value of any key by its path. Raises KeyError."""
         value: Value = self.given.get(path, _READER.keys[path].default)
         return value
 
     def to_toml(self, remarks: Mapping[str, str] = MappingProxyType({})) -> str:
-        """The whole profile as a file: every key with its help, defaults as comments; `remarks` say
-        of some keys why they stay open.
+        """The whole profile as a TOML file with the help of every key; defaults are comments.
+        `remarks` explain why keys stay open.
         """
         lines: list[str] = []
         table = ""
@@ -276,14 +276,12 @@ class ConformanceProfile:
 
 
 def load_profile(path: str | os.PathLike[str]) -> ConformanceProfile:
-    """Read a profile. Raises UsageError for a file that cannot be read, is no TOML, or with
-    everything that is wrong with it.
-    """
+    """Read a profile file. Raises UsageError listing all errors."""
     return read_profile(read_toml(path, what="profile"), os.fspath(path))
 
 
 def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile:
-    """A profile from what a TOML file holds. Raises UsageError."""
+    """Convert parsed TOML to a profile. Raises UsageError."""
     plain: dict[str, Any] = {}
     rationales: dict[str, str] = {}
     faults: list[Fault] = []
@@ -322,7 +320,7 @@ def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile
 
 
 def check_deviations(profile: ConformanceProfile, known: Collection[str]) -> None:
-    """Raise UsageError when a deviation names a case that the suite does not have."""
+    """Raise UsageError for a deviation of an unknown case."""
     faults = [
         Fault(
             f"{DEVIATIONS}.{case_id}",

@@ -1,4 +1,4 @@
-"""A device on a real bus as a subject: any link, power by a command or a function, readback by a
+"""Subject for a device on a real bus: any link, power by a command or function, readback by a
 command that dumps the flash to a file.
 """
 
@@ -24,21 +24,21 @@ from flasher.protocol.frame import Frame
 PowerControl = Callable[[bool], None]
 """Called with True to switch the device on."""
 Readback = Callable[[], bytes]
-"""Yields the application area from its first byte on."""
+"""Returns the application area from its first byte on."""
 HOST_UNCERTAINTY_S: Final = 0.002
-"""How far the time of a frame may be off: the adapter's driver, and where the kernel does not stamp
-the frame as it comes in, the computer's scheduler.
+"""Uncertainty of a frame's time: the adapter's driver and, where the kernel does not stamp incoming
+frames, the computer's scheduler.
 """
 _OWN_FRAMES: Final = 256
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _FILE: Final = "{file}"
 _READBACK_MAX_SIZE: Final = 64 * 1024 * 1024
-"""In bytes; what a device holds is far smaller."""
+"""In bytes, far more than a device has."""
 
 
 class RealPort:
-    """A link as the bench's port; `echoes` says that the adapter gives back what it sent. Frames
-    have the time of the kernel or, where it gives none, of this process.
+    """A link as the bench's port; `echoes` says that the adapter echoes sent frames. Times come
+    from the kernel if possible, otherwise from this process.
     """
 
     sends_error_frames = False
@@ -77,7 +77,7 @@ class RealPort:
     def receive(self, deadline: float) -> Arrival | None:
         while (frame := self._link.receive(deadline)) is not None:
             stamped_at = None if self._stamps is None else self._stamps.received_at
-            # Never before that of the frame before it.
+            # Times never go back.
             at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
             self._last_at = at
             frame = Frame(*frame[:5])  # whose it is, is judged here, and not by the link
@@ -87,9 +87,7 @@ class RealPort:
         return None
 
     def _take_own(self, frame: Frame) -> bool:
-        """True for an own frame that came back. With `echoes`, a lost echo does not hide the
-        following ones.
-        """
+        """True for an echo of a sent frame. With `echoes`, a lost echo does not hide later ones."""
         if self.echoes and frame in self._own:
             while self._own.popleft() != frame:
                 pass
@@ -101,9 +99,7 @@ class RealPort:
 
 
 class RealSubject:
-    """A device behind an open adapter. Without `power` and `readback` the cases that need them
-    are unsupported.
-    """
+    """A device on an open adapter, by default without power control and readback."""
 
     has_bus_off = False
     has_timed_cuts = False
@@ -150,9 +146,9 @@ class RealSubject:
 
 
 class DevicePowerCommand:
-    """Power by a command such as `relay {on|off}`: the first word of the braces switches on.
+    """Switches the power by a command such as `relay {on|off}`; the first word in braces is on.
 
-    Raises UsageError for a command without them.
+    Raises UsageError for a command without braces.
     """
 
     def __init__(self, template: str, limit_s: float = 10.0) -> None:
@@ -171,8 +167,8 @@ class DevicePowerCommand:
 
 
 class ReadbackCommand:
-    """Readback by a command such as `st-flash read {file} 0x8008000 0x18000`, which writes the
-    application area to a file. Raises UsageError for a command without `{file}`.
+    """Reads the flash by a command such as `st-flash read {file} 0x8008000 0x18000`, which writes
+    the application area to a file. Raises UsageError for a command without `{file}`.
     """
 
     def __init__(self, template: str, limit_s: float = 60.0) -> None:

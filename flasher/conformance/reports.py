@@ -1,5 +1,5 @@
-"""A run as files for programs: JUnit XML for CI servers, and the frames of a case as a candump log,
-which `flasher explain`, candump's friends and python-can read.
+"""JUnit XML report of a run for CI servers, and trace files of cases as candump logs, which
+`flasher explain` and python-can read.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from flasher.trace.figures import Distribution
 TRACED: Final = frozenset(
     {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.DEVIATION}
 )
-"""Verdicts whose frames are worth a file."""
+"""Verdicts that get a trace file."""
 _FINDINGS: Final = 20
 _RUN: Final = "run"
-"""The suite of what concerns the run itself: its end, the good image."""
+"""JUnit suite for the run itself: whether it was completed, and the good image."""
 _JUNIT_RESULTS: Final = {
     CaseVerdict.FAIL: JUnitResult.FAILURE,
     CaseVerdict.ERROR: JUnitResult.ERROR,
@@ -40,8 +40,9 @@ _JUNIT_RESULTS: Final = {
     CaseVerdict.UNSUPPORTED: JUnitResult.SKIPPED,
     CaseVerdict.INCONCLUSIVE: JUnitResult.SKIPPED,
 }
-"""What was not judged is skipped with its reason, but a case that was not run because the run broke
-off is an error: a server must not show green for it."""
+"""A case that was not judged is skipped with its reason. A case that was not run because the run
+broke off is an error, so that a CI server does not show green.
+"""
 
 BINS: Final = 20
 ByResult = Mapping[tuple[str, int], str]
@@ -50,12 +51,12 @@ _NONE: Final[ByResult] = {}
 
 
 def group_title(group: str) -> str:
-    """What a group is about; its id when it is none of the catalogue's."""
+    """Title of a group, or its id when it is not in the catalogue."""
     return GROUPS.get(group, group)
 
 
 def distribution(measurements: Iterable[Measurement]) -> Distribution:
-    """How measured times are spread. Raises ValueError for none."""
+    """Distribution of measured times. Raises ValueError for none."""
     found = Distribution.of(measurement.value_s for measurement in measurements)
     if found is None:
         raise ValueError("no measurements")
@@ -187,7 +188,7 @@ def failure_details(text: CaseText, result: CaseResult) -> str:
 
 
 def _junit_run(report: RunReport) -> list[JUnitCase]:
-    """The run itself as two test cases, so that an incomplete run does not pass."""
+    """Two test cases for the run itself, so that an incomplete run does not pass."""
     broken = report.stopped or report.not_upgradable
     whole = JUnitResult.ERROR if broken else JUnitResult.PASSED
     if not report.final_image:
@@ -210,7 +211,7 @@ def _junit_run(report: RunReport) -> list[JUnitCase]:
 
 
 def trace_file_name(result: CaseResult) -> str:
-    """The name of a result's trace file: "TX-03.log", from its second repeat on "TX-03-2.log"."""
+    """Name of a result's trace file: "TX-03.log", for repetitions "TX-03-2.log"."""
     repeat = f"-{result.repeat}" if result.repeat > 1 else ""
     return f"{result.case_id}{repeat}.log"
 
@@ -221,12 +222,12 @@ def is_traced(result: CaseResult) -> bool:
 
 
 def candump(trace: Iterable[TraceEntry]) -> bytes:
-    """Frames as a log; times count from the beginning of the case, what the suite sent is `T`."""
+    """Encode frames as a candump log; times start with the case, sent frames are marked `T`."""
     from flasher.python_can import can  # noqa: PLC0415  slow
     from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of  # noqa: PLC0415
 
     text = io.StringIO()
-    # By its channel `flasher explain` knows it again: one tool, whatever it sends.
+    # `flasher explain` recognises traces of a single tool by this channel.
     writer = can.CanutilsLogWriter(text, channel=ONE_TOOL_CHANNEL)
     for entry in trace:
         frame = Frame(*entry.frame)

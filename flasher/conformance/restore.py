@@ -1,7 +1,7 @@
-"""Brings the device to the known state: the good image's application runs.
+"""Restores the device to the known state: the application of the good image runs.
 
-The protocol is tried first, then a power cycle. Which one was needed tells a case that leaves the
-device unreachable from one that only leaves an upgrade unfinished.
+Tries the protocol first, then a power cycle. The report distinguishes cases after which only a
+power cycle helped.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ BY_POWER: Final = "power cycle, then upgrade"
 
 
 class RestoreResult(NamedTuple):
-    """`how` is one of the texts above; empty, with a `reason`, when no way succeeded."""
+    """Result of `restore`: `how` is one of the texts above, or "" with a `reason` when all ways
+    failed.
+    """
 
     how: str
     reason: str = ""
     trace: tuple[TraceEntry, ...] = ()
-    """The frames of all ways that were tried, when none succeeded."""
+    """Frames of all attempts, when none succeeded."""
     diagnosis: tuple[str, ...] = ()
-    """What was heard then, and what would fit; nothing for a device that stopped by itself."""
+    """Diagnosis of the received frames; empty for a device that crashed."""
 
     @property
     def ok(self) -> bool:
-        """True when the good image runs."""
         return bool(self.how)
 
 
@@ -53,9 +54,9 @@ def restore(
     flash: bool,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RestoreResult:
-    """Make the application of the good image run; with `flash` it is flashed in any case.
+    """Make the application of the good image run; with `flash` it is always flashed.
 
-    Raises BusError when the adapter fails, RunStopped when somebody wants to end the run.
+    Raises BusError when the adapter fails, RunStopped when the run is to end.
     """
     reasons: list[str] = []
     trace: list[TraceEntry] = []
@@ -93,7 +94,7 @@ def is_reachable(
     subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool] = lambda: False
 ) -> bool:
     """True when the bootloader announces itself after a reset, a pause or a power cycle: a device
-    that cannot be upgraded can still be judged. Raises as `restore`.
+    that cannot be upgraded can still be judged. Raises like `restore`.
     """
     bench = Bench(subject, profile, limit_s=_limit_s(subject, profile), stopped=stopped)
     within_s = profile.limit("first_version_s") + profile.limit("pause_s")
@@ -112,19 +113,19 @@ def is_reachable(
 
 
 def may_need_power(profile: ConformanceProfile) -> bool:
-    """True when the profile leaves it possible that nothing but power ends a transfer."""
+    """True when the profile allows a device on which only a power cycle ends a transfer."""
     only_power = (("tx_12", "waits"), ("tx_13", "ignored"), ("up_08", "rejected"))
     return all(profile.choice(key) in (value, "either") for key, value in only_power)
 
 
 def needs_power(profile: ConformanceProfile) -> bool:
-    """True when the profile leaves no other way out of a transfer than power."""
+    """True when the profile says that only a power cycle ends a transfer."""
     choices = (profile.choice("tx_12"), profile.choice("tx_13"), profile.choice("up_08"))
     return choices == ("waits", "ignored", "rejected")
 
 
 def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
-    """The time limit of one way: all its waits, and the transfer at a slow pace."""
+    """Time limit of one attempt: all waits, and the transfer at low speed."""
     limit = profile.limit
     waits_s = (
         3
@@ -146,8 +147,8 @@ def _check_version(bench: Bench) -> str:
 
 
 def _upgrade(bench: Bench) -> str:
-    """Upgrade by the protocol, in a way that does not depend on what a reset (TX-13) or an update
-    command (UP-08) does during a transfer; more than once, as a burst may have just begun or ended.
+    """Upgrade by the protocol, whatever a reset (TX-13) or update command (UP-08) does during a
+    transfer; repeats the attempt, as a burst may have just started or ended.
     """
     blind = bench.choice("up_08") != "rejected"
     reason = ""

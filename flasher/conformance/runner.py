@@ -1,7 +1,7 @@
-"""Runs cases one after another, each from the known state, and yields the report.
+"""Runs cases one after another, each from the known state, and builds the report.
 
-What a case left the device in is repaired before the next one. A device that cannot be brought back
-ends the run: the case is named, the rest is reported as not run.
+Restores the device after each case. A device that cannot be restored ends the run: the report names
+the case and lists the rest as not run.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ from flasher.errors import BusError
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How to run: `seed` decides every chance, each case is run `repeat` times, `limit_s` ends the
-    run after that time on the bench's clock, `strict` makes a deviation that is none any more a
-    failure, `upgrades` is how often a case that wears the device has it upgraded (None: `WEAR`).
+    """Options of a run: `seed` determines all random values, each case runs `repeat` times,
+    `limit_s` ends the run on the bench's clock, `strict` fails on resolved deviations, `upgrades`
+    is the number of upgrades in a case that wears the device (None: `WEAR`).
     """
 
     seed: str = "1"
@@ -76,19 +76,17 @@ _PLAIN: Final = RunOptions()
 
 
 class RunObserver:
-    """Is told how a run goes on; to be subclassed, does nothing itself."""
+    """Receives the progress of a run; the methods do nothing and are meant to be overridden."""
 
     def run_began(self, count: int) -> None:
-        """So many case runs follow."""
+        """The run starts with `count` case runs."""
 
     def preparing(self, what: str) -> None:
-        """The device is brought to the known state, for the reason `what`."""
+        """The device is being restored; `what` is the reason."""
 
-    def case_began(self, case: Case, repeat: int) -> None:
-        """A case begins, for the `repeat`-th time."""
+    def case_began(self, case: Case, repeat: int) -> None: ...
 
-    def case_ended(self, result: CaseResult) -> None:
-        """A case has its verdict."""
+    def case_ended(self, result: CaseResult) -> None: ...
 
 
 def run(
@@ -100,10 +98,10 @@ def run(
     observer: RunObserver | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RunReport:
-    """Run the selected cases on a device and report; `stopped` is asked while it runs.
+    """Run the selected cases on a device and return the report; polls `stopped` meanwhile.
 
-    Raises UsageError for a case, group or deviation that does not exist. An adapter that fails ends
-    the run and is in the report.
+    Raises UsageError for an unknown case, group or deviation. A failing adapter ends the run and is
+    in the report.
     """
     selection.check()
     check_deviations(profile, known_cases())
@@ -113,7 +111,7 @@ def run(
 
 
 class CaseEnd(NamedTuple):
-    """How a case ended; `stop` is the reason when the whole run ends with it."""
+    """How a case ended; `stop` is the reason when it also ends the run."""
 
     verdict: CaseVerdict
     note: str = ""
@@ -121,7 +119,7 @@ class CaseEnd(NamedTuple):
 
 
 def execute(case: Case, bench: Bench) -> CaseEnd:
-    """Run a case to its end; raises nothing, whatever the case does."""
+    """Run a case and return its end; never raises."""
     try:
         case.run(bench)
     except CaseStopped:
@@ -145,7 +143,7 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
 
 
 class SuiteRun:
-    """A run case by case (`begin`, `run_case`, `finish`, `report`), or whole (`run_all`)."""
+    """A run, either case by case (`begin`, `run_case`, `finish`, `report`) or all (`run_all`)."""
 
     def __init__(
         self,
@@ -156,7 +154,7 @@ class SuiteRun:
         stopped: Callable[[], bool],
     ) -> None:
         self.stopped = ""
-        """Why no further case is run; empty while the run goes on."""
+        """Why no further case is run; "" while the run continues."""
         self._subject = subject
         self._profile = profile
         self._options = options
@@ -170,12 +168,12 @@ class SuiteRun:
         self._not_upgradable = ""
         self._killed_by = ""
         self._no_bring_up: RestoreResult | None = None
-        """How the good image could not be flashed before the first case."""
+        """Why the good image could not be flashed before the first case."""
         self._final_image = ""
         self._final_image_seen_by: tuple[str, ...] = ()
 
     def run_all(self, chosen: Sequence[str]) -> RunReport:
-        """Run the cases with these ids; one that this bench cannot run has its result at once."""
+        """Run these cases; those that the bench cannot run are reported at once."""
         cases: list[Case] = []
         for case_id in chosen:
             case = CASES.get(case_id)
@@ -197,7 +195,7 @@ class SuiteRun:
 
     @property
     def judged(self) -> set[str]:
-        """The ids of the cases that have a result."""
+        """Ids of the cases with a result."""
         return {result.case_id for result in self._results}
 
     def skip_case(self, case_id: str, why: str) -> None:
@@ -205,11 +203,11 @@ class SuiteRun:
         self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=why))
 
     def begin(self) -> None:
-        """Flash the good image, so that the first case finds the known state."""
+        """Flash the good image before the first case."""
         self._restore("before the first case", flash=True)
 
     def run_case(self, case: Case, repeat: int = 1) -> CaseResult:
-        """Run a case, unless the run has come to its end before."""
+        """Run a case unless the run has ended."""
         if not self.stopped and self._subject.port.now() >= self._ends_at:
             self.stopped = "the run's own time limit is over"
         if not self.stopped and self._asked_to_stop():
@@ -258,16 +256,16 @@ class SuiteRun:
         )
 
     def restore_after(self, what: str, bench: Bench, *, flash: bool) -> str:
-        """Bring the device back after a case, or a test of somebody else, that used `bench`; the
-        good image is flashed with `flash`, and when it may have been erased. Returns what was wrong
-        with the device, "" when nothing was.
+        """Restore the device after a case or a user's test that used `bench`; flashes the good
+        image if `flash` is set or it may have been erased. Returns what was wrong with the device,
+        or "".
         """
         erased = flash or bench.tester.update_was_sent
         return self._restore(f"after {what}", flash=erased, case_id=what, is_off=bench.is_off)
 
     def finish(self) -> str:
-        """Flash the good image once more and verify it, by its version and by readback or over
-        the bus where there are such; returns `FINAL_IMAGE_OK`, or what failed.
+        """Flash the good image again and verify it by version and flash content where possible.
+        Returns `FINAL_IMAGE_OK` or what failed.
         """
         if self._killed_by:
             self._final_image = "not flashed: the device could not be brought back"
@@ -283,7 +281,7 @@ class SuiteRun:
         return self._final_image
 
     def _compare_final_image(self) -> None:
-        """The good image was flashed: see by what there is whether it is there."""
+        """Verify the flashed good image with what the bench has."""
         subject, image = self._subject, self._subject.good_image
         seen_by = [] if reported_version(subject.target, image) is None else ["version"]
         limit_s = CASES[BRING_UP].limit_s
@@ -298,7 +296,7 @@ class SuiteRun:
         self._final_image_seen_by = tuple(seen_by)
 
     def report(self, chosen: Sequence[str]) -> RunReport:
-        """The results so far; `chosen` are the ids of the cases that belong to the run."""
+        """Results so far; `chosen` are the ids of the cases of the run."""
         self._results.sort(key=lambda result: (result.repeat, chosen.index(result.case_id)))
         port = self._subject.port
         return RunReport(
@@ -327,7 +325,7 @@ class SuiteRun:
         )
 
     def _failed_bring_up(self, failed: RestoreResult, repeat: int) -> CaseResult:
-        """The result of a bring-up that did not succeed: what was heard, and the likely cause."""
+        """The result of a failed bring-up, with its diagnosis."""
         at_s = failed.trace[-1].at_s if failed.trace else 0.0
         got = "; ".join((*failed.diagnosis, failed.reason))
         check = Check("", CheckOutcome.FAIL, "the device can be upgraded", got, at_s)

@@ -1,8 +1,4 @@
-"""Several runs beside each other: the verdict of every case, and the times, a column a run.
-
-`diff` says what got worse between two; this shows how any number of devices, benches or releases
-differ.
-"""
+"""Comparison of any number of runs: verdicts and times with one column per run."""
 
 from __future__ import annotations
 
@@ -25,7 +21,7 @@ _FACTS: Final = (
     "profile_source",
     "stopped",
 )
-"""What of a run is shown where it differs between the runs."""
+"""Properties of a run to show where they differ."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,7 @@ class RunColumn:
     """One run."""
 
     name: str
-    """Of its file."""
+    """Name of its file."""
     subject: str
     passed: bool
     passes: int
@@ -49,19 +45,19 @@ class CaseRow:
     group: str
     title: str
     verdicts: Sequence[CaseVerdict | None]
-    """The worst of each run's repeats; None (null) where the run has not the case."""
+    """The worst verdict of each run's repeats; None (null) where the run does not have the case."""
     reasons: Sequence[str]
-    """What each run says of it."""
+    """Reason given by each run."""
 
     @property
     def differs(self) -> bool:
-        """True when not all runs have the same verdict."""
+        """True when the verdicts differ."""
         return len(set(self.verdicts)) > 1
 
 
 @dataclass(frozen=True)
 class FactRow:
-    """Something else that differs between the runs."""
+    """Another property that differs between the runs."""
 
     name: str
     values: Sequence[str]
@@ -69,7 +65,7 @@ class FactRow:
 
 @dataclass(frozen=True)
 class TimeRow:
-    """The times of one name in all runs, None (null) where a run has none."""
+    """Times of one name in all runs, None (null) where a run has none."""
 
     name: str
     medians_s: Sequence[float | None]
@@ -78,12 +74,12 @@ class TimeRow:
 
 @dataclass(frozen=True)
 class SideBySide:
-    """The runs beside each other."""
+    """Several runs in columns."""
 
     runs: Sequence[RunColumn]
     cases: Sequence[CaseRow]
     facts: Sequence[FactRow]
-    """What differs between the runs, the keys of their profiles included."""
+    """Properties and profile keys that differ between the runs."""
     times: Sequence[TimeRow]
 
 

@@ -1,5 +1,5 @@
-"""A simulated bus as the suite's way to a device model: exact end times of all frames, on a virtual
-clock, so that no time is spent; and what all models are as subjects.
+"""Port and base class of subjects on a simulated bus with a virtual clock, which provides exact end
+times of all frames.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ _AT_ONCE: Final = float("-inf")
 
 
 class SimulatedPort:
-    """A way onto a simulated bus, with exact end times of all frames, the own ones included. Its
-    methods raise DeviceCrashed too.
-    """
+    """Port on a simulated bus. Its methods raise DeviceCrashed too."""
 
     echoes = True
     timestamp_source = "simulated bus"
@@ -41,7 +39,7 @@ class SimulatedPort:
         self._link = self.bus.link()
         self._arrived: deque[tuple[Frame, float]] = deque()
         self._pending: deque[tuple[Frame, RawFrame]] = deque()
-        """What was sent and has not left."""
+        """Frames that have not left yet."""
         self.now = self.bus.clock.now
 
     def send(self, frame: RawFrame) -> None:
@@ -65,13 +63,15 @@ class SimulatedPort:
         return Arrival(RawFrame(*frame[:5]), at, is_echo=False)
 
     def _take_reports(self) -> None:
-        """The link has the same frames; it reports errors, and raises when unplugged."""
+        """Take error frames from the link, which raises when unplugged; its other frames are
+        duplicates.
+        """
         while (seen := self._link.receive(_AT_ONCE)) is not None:
             if seen.is_error:
                 self._arrived.append((seen, self.now()))
 
     def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
-        """Take note of every frame on the wire, unless the adapter is off the bus."""
+        """Record every frame on the wire, unless the adapter is off the bus."""
         if self.bus.faults.takes_part:
             self._arrived.append((frame, at))
         return (frame,)
@@ -81,9 +81,7 @@ DeviceT = TypeVar("DeviceT", bound="MockDevice | CompiledDevice")
 
 
 class SimulatedSubject(Generic[DeviceT]):
-    """A device model as a subject; a cut in a flash operation is the business of each. Without a
-    good image of its user it has both of the `own` ones.
-    """
+    """A simulated device as a subject. Without `good_image` it uses both images of `own`."""
 
     has_power = has_readback = has_bus_off = has_timed_cuts = True
 
@@ -118,7 +116,9 @@ class SimulatedSubject(Generic[DeviceT]):
 
 
 class _CrashReporter(AbstractContextManager[None]):
-    """A device model that raises has done what a real part does not allow."""
+    """Converts a device model's exception to DeviceCrashed: it did something impossible on
+    hardware.
+    """
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if isinstance(error, FlasherError) and not isinstance(error, BusError):

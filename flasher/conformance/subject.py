@@ -1,4 +1,6 @@
-"""The interfaces of a device under test and of the bus to it; `mock` and `real` implement both."""
+"""Interfaces of the device under test (`Subject`) and of its bus (`BusPort`); implemented by
+`mock`, `real` and `dut`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ BY_BUS: Final = "memory over the bus"
 
 
 class Arrival(NamedTuple):
-    """A frame on the bus: when its last bit was there (seconds), and whether it is an own one."""
+    """A frame on the bus, with the time of its last bit in seconds; `is_echo` for a sent frame."""
 
     frame: RawFrame
     at: float
@@ -26,66 +28,66 @@ class BusPort(Protocol):
 
     bitrate_bps: int
     echoes: bool
-    """True when own frames come back from `receive` once they have left."""
+    """True when `receive` returns sent frames too, once they have left."""
     timestamp_source: str
-    """Who stamps the frames: "simulated bus", "hardware", "kernel" or "host"."""
+    """Source of the time stamps: "simulated bus", "hardware", "kernel" or "host"."""
     uncertainty_s: float
-    """How far a time stamp may be off."""
+    """Uncertainty of a time stamp."""
     sends_error_frames: bool
-    """True when `send` takes error frames too."""
+    """True when `send` supports error frames."""
 
     def now(self) -> float:
-        """The time in seconds; it never goes back."""
+        """Monotonic time in seconds."""
 
     def send(self, frame: RawFrame) -> None:
         """Hand a frame over; returns when it is accepted."""
 
     def receive(self, deadline: float) -> Arrival | None:
-        """The next frame, None when `deadline` passed first."""
+        """The next frame, or None at `deadline`."""
 
 
 class Subject(Protocol):
-    """The device under test. What it cannot do raises `Unsupported`."""
+    """The device under test. Unavailable operations raise `Unsupported`."""
 
     name: str
-    """What it is and where, for the report."""
+    """Name and location for the report."""
     target: str
     """wmc, bms or obc."""
     good_image: bytes
-    """An image that runs on it."""
+    """An image that runs on the device."""
     second_image: bytes | None
-    """Another image that runs on it, smaller, of another version."""
+    """Another such image, smaller and of another version."""
     has_power: bool
-    """True when `power` works; the same for those below."""
+    """True when `power` works; likewise the following."""
     has_readback: bool
     has_bus_off: bool
     has_timed_cuts: bool
 
     @property
     def port(self) -> BusPort:
-        """The way to it."""
+        """The bus of the device."""
 
     def power(self, *, on: bool) -> None:
         """Switch the device on or off."""
 
     def readback(self) -> bytes:
-        """The application area from its first byte on: at least the bytes of the image in it."""
+        """Read the application area from its first byte on, at least as much as the image in it."""
 
     def bus_off(self, for_s: float) -> None:
-        """Take the device's CAN controller off the bus; it comes back after `for_s` seconds."""
+        """Take the device's CAN controller off the bus for `for_s` seconds."""
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
-        """Cut the power when `share` (0 to 1) is done of the flash operation number `operation`
-        (from 0) that begins from now on; it comes back after `off_s` seconds. One cut at a time.
+        """Cut the power for `off_s` seconds when `share` (0 to 1) of flash operation number
+        `operation` (counted from now, from 0) is done. Only one cut can be pending.
         """
 
     def take_cut(self) -> bool:
-        """True when the cut that was set last has happened; one that has not is cancelled."""
+        """True when the cut has happened; otherwise cancels it."""
 
 
 def readback_source(subject: Subject, profile: ConformanceProfile) -> str:
-    """By what the flash is compared: `READBACK` past the protocol, or `BY_BUS`, the memory query of
-    a running BMS, where the profile knows the address; "" where it is not.
+    """How the flash can be compared: `READBACK`, `BY_BUS` (memory queries to a running BMS at the
+    address in the profile), or "".
     """
     if subject.has_readback:
         return READBACK

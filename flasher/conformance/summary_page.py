@@ -1,4 +1,4 @@
-"""What goes with a release: a badge, and the run on one page of paper."""
+"""Badge and one-page summary of a run, for publication with a release."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from flasher.conformance.trace_excerpt import boot_versions
 from flasher.report.base import Status, render_page
 
 _LISTED: Final = 6
-"""Cases that went wrong, deviations and times: the page has room for so many of each."""
+"""Room on the page for failed cases, deviations and times, each."""
 _NARROW: Final = frozenset(" ,fijlrt")
 _WIDTH: Final = 6.9
 _NARROW_WIDTH: Final = 3.8
-"""Of a character in the badge, at its size of 11."""
+"""Widths of characters in the badge at font size 11."""
 _LABEL: Final = "bootloader conformance"
 _WRONG: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE)
 

@@ -1,6 +1,6 @@
-"""The tester's side of the bus: sends frames, reassembles the device's messages, keeps a trace.
+"""Tester's end of the bus: sends frames, decodes the device's messages, records a trace.
 
-Frames are received whenever time passes, and no wait goes beyond the time limit of the case.
+Frames are received whenever time passes; no wait exceeds the time limit of the case.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from flasher.conformance.wire import (
 )
 
 TRACE_FRAMES: Final = 20_000
-"""Frames of a case that are kept: the newest ones."""
+"""Largest number of frames to keep of a case, the newest ones."""
 _LIMITS: Final = {
     MessageKind.FEEDBACK: "feedback_s",
     MessageKind.BOOT_VERSION: "first_version_s",
@@ -39,22 +39,22 @@ _LIMITS: Final = {
     MessageKind.VERSION_INFORMATION: "start_s",
 }
 _RECEIVED_LIMIT: Final = 50_000
-"""Messages that are kept: a babbling device must not fill the memory."""
+"""Largest number of messages to keep, so that a babbling device does not exhaust memory."""
 _ECHO_LIMIT_S: Final = 2.0
-"""A frame that has not left by then is taken as sent: its echo was lost."""
+"""After this time a frame counts as sent and its echo as lost."""
 _FRAME_BITS: Final = 47
-"""A frame without data and stuff bits, interframe space included."""
+"""Bits of a frame without data and stuff bits, including interframe space."""
 _STUFFED_BITS: Final = 33
-"""Of these, what can be stuffed."""
+"""Bits of these that are subject to bit stuffing."""
 _UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE.to_bytes(2, "big")
 _NO_READ: Final = re.compile(rb"\x55\xaa[^\x11\x0c]", re.DOTALL)
-"""The beginning of a message that is neither read nor report."""
+"""Start of a message that is neither read nor report."""
 _POLL_S: Final = 0.2
-"""Longest single wait, so that a request to stop is noticed soon."""
+"""Longest single wait, so that a stop request is noticed soon."""
 
 
 class FaultKind(Enum):
-    """What happens to the frame."""
+    """Effect on the frame."""
 
     DROP = "dropped"
     DOUBLE = "doubled"
@@ -64,8 +64,8 @@ class FaultKind(Enum):
 
 @dataclass(frozen=True)
 class LineFault:
-    """One fault on the line, of the `index`-th frame (from 0) since `BusTester.disturb`: of those
-    that are sent or, with `incoming`, of those that arrive (which can be dropped and doubled only).
+    """A fault of frame number `index` (from 0) since `BusTester.disturb`, of those sent or, with
+    `incoming`, of those received. Received frames can only be dropped and doubled.
     """
 
     kind: FaultKind
@@ -78,20 +78,19 @@ class LineFault:
             raise ValueError(f"a frame that arrives cannot be {self.kind.value}")
 
     def __str__(self) -> str:
-        """As a step of a case."""
         side = "received" if self.incoming else "sent"
         return f"frame {self.index + 1} {side} is {self.kind.value}"
 
 
 class Sent(NamedTuple):
-    """When a message began and when its last frame had left, in seconds."""
+    """Start of a message and end of its last frame, in seconds."""
 
     at: float
     left_at: float
 
 
 class BusTester:
-    """Sends and receives on one `BusPort`, for one case, which may take `limit_s`."""
+    """Sends and receives on one `BusPort`, for a case that may take `limit_s`."""
 
     def __init__(
         self,
@@ -107,15 +106,17 @@ class BusTester:
         self.began_at = port.now()
         self.ends_at = self.began_at + limit_s
         self.update_was_sent = False
-        """True once an update command went out: the application may be erased."""
+        """True once an update command was sent, so that the application may be erased."""
         self.collects_feedback = profile.choice("fr_10") == "silence"
-        """Else general feedback that a write may be answered by (R15) is in the trace only."""
+        """False: general feedback to a write (R15) only appears in the trace."""
         self.collects_application = False
-        """Set by a case that cares about `Kind.APPLICATION`; else they are in the trace only."""
+        """Set by cases that need `MessageKind.APPLICATION`, which otherwise only appears in the
+        trace.
+        """
         self.frames_sent = 0
         self.frames_received = 0
         self.left_at = self.began_at
-        """When the last frame sent had left."""
+        """End of the last frame sent."""
         self._stopped = stopped
         self._decoder = DeviceDecoder(encoder)
         self._received: deque[Received] = deque(maxlen=_RECEIVED_LIMIT)
@@ -133,7 +134,6 @@ class BusTester:
 
     @property
     def now(self) -> float:
-        """The time, in seconds on the port's clock."""
         return self.port.now()
 
     @property
@@ -142,11 +142,10 @@ class BusTester:
         return self.now - self.began_at
 
     def wait(self, for_s: float) -> None:
-        """Let time pass; messages received meanwhile are kept for the calls below."""
+        """Let time pass; received messages are kept for the calls below."""
         self.wait_until(self.now + for_s)
 
     def wait_until(self, moment: float) -> None:
-        """Let time pass until `moment`."""
         while self.now < moment:
             self._pump(moment)
 
@@ -160,8 +159,8 @@ class BusTester:
         gaps: int | None = None,
         at: float | None = None,
     ) -> Sent:
-        """Send frames, `gap_s` of silence behind each of the first `gaps` of them (None: between
-        all), from the time `at` on; returns when the last one has left.
+        """Send frames, with `gap_s` of silence after each of the first `gaps` of them (None: all),
+        starting at `at`. Returns when the last one has left.
         """
         if at is not None:
             self.wait_until(at)
@@ -184,14 +183,14 @@ class BusTester:
         return Sent(began_at, self.left_at)
 
     def wire_s(self, frames: Iterable[RawFrame], *, is_stuffed: bool = False) -> float:
-        """How long frames take on the wire: at the least, or with all stuff bits there can be."""
+        """Minimum time of frames on the wire or, with `is_stuffed`, the maximum."""
         sizes = [8 * len(frame.data) for frame in frames]
         stuff_bits = sum((_STUFFED_BITS + size) // 4 for size in sizes) if is_stuffed else 0
         return (len(sizes) * _FRAME_BITS + sum(sizes) + stuff_bits) / self.port.bitrate_bps
 
     @contextmanager
     def collecting_feedback(self) -> Iterator[None]:
-        """General feedback is heard inside the `with`, as that of an application is waited for."""
+        """Context manager that collects general feedback, for answers of an application."""
         before, self.collects_feedback = self.collects_feedback, True
         try:
             yield
@@ -200,7 +199,7 @@ class BusTester:
 
     @contextmanager
     def disturb(self, *faults: LineFault) -> Iterator[None]:
-        """Let these faults happen inside the `with`; frames are counted from its beginning."""
+        """Context manager that applies these faults; frames are counted from its start."""
         self._faults = {(fault.incoming, fault.index): fault for fault in faults}
         self._fault_origin = (self.frames_sent, self.frames_received)
         try:
@@ -225,8 +224,8 @@ class BusTester:
         within_s: float | None = None,
         unlike: Callable[[Received], bool] | None = None,
     ) -> Received | None:
-        """The next message of one of `kinds`, others skipped; None after `within_s`, by default
-        the limit for the first kind. One for which `unlike` is true is skipped too.
+        """The next message of one of `kinds` for which `unlike` is false, skipping others; None
+        after `within_s` (default: the limit for the first kind).
         """
         deadline = self.now + (self.limit_s(kinds[0]) if within_s is None else within_s)
         while (received := self.next_message(deadline - self.now)) is not None:
@@ -235,36 +234,35 @@ class BusTester:
         return None
 
     def limit_s(self, kind: MessageKind) -> float:
-        """The profile's limit for the answer of that kind. Raises KeyError for one without."""
+        """The profile's limit for an answer of this kind. Raises KeyError without one."""
         return self.profile.limit(_LIMITS[kind])
 
     def collect(self, for_s: float) -> list[Received]:
-        """The messages of the next `for_s`, and those received before and not yet taken."""
+        """Return the messages received so far and in the next `for_s`."""
         self.wait(for_s)
         found = list(self._received)
         self._received.clear()
         return found
 
     def forget(self) -> None:
-        """Discard the messages received so far and not yet taken."""
+        """Discard the messages received so far."""
         self._received.clear()
 
     # -- trace ------------------------------------------------------------------------------------
 
     @property
     def trace(self) -> tuple[TraceEntry, ...]:
-        """The newest `TRACE_FRAMES` frames."""
         return tuple(self._trace)
 
     @property
     def trace_dropped(self) -> int:
-        """Older frames that were not kept."""
+        """Number of older frames that were dropped."""
         return self._traced - len(self._trace)
 
     # -- inside -----------------------------------------------------------------------------------
 
     def _pump(self, deadline: float) -> None:
-        """Take one frame, or let time pass, up to `deadline` or for `_POLL_S`."""
+        """Receive one frame, or let time pass until `deadline` or for `_POLL_S`."""
         now = self.port.now()
         if now >= self.ends_at:
             raise CaseLimitReached(
@@ -326,7 +324,7 @@ class BusTester:
         self._record(self.left_at, frame, sent=True)
 
     def _wait_for_echoes(self) -> None:
-        """Wait until the last frame has left: by its echo, or by its length on the wire."""
+        """Wait until the last frame has left: for its echo, or for its time on the wire."""
         if not self.port.echoes:
             self.wait_until(self.left_at)
             return

@@ -1,4 +1,4 @@
-"""The frames of a case as people read them: which of them matter, as messages and as bytes."""
+"""Excerpt of a case's trace for people: its relevant part, as messages and raw frames."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from flasher.trace.decoder import BusEvent, Decoder
 _FRAMES_A_MESSAGE: Final = 20
 _FIELDS: Final = 8
 _FIRST_FRAMES: Final = 200
-"""Of a case, in which its bootloader has announced itself."""
+"""Frames of a case within which its bootloader has announced itself."""
 _LINE: Final = 120
-"""Characters of the fields in a line of text."""
+"""Longest text of fields in a line."""
 _AFTER_S: Final = 0.02
-"""What came so shortly after a failed check belongs to it."""
+"""A frame this soon after a failed check belongs to it."""
 
 
 class TraceRow(NamedTuple):
-    """A decoded message, and the text of its fields."""
+    """A decoded message and the text of its fields."""
 
     seen: BusEvent
     text: str
 
     def __str__(self) -> str:
-        """As a line of text."""
         seen = self.seen
         sender = seen.sender or f"{seen.can_id:03X}"
         text = self.text if len(self.text) <= _LINE else f"{self.text[:_LINE]}..."
@@ -41,12 +40,12 @@ class Excerpt(NamedTuple):
     messages: Sequence[TraceRow]
     frames: Sequence[TraceEntry]
     text: str
-    """Which part it is."""
+    """Description of the part."""
 
 
 def excerpt(result: CaseResult, messages: int, frames: int) -> Excerpt:
-    """At most so many messages and frames of a case: the last ones before its first failed check,
-    or the first ones where none failed.
+    """Up to `messages` and `frames` of a case: the last ones before its first failed check, or the
+    first ones when none failed.
     """
     if not result.trace:
         return Excerpt((), (), "")
@@ -68,7 +67,7 @@ def excerpt(result: CaseResult, messages: int, frames: int) -> Excerpt:
 
 
 def frame_lines(frames: Sequence[TraceEntry]) -> Iterator[str]:
-    """Frames as lines: time in seconds, `>` for one that the suite sent, id, size, bytes."""
+    """Format frames as lines: time in seconds, `>` for sent ones, id, size, bytes."""
     for entry in frames:
         frame = entry.frame
         can_id = f"{frame.can_id:0{8 if frame.is_extended else 3}X}"
@@ -79,7 +78,7 @@ def frame_lines(frames: Sequence[TraceEntry]) -> Iterator[str]:
 
 
 def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
-    """What these frames say, in order; bytes that no message was made of too."""
+    """Decode the frames into messages, including bytes without a message."""
     decoder = Decoder()
     found: list[BusEvent] = []
     for entry in entries:
@@ -97,7 +96,7 @@ def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
 
 
 def boot_versions(report: RunReport) -> tuple[str, ...]:
-    """What the bootloader called itself in the frames of a run, each once."""
+    """Distinct boot versions in the frames of a run."""
     found: dict[str, None] = {}
     for result in report.results:
         heard = [entry for entry in result.trace[:_FIRST_FRAMES] if not entry.sent]

@@ -1,10 +1,10 @@
-"""The protocol's bytes, written a second time from sections 1 to 5 of the document alone.
+"""Independent second implementation of the wire protocol, from sections 1 to 5 of the document.
 
-This is the one deliberate exception to "one fact, one place": a misreading that host and device
-model of this project share must not hide here, so nothing of `flasher.protocol` is imported, and an
-import contract holds that. Do not replace these constants by those of the other modules.
+The deliberate exception to "one fact, one place": if host and device model share a misreading of
+the document, this module must not share it too. It imports nothing of `flasher.protocol`, which an
+import contract enforces. Do not replace its constants by those of other modules.
 
-`Encoder` builds what the tool sends, `DeviceDecoder` names what the device sends.
+`Encoder` builds the tool's messages, `DeviceDecoder` decodes the device's.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ VERSION_INFORMATION: Final = 0x1540
 QUERY_MEMORY: Final = 0x4308
 MEMORY: Final = 0x5688
 MEMORY_BYTES: Final = 128
-"""What one memory query asks for at the most."""
+"""Most bytes in one memory query."""
 
 FRAME_BYTES: Final = 8
 _OVERHEAD_BYTES: Final = 9
@@ -54,18 +54,18 @@ _VERSION: Final = re.compile(rb"V\d{1,2}r\d{1,2}r\d{1,2}_\d{8}")
 
 
 class RawFrame(NamedTuple):
-    """One CAN frame, of any kind."""
+    """One CAN frame of any kind."""
 
     can_id: int
     data: bytes
     is_extended: bool = False
     is_remote: bool = False
-    """Its data then only tell the length that it asks for."""
+    """`data` then only gives the requested length."""
     is_error: bool = False
 
     @property
     def is_payload(self) -> bool:
-        """True for a standard data frame with bytes in it."""
+        """True for a standard data frame with data."""
         return bool(self.data) and not any(self[2:])
 
 
@@ -83,8 +83,8 @@ _TABLE: Final = tuple(_table_entry(index) for index in range(256))
 
 
 def crc(covered: bytes, *, start: int = 0xFFFFFFFF, steps: int = 4) -> int:
-    """Appendix 1: a byte into the low end of the register, then four table steps. With one step the
-    byte goes into the high end, as CRC-32/MPEG-2 has it.
+    """CRC of appendix 1: each byte enters the low end of the register, followed by four table
+    steps. With one step it enters the high end, as in CRC-32/MPEG-2.
     """
     register = start
     for byte in covered:
@@ -101,16 +101,16 @@ def message_crc(can_id: int, body: bytes) -> bytes:
 
 
 def build(can_id: int, mode: int, command: int, data: bytes = b"") -> bytes:
-    """A message, header to tail, with the length that its data has.
+    """Build a message from header to tail, with the length of its data.
 
-    A `command` whose second byte does not fit the data is sent as it is: that is a stimulus too.
+    A `command` whose second byte contradicts the data is kept, as a stimulus.
     """
     body = struct.pack(">BBH", mode, 2 + len(data), command) + data
     return b"\x55\xaa" + body + message_crc(can_id, body) + b"\xf0"
 
 
 def is_intact(can_id: int, raw: bytes) -> bool:
-    """True for one whole message with the right CRC, in which length and command fit the data."""
+    """True for one complete message with a correct CRC whose length and command match its data."""
     is_whole = len(raw) >= _OVERHEAD_BYTES + 2 and raw[3] == len(raw) - _OVERHEAD_BYTES
     if not is_whole or raw[5] != raw[3] - 2 or not raw.startswith(b"\x55\xaa"):
         return False
@@ -118,7 +118,7 @@ def is_intact(can_id: int, raw: bytes) -> bool:
 
 
 def split(can_id: int, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
-    """Bytes as consecutive CAN frames of `size_bytes`, the last one shorter."""
+    """Split bytes into CAN frames of `size_bytes`, the last one shorter."""
     return [
         RawFrame(can_id, raw[start : start + size_bytes])
         for start in range(0, len(raw), size_bytes)
@@ -126,34 +126,33 @@ def split(can_id: int, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
 
 
 def joined(frames: Iterable[RawFrame]) -> bytes:
-    """The bytes that frames carry."""
     return b"".join(frame.data for frame in frames)
 
 
 def inverted(data: bytes | bytearray) -> bytes:
-    """The same bytes with every bit the other way round."""
+    """Invert every bit."""
     return bytes(byte ^ 0xFF for byte in data)
 
 
 def packet_count(size_bytes: int) -> int:
-    """How many packets an image of that size has."""
+    """Number of packets of an image."""
     return -(-size_bytes // PACKET_BYTES)
 
 
 def packet_payload(image: bytes, number: int) -> bytes:
-    """The 128 bytes of packet `number` (from 1), filled with FF."""
+    """The 128 bytes of packet `number` (from 1), padded with FF."""
     start = (number - 1) * PACKET_BYTES
     return image[start : start + PACKET_BYTES].ljust(PACKET_BYTES, b"\xff")
 
 
 def version_in(image: bytes) -> str | None:
-    """The firmware version inside an image; None without one, or with two different ones."""
+    """Firmware version contained in an image; None for none or several different ones."""
     found = set(_VERSION.findall(image))
     return found.pop().decode("ascii") if len(found) == 1 else None
 
 
 def padded_to_frame(frames: Sequence[RawFrame], filler: int = 0) -> list[RawFrame]:
-    """The frames, the last one filled up to 8 bytes."""
+    """Pad the last frame to 8 bytes."""
     last = frames[-1]
     return [*frames[:-1], last._replace(data=last.data.ljust(FRAME_BYTES, bytes((filler,))))]
 
@@ -177,14 +176,14 @@ TARGET_NAMES: Final = tuple(_TARGETS)
 
 
 def reported_version(target: str, image: bytes) -> str | None:
-    """The version by which a device tells that it runs `image`; None where it cannot."""
+    """Version by which a device identifies `image`; None when it cannot."""
     return version_in(image) if _TARGETS[target].has_version_query else None
 
 
 class Encoder:
-    """The messages of the tool to one target, as CAN frames, and the CAN ids of both directions.
+    """Builds the tool's messages to one target as CAN frames, and knows the CAN ids of both.
 
-    Raises KeyError for a target that is none of `TARGET_NAMES`.
+    Raises KeyError for a target that is not in `TARGET_NAMES`.
     """
 
     def __init__(
@@ -210,11 +209,10 @@ class Encoder:
         ]
 
     def frames(self, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
-        """Any bytes to this target."""
         return split(self.to_device, raw, size_bytes)
 
     def frames_by_chance(self, raw: bytes, chance: Random) -> list[RawFrame]:
-        """Any bytes in frames of 1 to 8 bytes."""
+        """Split bytes into frames of random size, 1 to 8 bytes."""
         found: list[RawFrame] = []
         while raw:
             size = chance.randint(1, FRAME_BYTES)
@@ -223,22 +221,20 @@ class Encoder:
         return found
 
     def message(self, mode: int, command: int, data: bytes = b"") -> list[RawFrame]:
-        """Any message to this target."""
         return self.frames(build(self.to_device, mode, command, data))
 
     def reset(self) -> list[RawFrame]:
-        """Restart into the bootloader."""
         return self.message(WRITE, self.reset_command, self.reset_data)
 
     def update(self, size_bytes: int, text: bytes | None = None) -> list[RawFrame]:
-        """Update command for an image of that size."""
+        """Update command for an image of this size."""
         name = self.update_text if text is None else text
         return self.message(WRITE, UPDATE, name + struct.pack("<I", size_bytes))
 
     def packet(
         self, number: int, total: int, payload: bytes, *, start: int = START
     ) -> list[RawFrame]:
-        """A packet; `payload` is its 128 bytes."""
+        """A packet with 128 bytes of data."""
         return self.message(WRITE, PACKET, struct.pack("<BHH", start, number, total) + payload)
 
     def packet_of(self, image: bytes, number: int) -> list[RawFrame]:
@@ -246,16 +242,15 @@ class Encoder:
         return self.packet(number, packet_count(len(image)), packet_payload(image, number))
 
     def end(self) -> list[RawFrame]:
-        """End of transfer."""
         return self.message(WRITE, END, END_MARK)
 
     def damaged_packet_of(self, image: bytes, number: int) -> list[RawFrame]:
-        """The same with another CRC."""
+        """Packet `number` of an image with an inverted CRC."""
         raw = joined(self.packet_of(image, number))
         return self.frames(raw[:-5] + inverted(raw[-5:-1]) + raw[-1:])
 
     def upgrade_messages(self, size_bytes: int) -> dict[str, list[RawFrame]]:
-        """The messages of an upgrade to an image of that size, each once, by name."""
+        """Each message of an upgrade once, by name."""
         return {
             "update command": self.update(size_bytes),
             "packet": self.packet(1, packet_count(size_bytes), bytes(PACKET_BYTES)),
@@ -263,27 +258,27 @@ class Encoder:
         }
 
     def answer(self, command: int, data: bytes) -> list[RawFrame]:
-        """What this target itself sends to the tool: a report."""
+        """A report from this target to the tool."""
         return split(self.to_tool, build(self.to_tool, REPORT, command, data))
 
     def query_version(self) -> list[RawFrame]:
-        """Ask the application for its version information."""
+        """Query the version information of the application."""
         return self.message(READ, QUERY_VERSION)
 
     def query_memory(self, start: int, end: int) -> list[RawFrame]:
-        """Ask the application for the memory from `start` to before `end` (R5)."""
+        """Query the memory from `start` to before `end` (R5)."""
         return self.message(READ, QUERY_MEMORY, struct.pack("<II", start, end))
 
 
 # -- from the device to the tool -----------------------------------------------------------------
 
 _FIRMWARE_AT: Final = slice(48, 64)
-"""The fourth of the four texts of version information."""
+"""The fourth of the four texts in version information."""
 _BOOT_VERSION_TEXT: Final = re.compile(rb"V\d\.\d\.\d")
 
 
 class MessageKind(Enum):
-    """What a message from the device is; the value is how reports name it."""
+    """Kind of a message from the device; reports use the value."""
 
     FEEDBACK = "general feedback"
     BOOT_VERSION = "boot version"
@@ -294,9 +289,9 @@ class MessageKind(Enum):
     VERSION_INFORMATION = "version information"
     MEMORY = "memory"
     APPLICATION = "a message of the application to other nodes"
-    """On another id than the tool's, and none of the upgrade's: mostly of no concern here."""
+    """On another id than the tool's and not part of the upgrade; usually ignored."""
     OTHER = "another message"
-    """To the tool and none of those above, or one of those on a wrong id or of a wrong form."""
+    """Any other message to the tool, or an upgrade message with a wrong id or form."""
     DAMAGED = "a damaged message"
 
 
@@ -309,12 +304,12 @@ _KINDS: Final = {
     COMPLETE: (MessageKind.COMPLETE, b"\0\0"),
     MEMORY: (MessageKind.MEMORY, None),
 }
-"""Commands from device to tool, with their data where the document fixes it."""
+"""Commands from device to tool, with their data where the document defines it."""
 
 
 @dataclass(frozen=True)
 class Received:
-    """A message from the device, with the times of its first and last frame in seconds."""
+    """A message from the device; the times of its first and last frame are in seconds."""
 
     kind: MessageKind
     first_at: float
@@ -325,31 +320,29 @@ class Received:
     command: int = 0
     data: bytes = b""
     padding: bytes = b""
-    """What follows the tail in the last frame."""
+    """Bytes after the tail in the last frame."""
 
     @property
     def number(self) -> int:
-        """The packet number of an ACK or NAK."""
         return int.from_bytes(self.data[:2], "little")
 
     @property
     def firmware(self) -> str:
-        """The firmware text of version information, up to its terminator."""
+        """Firmware version in version information, up to its terminator."""
         text: bytes = self.data[_FIRMWARE_AT].partition(b".")[0]
         return text.decode("latin-1")
 
     @property
     def boot_name(self) -> str:
-        """The name in a boot version."""
         return self.data[:3].decode("latin-1")
 
     @property
     def has_good_version_text(self) -> bool:
-        """True when a boot version's text is of the form Vx.x.x."""
+        """True when the text of a boot version has the form Vx.x.x."""
         return _BOOT_VERSION_TEXT.fullmatch(self.data[3:]) is not None
 
     def __str__(self) -> str:
-        """As reports name it; device bytes in hexadecimal or escaped."""
+        """Text for reports; device bytes are in hexadecimal or escaped."""
         if self.kind in (MessageKind.ACK, MessageKind.NAK):
             return f"{self.kind.value} {self.number}"
         if self.kind is MessageKind.BOOT_VERSION:
@@ -362,10 +355,10 @@ class Received:
 
 
 class DeviceDecoder:
-    """Reassembles the messages of the device, id by id; frames of other senders are ignored. Bytes
-    that are no message become `Kind.DAMAGED`.
+    """Assembles messages of the device per CAN id and ignores other senders. Bytes that do not form
+    a message become `MessageKind.DAMAGED`.
 
-    A message starts with a CAN frame (R19); what follows its tail in the last frame is padding.
+    A message starts at the start of a CAN frame (R19); bytes after its tail are padding.
     """
 
     def __init__(self, encoder: Encoder, partial_timeout_s: float = 0.1) -> None:
@@ -374,9 +367,9 @@ class DeviceDecoder:
         self._partial: dict[int, tuple[float, float, bytes]] = {}
 
     def feed(self, frame: RawFrame, at: float) -> Iterator[Received]:
-        """The messages that end with this frame."""
+        """Yield the messages that end with this frame."""
         can_id = frame.can_id
-        # The first digit behind the 7 is the sender.
+        # The second digit of an id is the sender.
         if not frame.is_payload or can_id & 0x7F0 != self._ids.to_all:
             return
         first_at, last_at, so_far = self._partial.pop(can_id, (at, at, b""))
@@ -418,7 +411,7 @@ class DeviceDecoder:
 
 
 def describe(heard: Sequence[Received]) -> str:
-    """Several messages in a line, repetitions counted; "nothing" for none."""
+    """Messages in one line, with repetitions counted; "nothing" for none."""
     runs = [(text, len(list(same))) for text, same in groupby(map(str, heard))]
     shown = [text if count == 1 else f"{text} ({count} times)" for text, count in runs[:8]]
     if len(runs) > len(shown):

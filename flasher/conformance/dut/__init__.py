@@ -1,9 +1,9 @@
-"""A bootloader that is compiled for the computer, or written in Python, as a device under test.
+"""Device under test that is a bootloader compiled for this computer or written in Python.
 
-`flasher_dut.h` is the interface, with the meaning of every call; `flasher_dut_process.c` makes a
-program of a bootloader that implements it. What stands here is the same interface for Python:
-`--subject MODULE:FACTORY` names a function without arguments that returns a `Bootloader`. It is
-called once for each start, as RAM is lost with the power.
+`flasher_dut.h` documents the interface; `flasher_dut_process.c` makes a program of a bootloader in
+C that implements it. This module is the same interface for Python: `--subject MODULE:FACTORY` names
+a function without arguments that returns a `Bootloader`. It is called for every start of the
+device, since RAM is lost.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from typing import NamedTuple, Protocol
 
 
 class SubjectError(Exception):
-    """What was named is no bootloader; the text says why."""
+    """The given subject is not a usable bootloader; the text says why."""
 
 
 class CanFrame(NamedTuple):
-    """A classical CAN frame; a remote frame has no data, but a length code."""
+    """A classic CAN frame; a remote frame has a length code but no data."""
 
     can_id: int
     data: bytes = b""
     is_extended: bool = False
     is_remote: bool = False
     length: int | None = None
-    """The length code; None for as many bytes as there are data."""
+    """Length code; None means the length of `data`."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What the suite has to know of the device: as `flasher_dut_facts` of the header. Raises
-    ValueError for sizes that do not fit each other.
+    """Properties of the device, like `flasher_dut_facts` in the header. Raises ValueError for sizes
+    that contradict each other.
     """
 
     flash_bytes: int
@@ -59,7 +59,7 @@ class Facts:
 
 
 class Host(Protocol):
-    """The hardware, as `flasher_host` of the header."""
+    """Hardware functions, like `flasher_host` in the header."""
 
     def now_us(self) -> int: ...
     def flash_read(self, offset: int, size_bytes: int) -> bytes: ...
@@ -79,6 +79,6 @@ class Bootloader(Protocol):
     def start(self, host: Host, cause: int) -> None: ...
     def receive(self, frame: CanFrame) -> None: ...
     def tick(self, now_us: int) -> int | None:
-        """Returns when it wants the next one; None when only a frame can change anything."""
+        """Return the time of the next call; None when only a frame can change anything."""
 
     def next_frame(self) -> CanFrame | None: ...

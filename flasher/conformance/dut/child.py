@@ -1,5 +1,5 @@
-"""What runs in the process of a bootloader that is a shared library or written in Python: it talks
-to the suite as `flasher_dut_process.c` does.
+"""Main program of the child process of a bootloader that is a shared library or Python code; the
+counterpart of `flasher_dut_process.c`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FUNCTIONS: Final = tuple(
 
 
 class _ProcessHost:
-    """The hardware, at the other end of the pipe."""
+    """Hardware functions that call the suite through the pipe."""
 
     def __init__(self, pipe: Pipe) -> None:
         self._pipe = pipe
@@ -98,7 +98,7 @@ class _Library:
 
     def __init__(self, path: str) -> None:
         try:
-            # Without a folder the loader would look in those of the system.
+            # Without a directory the loader would search the system's directories.
             self._library = library = ctypes.CDLL(os.path.abspath(path))  # noqa: PTH100
             for name in _FUNCTIONS:
                 getattr(library, name)
@@ -167,7 +167,7 @@ def _make(subject: str) -> Bootloader:
 
 
 def _next(pipe: Pipe) -> tuple[PipeMessage, bytes]:
-    """The next message of the suite; ends the process when the suite has ended."""
+    """Read the next message; ends the process when the suite has ended."""
     while (found := pipe.take()) is None:
         if not pipe.fill():
             os._exit(0)
@@ -175,8 +175,8 @@ def _next(pipe: Pipe) -> tuple[PipeMessage, bytes]:
 
 
 def serve(subject: str, pipe: Pipe) -> Never:
-    """Be one start of the bootloader, to its end: of the library with this path, or of what the
-    function MODULE:FACTORY makes.
+    """Run one start of the bootloader until it ends. `subject` is the path of a library or
+    MODULE:FACTORY.
     """
     bootloader, host = _make(subject), _ProcessHost(pipe)
     pipe.write(PipeMessage.FACTS, pipes.pack_facts(bootloader.facts))

@@ -1,6 +1,4 @@
-"""The device around a bootloader that is compiled for the computer: flash, CAN controller, power,
-and the application that the bootloader starts.
-"""
+"""Simulated hardware around a compiled bootloader: flash, CAN controller, power, application."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ POWER_ON: Final = 0
 RESET: Final = 1
 _TICK_S: Final = 0.001
 _RESTART_S: Final = 0.01
-"""From a reset, or from what a watchdog of the chip ends, to the first instruction."""
+"""From a reset or watchdog to the first instruction."""
 _US: Final = 1_000_000
 _MAGIC: Final = b"FLASHERA"
 _HEAD: Final = Struct("<II8sI")
@@ -42,15 +40,15 @@ _FLASH_PASSES_MAX: Final = 16
 
 
 def application_image(version: str, size_bytes: int) -> bytes:
-    """An image for the application that the suite plays: it begins as a program for a Cortex-M
-    does, and can tell whether it is whole.
+    """Make an image that the simulated application runs: it starts like a Cortex-M program and
+    contains its size and checksum.
     """
     body = _HEAD.pack(_STACK, _ENTRY, _MAGIC, size_bytes) + version.encode("ascii") + b"\0"
     return with_checksum(body, size_bytes)
 
 
 def _is_incomplete(area: bytes) -> bool:
-    """True for nothing at all, and for an image of `application_image` that is not whole."""
+    """True for erased flash and for an incomplete image of `application_image`."""
     if len(area) < _HEAD.size:
         return False
     _, _, magic, size_bytes = _HEAD.unpack_from(area)
@@ -60,10 +58,10 @@ def _is_incomplete(area: bytes) -> bool:
 
 
 class CompiledDevice(Machine):
-    """A device with the bootloader of `process`; an engine. It has no application at first.
+    """A device that runs the bootloader of `process`, as an engine; initially without application.
 
-    Whatever the flash does not allow, and a bootloader that ends or does not return, raises
-    FlasherError; the device begins anew then, as by a watchdog.
+    Raises FlasherError for a forbidden flash access and for a bootloader that ends or does not
+    return; the device then restarts, as after a watchdog reset.
     """
 
     def __init__(self, target: Target, process: BootloaderProcess, *, bitrate_bps: int) -> None:
@@ -91,14 +89,14 @@ class CompiledDevice(Machine):
         self._received: deque[CanFrame] = deque()
         self._to_send: deque[Frame] = deque()
         self._left_at = -inf
-        """When the frame that the bus has taken last is through."""
+        """End of the frame that the bus took last."""
         self._is_full = False
-        """The bootloader may have more to send than the controller has taken."""
+        """The bootloader may have more frames to send than the controller had room for."""
         self._busy_until = -inf
-        """The processor is in a call, or waits for the flash."""
+        """Until then the processor executes a call or waits for the flash."""
         self._tick_at = inf
         self._handled_bytes = 0
-        """Bytes that this call has read, erased, written and logged."""
+        """Bytes that the current call has read, erased, written and logged."""
         self._operations = 0
         self._cut: tuple[int, float, float] | None = None
         self._cause = POWER_ON
@@ -162,14 +160,14 @@ class CompiledDevice(Machine):
             self._restart(POWER_ON, now)
 
     def set_cut(self, operation: int, share: float, off_s: float) -> None:
-        """Cut the power when `share` (0 to 1) of the flash operation number `operation` from now
-        on is done, for `off_s` seconds.
+        """Cut the power for `off_s` seconds when `share` (0 to 1) of flash operation number
+        `operation` (counted from now) is done.
         """
         self._operations = 0
         self._cut = (operation, share, off_s)
 
     def take_cut(self) -> bool:
-        """True when the cut has happened; one that has not is cancelled."""
+        """True when the cut has happened; otherwise cancels it."""
         happened, self._cut = self._cut is None, None
         return happened
 
@@ -180,11 +178,10 @@ class CompiledDevice(Machine):
         self._tick_at = min(self._tick_at, now)  # the controller has room again
 
     def readback(self) -> bytes:
-        """The application area."""
         return self.flash.read(AREA_START, self.facts.application_bytes)
 
     def _restart(self, cause: int, at: float) -> None:
-        """RAM and all that was under way are lost; the bootloader starts at that time."""
+        """Restart the bootloader at time `at`; RAM and pending work are lost."""
         self._process.kill()
         if self._runs_application:
             self.application.stop()
@@ -198,7 +195,7 @@ class CompiledDevice(Machine):
         self._due_at = at
 
     def _expire(self, now: float) -> None:
-        """The time to start has come: after a reset, or as the power is there."""
+        """Start the bootloader after a reset or power-up."""
         self._due_at = inf
         if self._runs_application:
             self._restart(RESET, now)
@@ -236,7 +233,7 @@ class CompiledDevice(Machine):
         return max(self._tick_at, self._busy_until)
 
     def _call_when_free(self, now: float) -> None:
-        """Hand over what was received, and give it its turn, unless it is busy."""
+        """Pass received frames to the bootloader and call its tick, unless it is busy."""
         while self._process.is_running and self._received and now >= self._busy_until:
             frame = pipes.pack_frame(self._received.popleft())
             self._call(PipeMessage.RECEIVE, self._pending(now), now, frame)
@@ -281,7 +278,7 @@ class CompiledDevice(Machine):
             self._is_full = self._pending(now) >= pipes.TRANSMIT_FRAMES
 
     def _hardware(self, asked: PipeMessage, data: bytes) -> bytes | None:
-        """What a function of the hardware gives; None for no answer."""
+        """Perform a hardware function; None when it has no reply."""
         if asked is PipeMessage.LOG:
             self._count_bytes(pipes.HEADER.size + len(data))
             self._log.append(data.decode(errors="replace"))
@@ -296,7 +293,7 @@ class CompiledDevice(Machine):
             ) from error
 
     def _flash_operation(self, asked: PipeMessage, data: bytes) -> bytes | None:
-        """Read, erase or write; None when the power was cut."""
+        """Read, erase or write flash; None when the power was cut."""
         if asked is PipeMessage.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
             self._count_bytes(size_bytes)

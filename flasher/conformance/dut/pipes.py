@@ -1,6 +1,4 @@
-"""The messages between the suite and the process of a bootloader; their meaning stands in
-`flasher_dut_process.c`.
-"""
+"""Messages between the suite and the bootloader process; documented in `flasher_dut_process.c`."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from flasher.conformance.dut import CanFrame, Facts
 
 ABI: Final = 1
 TRANSMIT_FRAMES: Final = 3
-"""As FLASHER_TRANSMIT_FRAMES of the header."""
+"""FLASHER_TRANSMIT_FRAMES of the header."""
 HEADER: Final = Struct("<B3xI")
 FACTS: Final = Struct("<9I")
 TURN: Final = Struct("<QI")
@@ -24,12 +22,12 @@ PLACE: Final = Struct("<QI")
 TIME: Final = Struct("<Q")
 DONE: Final = Struct("<QQ")
 NEVER: Final = 0xFFFF_FFFF_FFFF_FFFF
-"""The next tick of a bootloader that waits for a frame."""
+"""Next tick of a bootloader that only waits for frames."""
 _READ_SIZE: Final = 1 << 16
 
 
 class PipeMessage(Enum):
-    """The first byte of a message."""
+    """Type of a message: its first byte."""
 
     FACTS = ord("f")
     START = ord("S")
@@ -47,7 +45,7 @@ class PipeMessage(Enum):
 
 
 class Pipe:
-    """Two file descriptors as a way for messages."""
+    """Reads and writes messages on two file descriptors."""
 
     def __init__(self, read_fd: int, write_fd: int) -> None:
         self.read_fd = read_fd
@@ -62,9 +60,7 @@ class Pipe:
             view = view[os.write(self._write_fd, view) :]
 
     def take(self) -> tuple[PipeMessage, bytes] | None:
-        """A message that has arrived whole; None without one. Raises ValueError for bytes that are
-        no message.
-        """
+        """Return a complete message or None. Raises ValueError for bytes that are not a message."""
         if len(self._buffer) < HEADER.size:
             return None
         kind, size = HEADER.unpack_from(self._buffer)
@@ -87,32 +83,28 @@ class Pipe:
         return bool(data)
 
     def close(self) -> None:
-        """Close both descriptors."""
         os.close(self.read_fd)
         os.close(self._write_fd)
 
 
 def pack_frame(frame: CanFrame) -> bytes:
-    """The 16 bytes of a frame."""
     length = len(frame.data) if frame.length is None else frame.length
     return FRAME.pack(frame.can_id, length, frame.is_extended, frame.is_remote, frame.data)
 
 
 def unpack_frame(data: bytes) -> CanFrame:
-    """The frame of 16 bytes."""
     can_id, length, is_extended, is_remote, content = FRAME.unpack(data)
     payload = b"" if is_remote else content[:length]
     return CanFrame(can_id, payload, bool(is_extended), bool(is_remote), length)
 
 
 def pack_facts(facts: Facts) -> bytes:
-    """The content of a message with facts."""
     *numbers, _ = astuple(facts)
     return FACTS.pack(ABI, *numbers) + facts.name.encode()
 
 
 def unpack_facts(data: bytes) -> Facts:
-    """The facts of such a content. Raises ValueError for another version, or what cannot be."""
+    """Raises ValueError for another ABI version or contradictory facts."""
     if len(data) < FACTS.size:
         raise ValueError("the facts are cut off")
     abi, *numbers = FACTS.unpack_from(data)

@@ -1,4 +1,4 @@
-"""The process of a bootloader, as the suite sees it: started, called, killed, and watched."""
+"""Runs a bootloader in a child process: starts, calls, watches and kills it."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from flasher.conformance.dut.pipes import Pipe, PipeMessage
 from flasher.errors import FlasherError, UsageError, printable
 
 WATCHDOG_S: Final = 5.0
-"""A call that takes longer on the computer does not return."""
+"""A call that takes longer in real time counts as not returning."""
 _WAIT_S: Final = 0.01
 _OUTPUT_SIZE: Final = 4096
 _DUMP_MARK: Final = "Shadow bytes around"
-"""Behind what AddressSanitizer says for people."""
+"""Start of the memory dump after AddressSanitizer's readable report."""
 _STDIN, _STDOUT, _STDERR = range(3)
 _LIBRARY: Final = frozenset((".so", ".dylib"))
 
 
 class BootloaderError(FlasherError):
-    """The process of the bootloader ended, or had to be ended, where it had to go on."""
+    """The bootloader process ended or was killed during a call."""
 
 
 class BootloaderProcess:
-    """Starts of one bootloader, one after another, each in a process of its own. `subject` is a
-    program or a shared library by its path, or MODULE:FACTORY. Raises UsageError for what is none.
+    """Runs one bootloader, each start in a new process. `subject` is the path of a program or
+    shared library, or MODULE:FACTORY. Raises UsageError when it is unusable.
     """
 
     def __init__(self, subject: str) -> None:
@@ -63,12 +63,11 @@ class BootloaderProcess:
 
     @property
     def is_running(self) -> bool:
-        """True from a start until the process has ended."""
         return self._process is not None
 
     def start(self) -> Facts:
-        """Begin a process; returns what it says of the device. Raises BootloaderError, and
-        UsageError for one that does not talk as it has to.
+        """Start a process and return its facts. Raises BootloaderError, and UsageError when it does
+        not speak the protocol.
         """
         self.kill()
         if not self._is_program:  # loaded once, not in each process
@@ -100,10 +99,10 @@ class BootloaderProcess:
     def call(
         self, kind: PipeMessage, *parts: bytes, during: Callable[[PipeMessage, bytes], bytes | None]
     ) -> tuple[PipeMessage, bytes] | None:
-        """Call the bootloader, and answer with `during` what it asks of its hardware meanwhile.
+        """Call the bootloader; `during` answers its hardware requests.
 
-        Returns how the call ended (DONE, APPLICATION, RESET) and what was said with it; None when
-        `during` killed the process. Raises BootloaderError when it ends, or does not return.
+        Returns the final message (DONE, APPLICATION or RESET) with its data, or None when `during`
+        killed the process. Raises BootloaderError when the process ends or does not return.
         """
         doing = f"flasher_dut_{kind.name.lower()}"
         try:
@@ -127,7 +126,9 @@ class BootloaderProcess:
             raise self._died(doing) from None
 
     def kill(self) -> int | None:
-        """End the process at once, as a power cut does; returns how it ended, None without one."""
+        """Kill the process immediately, like a power cut. Returns its exit code, None without a
+        process.
+        """
         process, self._process = self._process, None
         if process is None:
             return None
@@ -137,7 +138,7 @@ class BootloaderProcess:
         return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
     def unusable(self, why: str, cause: str) -> UsageError:
-        """That it cannot be tested."""
+        """Make the error for a subject that cannot be tested."""
         return UsageError(
             f"{printable(self.subject)} {why}.",
             cause=cause,
@@ -148,23 +149,21 @@ class BootloaderProcess:
         )
 
     def close(self) -> None:
-        """End the process, and forget what it printed."""
+        """Kill the process and discard its output."""
         self.kill()
         self._stderr.close()
 
     def output(self) -> str:
-        """What the process printed, the report of a sanitizer for instance, without its dump of
-        memory; "" for nothing.
-        """
+        """What the process printed, such as a sanitizer report without its memory dump."""
         self._stderr.seek(0)
         lines = self._stderr.read(_OUTPUT_SIZE).decode(errors="replace").splitlines()
         said = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)
         return " | ".join(printable(line) for line in said if line.strip(" ="))
 
     def _become_bootloader(self, read_fd: int, write_fd: int) -> Never:
-        """In the process of the bootloader: become it."""
+        """Replace this child process by the bootloader."""
         try:
-            # Ctrl-C and what ends a group of processes are for the suite, which ends this one.
+            # The suite handles Ctrl-C and signals to the process group, and ends this process.
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, signal.SIG_IGN)
             os.dup2(self._stderr.fileno(), _STDERR)
@@ -199,7 +198,7 @@ class BootloaderProcess:
         return found
 
     def _died(self, doing: str) -> BootloaderError:
-        """The process has ended, or talks nonsense: what it was, with what it printed."""
+        """The error for a process that ended or sent invalid data, with its output as cause."""
         assert self._process is not None  # noqa: S101  it was started
         for _ in range(round(WATCHDOG_S / _WAIT_S)):  # its pipe is closed a little sooner
             if os.waitid(os.P_PID, self._process, os.WEXITED | os.WNOHANG | os.WNOWAIT):

@@ -1,4 +1,4 @@
-"""A bootloader that is compiled for the computer as a subject, on a simulated bus."""
+"""Subject for a compiled bootloader on a simulated bus."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _SECOND: Final = ("V1r9r0_20230517", 6 * 128)
 
 
 class CompiledSubject(SimulatedSubject[CompiledDevice]):
-    """A device with that bootloader, with power, readback and cuts in flash operations. Without
-    images it gets those that the suite's own application runs.
+    """A device with the bootloader of `process`. Without `good_image` it uses images that the
+    simulated application runs.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ def open_subject(
     good_image: bytes | None,
     second_image: bytes | None,
 ) -> Iterator[tuple[CompiledSubject, ConformanceProfile]]:
-    """The bootloader `what` (`BootloaderProcess`) and the profile, with the sizes that it tells
-    where the profile leaves them open. Raises UsageError.
+    """Open the bootloader named `what` (see `BootloaderProcess`). The profile gets the bootloader's
+    own sizes where it does not set them. Raises UsageError.
     """
     with closing(BootloaderProcess(what)) as process:
         try:

@@ -1,6 +1,4 @@
-"""Random walks: many of them, each from the known state, until one finds something; then the
-shortest one that finds the same.
-"""
+"""Random walks on a device until one finds a violation, then shrink it to the fewest steps."""
 
 from __future__ import annotations
 
@@ -28,14 +26,14 @@ from flasher.conformance.subject import Subject
 from flasher.errors import BusError
 
 WALK_STEPS: Final = 24
-"""The longest walk."""
+"""Steps of the longest walk."""
 SHRINK_TRIES: Final = 60
 _LIMIT_S: Final = 900.0
 _NO_CHANCE: Final = random.Random(0)  # noqa: S311  all steps are given
 
 
 class Explorer:
-    """Walks on one device; `progress` is told the number of steps after each walk."""
+    """Runs walks on one device; calls `progress` with the number of steps after each walk."""
 
     def __init__(
         self,
@@ -56,7 +54,7 @@ class Explorer:
         self._walks = 0
 
     def explore(self, steps: int) -> ExploreResult:
-        """Walk until so many steps were taken, or something is found. Raises BusError."""
+        """Walk for `steps` steps or until a violation is found. Raises BusError."""
         try:
             trouble = self._restore()
             if trouble:
@@ -75,7 +73,7 @@ class Explorer:
         return self._result(stopped="it was stopped" if self._steps < steps else "")
 
     def replay(self, texts: Sequence[str]) -> ExploreResult:
-        """Take these steps, as a finding tells them. Raises UsageError, BusError."""
+        """Take the steps of a finding. Raises UsageError and BusError."""
         steps = [parse_step(text) for text in texts]
         taken: list[WalkStep] = []
         try:
@@ -97,8 +95,8 @@ class Explorer:
         taken: list[WalkStep],
         chance: random.Random = _NO_CHANCE,
     ) -> tuple[Violation, Bench] | None:
-        """Take these steps, `chance` choosing those that are None, then upgrade the device to the
-        good image.
+        """Take these steps, choosing those that are None by `chance`; then upgrade the device to
+        the good image.
         """
         self._walks += 1
         bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
@@ -128,7 +126,7 @@ class Explorer:
         return None
 
     def _restore(self) -> str:
-        """Flash the good image, by the protocol alone; returns what went wrong, or ""."""
+        """Flash the good image by the protocol alone; returns what went wrong, or ""."""
         done = restore(self._subject, self._profile, flash=True, stopped=self._stopped)
         if not done.ok:
             return "; ".join((done.reason, *(() if self._walks else done.diagnosis)))
@@ -137,11 +135,11 @@ class Explorer:
         return ""
 
     def _stop_reason(self) -> str:
-        """Why it ended early, once the good image is put back or cannot be."""
+        """Restore the device and return why the run ended early."""
         return "; ".join(filter(None, ("it was stopped", self._restore_at_end())))
 
     def _restore_at_end(self) -> str:
-        """Let the good image run, whoever wants to stop; returns what went wrong, or ""."""
+        """Restore the good image even after a stop request; returns what went wrong, or ""."""
         try:
             why = restore(self._subject, self._profile, flash=False).reason
         except BusError as error:
@@ -151,8 +149,8 @@ class Explorer:
     # -- shrinking ---------------------------------------------------------------------------------
 
     def _shrink(self, found: tuple[Violation, Bench], taken: list[WalkStep]) -> WalkFinding:
-        """The shortest walk, by leaving steps out, that ends with the same rule; the shortest until
-        then when somebody stops it, or the adapter fails.
+        """Shrink the walk by leaving out steps while it still violates the same rule. Returns the
+        best result so far when the run is stopped or the adapter fails.
         """
         best, rule = list(taken), found[0].rule
         size, tries = max(len(best) // 2, 1), 0
@@ -175,7 +173,7 @@ class Explorer:
         return self._finding(found, best, taken)
 
     def _cannot_restore(self) -> bool:
-        """Bring the device back for the next walk; True when that is not possible."""
+        """Restore the device for the next walk; True when that is impossible."""
         try:
             return not restore(self._subject, self._profile, flash=True, stopped=self._stopped).ok
         except RunStopped:

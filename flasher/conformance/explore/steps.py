@@ -1,4 +1,4 @@
-"""Steps of a walk as they are written, and which one comes next."""
+"""Steps of a walk: parsing, and random choice of the next one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from flasher.errors import UsageError, did_you_mean
 _NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
 _PACKET_OPEN: Final = "packet-open"
-"""Any of the forms that the profile decides about."""
+"""Takes any packet form that the profile decides about."""
 _WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
     DevicePhase.APPLICATION: {
         "reset": 14,
         **dict.fromkeys(("burst", "burst=twice", "query", "update=384", "packet", "end"), 1),
         **dict.fromkeys(("wait=0.3", "power", "bus-off"), 1),
-        # No write but a reset goes to an application on purpose: it may keep what is written.
+        # Apart from resets, do not send writes to an application, which may store them.
         **dict.fromkeys([name for name in NO_CONCERN if name != "unknown"], 0.7),
         **dict.fromkeys(("packet-crc", "update-others"), 0.4),
     },
@@ -102,11 +102,11 @@ _WEIGHTS: Final[dict[DevicePhase, dict[str, float]]] = {
         **dict.fromkeys(("wait=window", "wait=pause", "query"), 1),
     },
 }
-"""How often each step is taken, by what the device does."""
+"""Weight of each step in each phase."""
 
 
 class WalkStep(NamedTuple):
-    """One step, as it is written: `packet`, `update=384`."""
+    """One step in its written form: `packet` or `update=384`."""
 
     name: str
     argument: str = ""
@@ -120,11 +120,11 @@ _ARGUMENTS: Final = {
            if text.partition("=")[0] == name}
     for name in ALL_STEPS
 }  # fmt: skip
-"""What may stand behind each step; where a number does, another one may too."""
+"""Valid arguments of each step; where one is a number, any number is valid."""
 
 
 def parse_step(text: str) -> WalkStep:
-    """A step as it is written. Raises UsageError for one that does not exist."""
+    """Parse a step. Raises UsageError for one that does not exist."""
     name, _, argument = text.partition("=")
     known = set(_form_arguments()) if name == _PACKET_OPEN else _ARGUMENTS.get(name, set())
     is_number = _NUMBER.fullmatch(argument) and any(map(_NUMBER.fullmatch, known))
@@ -135,7 +135,7 @@ def parse_step(text: str) -> WalkStep:
 
 
 def next_step(walk: Walk, chance: random.Random) -> WalkStep:
-    """A step for what the device does, by chance; only what the bench can do."""
+    """Choose a random step for the current phase that the bench supports."""
     weights, subject = _WEIGHTS[walk.phase], walk.bench.subject
     lacks = {
         "power": not subject.has_power,
@@ -152,13 +152,12 @@ def next_step(walk: Walk, chance: random.Random) -> WalkStep:
 
 
 def _form_arguments() -> list[str]:
-    """The arguments of `packet-open`."""
     found = forms(Encoder("bms")).items()
     return [f"{key}-{index}" for key, each in found for index in range(len(each))]
 
 
 def reachable_pairs() -> list[tuple[DevicePhase, str]]:
-    """Every phase with every step that a walk may take in it, without the steps' arguments."""
+    """Every phase with every step that a walk may take in it, without arguments."""
     return [
         (phase, name)
         for phase, weights in _WEIGHTS.items()

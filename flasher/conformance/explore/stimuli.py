@@ -1,6 +1,4 @@
-"""Messages that a device has to refuse, or that are no concern of it, by the names of the steps of
-a walk. Each is made at a place in a transfer, which need not be under way.
-"""
+"""Messages that a device has to reject or ignore, by the names of the steps of a walk."""
 
 from __future__ import annotations
 
@@ -39,21 +37,20 @@ _SMALL_BYTES: Final = 3 * PACKET_BYTES
 
 @dataclass(frozen=True)
 class TransferPosition:
-    """Where in a transfer: the image, and the packet that is next."""
+    """A position in a transfer, which need not be running: the image and the next packet."""
 
     encoder: Encoder
     image: bytes
     wanted: int
     largest_bytes: int
-    """The largest image that the device takes."""
+    """Largest image that the device accepts."""
 
     @property
     def total(self) -> int:
-        """Packets of the image."""
         return packet_count(len(self.image))
 
     def packet(self, number: int, *, total: int | None = None, start: int = 1) -> bytes:
-        """A packet of the image; an impossible number carries the data of the next one."""
+        """A packet of the image; a number outside the image carries the data of the next packet."""
         inside = number if 1 <= number <= self.total else self.wanted
         payload = packet_payload(self.image, inside)
         total = self.total if total is None else total
@@ -61,38 +58,37 @@ class TransferPosition:
 
     @property
     def next_packet(self) -> bytes:
-        """The packet that is next."""
         return self.packet(self.wanted)
 
 
 class Stimulus(NamedTuple):
-    """What is sent; an intact write may have general feedback (R15)."""
+    """Frames to send; an intact write may be answered by general feedback (R15)."""
 
     frames: list[RawFrame]
     is_intact_write: bool
 
 
 Maker = Callable[[TransferPosition], bytes | list[RawFrame]]
-"""Bytes go to the device, in frames of 8."""
+"""Makes bytes, which are sent in frames of 8, or frames."""
 
 
 # -- packets ---------------------------------------------------------------------------------------
 
 
 def _with_crc(crc_bytes: Callable[[bytes], bytes]) -> Maker:
-    """The next packet with a CRC of its own, made of the bytes between header and CRC."""
+    """The next packet with the CRC that `crc_bytes` computes from the bytes before it."""
     return lambda place: (
         place.next_packet[:-5] + crc_bytes(place.next_packet[2:-5]) + place.next_packet[-1:]
     )
 
 
 def _with_frames(change: Callable[[list[RawFrame]], list[RawFrame]]) -> Maker:
-    """The next packet, some of its frames lost, doubled or exchanged."""
+    """The next packet with changed frames."""
     return lambda place: change(place.encoder.frames(place.next_packet))
 
 
 def _exchanged(frames: list[RawFrame]) -> list[RawFrame]:
-    """Two frames exchanged; where they are alike, one is lost."""
+    """Exchange two frames, or drop one of them when they are equal."""
     at = _SPOILT_FRAME
     exchanged = [] if frames[at] == frames[at + 1] else [frames[at + 1], frames[at]]
     return [*frames[:at], *exchanged, *frames[at + 2 :]]
@@ -127,7 +123,7 @@ PACKETS: Final[dict[str, Maker]] = {
     "packet-doubled": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME - 1 :]),
     "packet-exchanged": _with_frames(_exchanged),
     "packet-half": _with_frames(lambda all_: all_[: len(all_) // 2]),
-    # Its length byte and data are longer by one than its command says.
+    # Length byte and data exceed the command's length by one.
     "packet-long": lambda place: build(
         place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff"
     ),
@@ -140,7 +136,7 @@ PACKETS: Final[dict[str, Maker]] = {
 def _small_update(
     place: TransferPosition, *, mode: int = WRITE, text: bytes = b"", more: bytes = b""
 ) -> bytes:
-    """An update command; with `more` data, length byte and data are longer than it says."""
+    """An update command for a small image; with `more` data its length contradicts the command."""
     data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little") + more
     return build(place.encoder.to_device, mode, UPDATE, data)
 
@@ -188,7 +184,7 @@ def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Maker:
 
 
 def _resets_from_other_nodes(place: TransferPosition) -> list[RawFrame]:
-    """Resets to this target, but not by the tool: from every other node."""
+    """Resets to this target sent by every other node."""
     encoder, digit = place.encoder, place.encoder.to_device & 0xF
     ids = [0x700 | sender << 4 | digit for sender in (1, 2, 3, 4) if sender != digit]
     reset = (WRITE, encoder.reset_command, encoder.reset_data)
@@ -226,7 +222,7 @@ REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
 
 
 def make_stimulus(name: str, place: TransferPosition) -> Stimulus:
-    """What is sent in the step of that name."""
+    """Build the message of the step `name`."""
     made = REFUSED[name](place)
     frames = place.encoder.frames(made) if isinstance(made, bytes) else made
     raw, can_id = joined(frames), place.encoder.to_device

@@ -1,8 +1,8 @@
-"""A walk: steps in any order, valid ones and others, judged by a model of what is certain.
+"""Random walk: takes valid and invalid steps in any order and judges the answers by a model.
 
-The model knows what a device must do, what it may do, and what the profile decides; where that
-leaves the state open it is UNCLEAR, and only what is never right is judged. Two rules hold
-everywhere: nothing but what is valid is answered positively, and what is valid is answered.
+The model knows what a device must do, what it may do, and what the profile decides. Where the state
+is not certain it is UNCLEAR, and only violations of general rules count. Two rules always apply:
+only valid messages get a positive answer, and valid messages get an answer.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _UPDATES_MAX: Final = 8
 
 
 class DevicePhase(Enum):
-    """What the device does, as far as it is certain."""
+    """State of the device, as far as it is certain."""
 
     APPLICATION = "application"
     ANNOUNCING = "announcing"
@@ -61,16 +61,16 @@ _IN_TRANSFER: Final = frozenset((DevicePhase.BEGUN, DevicePhase.TRANSFER, Device
 
 
 class EndOutcome(Enum):
-    """What the end of a transfer has to lead to, by the image."""
+    """Required result at the end of a transfer of this image."""
 
     RUNS = "complete"
     REFUSED = "NAK"
     NEVER_ENDED = ""
-    """It would start what does not run."""
+    """The image does not run, so its transfer is never ended."""
 
 
 class Violation(Exception):  # noqa: N818  the device's error, and no error of the walk
-    """The device did what is never right, or not what it must; `rule` is short and stable."""
+    """The device violated a rule; `rule` is a short, stable name."""
 
     def __init__(self, rule: str, text: str) -> None:
         super().__init__(text)
@@ -78,7 +78,7 @@ class Violation(Exception):  # noqa: N818  the device's error, and no error of t
 
 
 def filler(size_bytes: int) -> bytes:
-    """An image that is never ended: bytes by its size, with headers and tails among them."""
+    """An image for unfinished transfers: deterministic bytes that include headers and tails."""
     chance = random.Random(size_bytes)  # noqa: S311  the same at every replay
     parts = (b"\x55\xaa\x16\x87\xa3\x85", b"\xf0\x55\xaa", b"\x55\x55\xaa\xf0")
     data = b""
@@ -89,21 +89,21 @@ def filler(size_bytes: int) -> bytes:
 
 
 class Walk:
-    """The device under the steps of one walk; it begins with a running good image."""
+    """Tracks the device during one walk, which starts with the good image running."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
         self.phase = DevicePhase.APPLICATION
         self.has_application: bool | None = True
-        """There is an application to start; None where that is not certain."""
+        """True when a complete application is installed; None when that is not certain."""
         self.update_accepted = False
-        """An update command was accepted in this walk."""
+        """True once the device accepted an update command in this walk."""
         self.running_image = bench.good_image
-        """The image of that application."""
+        """The image of the installed application."""
         self._image = filler(3 * PACKET_BYTES)
         self._expected_end = EndOutcome.NEVER_ENDED
         self._update_image = (self._image, self._expected_end)
-        """What the last update command was about."""
+        """Image and expected end of the last update command."""
         self._stored = 0
         self._updates_unanswered = 0
         self._acks_due: Counter[int] = Counter()
@@ -113,17 +113,17 @@ class Walk:
         self._may_restart = False
         self._may_complete = False
         self._may_send_partial = False
-        """Its message under way may have been cut: the next thing that is heard may be the half."""
+        """A message of the device may have been cut off, so half of it may arrive next."""
         self._nodes_asked: frozenset[int] = frozenset()
-        """Ids by which the device may answer other nodes, in whose name something was sent."""
+        """Ids on which the device may answer other nodes whose messages the walk imitated."""
         self._requested_at = -inf
         self._version_at = -inf
         self._answered_at = bench.now
-        """When the device had something to answer, from which a pause counts."""
+        """Time of the last message that required an answer; a pause counts from there."""
 
     def take(self, name: str, argument: str = "") -> None:
-        """Take a step: one of `STEPS`, or a message that is refused. Raises Violation, and what
-        the bench raises.
+        """Take a step of `STEPS`, or send an invalid message. Raises Violation and errors of the
+        bench.
         """
         self._apply_elapsed_time()
         if name in REFUSED:
@@ -132,7 +132,7 @@ class Walk:
             getattr(self, f"_{name.replace('-', '_')}")(argument)
 
     def check_application(self) -> None:
-        """The application that should be there runs. Raises Violation."""
+        """Check that the expected application runs. Raises Violation."""
         bench = self.bench
         if self.phase is not DevicePhase.APPLICATION and bench.encoder.has_version_query:
             bench.wait(bench.host.burst_s)
@@ -147,7 +147,7 @@ class Walk:
         bench.forget()
 
     def check_stored(self, image: bytes) -> None:
-        """The flash holds `image`, where it can be read. Raises Violation."""
+        """Check that the flash holds `image`, where it is readable. Raises Violation."""
         if self.bench.subject.has_readback:
             at = self.bench.difference(image)
             if at is not None:
@@ -156,7 +156,7 @@ class Walk:
     # -- what is heard -----------------------------------------------------------------------------
 
     def _apply_elapsed_time(self) -> None:
-        """What time alone has changed since the last step."""
+        """Update the state for the time that passed since the last step."""
         bench = self.bench
         silent_s = bench.now - self._version_at
         if self.phase is DevicePhase.ANNOUNCING and silent_s > bench.host.burst_s:
@@ -170,7 +170,7 @@ class Walk:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
 
     def _await_start(self) -> None:
-        """The burst is over: wait for the application, however long the window is."""
+        """After the burst, wait for the application, however long the window is."""
         bench = self.bench
         start_s = bench.limit("start_s")
         if bench.encoder.has_version_query:
@@ -184,7 +184,7 @@ class Walk:
     def _listen(
         self, within_s: float, until: Callable[[Received], bool] | None = None
     ) -> Received | None:
-        """Judge what arrives; ends at the message that was waited for."""
+        """Judge all messages until one satisfies `until`, which is returned, or time runs out."""
         deadline = self.bench.now + within_s
         while (heard := self.bench.next_message(deadline - self.bench.now)) is not None:
             self._judge(heard)
@@ -195,7 +195,7 @@ class Walk:
     def _await(
         self, kind: MessageKind, within_s: float, after: str, number: int | None = None
     ) -> None:
-        """The message has to come. Raises Violation when it does not."""
+        """Wait for a message of `kind`. Raises Violation without one."""
         heard = self._listen(
             within_s, lambda one: one.kind is kind and number in (None, one.number)
         )
@@ -205,7 +205,7 @@ class Walk:
         self._answered_at = self.bench.now
 
     def _listen_for_answers(self) -> None:
-        """Listen for as long as an answer may take, and a broken message is kept."""
+        """Listen for as long as an answer or the rest of a partial message may take."""
         bench = self.bench
         broken_s = 2 * bench.limit("inter_frame_s")
         if self.phase is DevicePhase.ANNOUNCING:
@@ -307,8 +307,8 @@ class Walk:
                 self.phase = DevicePhase.UNCLEAR
 
     def _burst(self, argument: str) -> None:
-        """Reset, no update command: the burst is whole, then the application starts. With `twice`,
-        a second reset follows the first one.
+        """Reset without an update command: expect a complete burst and the application. With
+        `twice`, a second reset follows.
         """
         if self.phase is not DevicePhase.APPLICATION:
             self._reset("")
@@ -388,7 +388,7 @@ class Walk:
     # -- update command ----------------------------------------------------------------------------
 
     def _await_version(self) -> None:
-        """Where it announces itself, wait for the moment at which it takes an update command."""
+        """While the device announces itself, wait until it accepts an update command."""
         if self.phase is not DevicePhase.ANNOUNCING:
             return
         bench = self.bench
@@ -437,7 +437,7 @@ class Walk:
             self._feedback_due += 1
         if self.phase is not DevicePhase.BEGUN:
             raise Violation("no request", "no request transfer after a valid update command")
-        # An erase for each of them is right too (R25), and so is one answer.
+        # A second erase for the second command is correct too (R25).
         while self._updates_unanswered and self._listen(
             LEFTOVER_S, lambda one: one.kind is MessageKind.REQUEST
         ):
@@ -465,7 +465,7 @@ class Walk:
             self.phase = DevicePhase.UNCLEAR
 
     def _update_reset(self, _: str) -> None:
-        """An update command, and a reset right behind it: while it erases."""
+        """Send an update command directly followed by a reset, which arrives during the erase."""
         bench = self.bench
         self._await_version()
         if self.phase is not DevicePhase.ANNOUNCING:
@@ -487,8 +487,8 @@ class Walk:
         self._listen_for_answers()
 
     def _cut(self, argument: str) -> None:
-        """Cut the power half-way through a flash operation: of the erasing that an update command
-        begins, or, when all packets are stored, of what the end of transfer writes.
+        """Cut the power halfway through a flash operation: of the erase after an update command or,
+        when all packets are stored, of the end of transfer.
         """
         bench, is_end = self.bench, self.phase is DevicePhase.STORED
         if is_end and self._expected_end is not EndOutcome.RUNS:
@@ -520,7 +520,7 @@ class Walk:
         self._may_complete = False
 
     def _check_not_mixed(self, images: Sequence[bytes]) -> None:
-        """What runs after a power cut is one of the images, whole, or nothing."""
+        """Check that after a power cut one of `images` runs completely, or no application."""
         bench = self.bench
         self.phase = DevicePhase.UNCLEAR
         self.has_application = None
@@ -537,7 +537,7 @@ class Walk:
         self.running_image, self.has_application, self.phase = whole, True, DevicePhase.APPLICATION
 
     def _image_of(self, argument: str) -> tuple[bytes, EndOutcome]:
-        """The image of a step, and what comes of it."""
+        """Image of a step, and its expected end."""
         bench = self.bench
         if argument in ("", "good"):
             return bench.good_image, EndOutcome.RUNS
@@ -554,12 +554,11 @@ class Walk:
 
     @property
     def total(self) -> int:
-        """Packets of the image."""
         return packet_count(len(self._image))
 
     @property
     def wanted(self) -> int:
-        """The packet that is next."""
+        """Number of the next packet."""
         return min(self._stored + 1, self.total)
 
     @property
@@ -569,7 +568,7 @@ class Walk:
         return TransferPosition(bench.encoder, self._image, self.wanted, largest_bytes)
 
     def _packet(self, _: str, frames: Sequence[RawFrame] = (), gap_s: float = 0.0) -> None:
-        """The next packet, in these frames; elsewhere than in a transfer it is out of turn."""
+        """Send the next packet, in these frames; outside a transfer it has to be rejected."""
         bench, number = self.bench, self.wanted
         self._feedback_due += 1
         is_next = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER)
@@ -594,12 +593,12 @@ class Walk:
         self._read("")
 
     def _read(self, _: str) -> None:
-        """What was acknowledged is in the flash, unless the device may buffer it."""
+        """Check that acknowledged packets are in the flash, unless the device may buffer them."""
         if self.phase in _IN_TRANSFER and not self.bench.number("buffer_bytes"):
             self.check_stored(self._image[: self._stored * PACKET_BYTES])
 
     def _packet_again(self, argument: str) -> None:
-        """The packet that was stored last, or an older one, perhaps with other data."""
+        """Send the last or an older stored packet again, optionally with other data."""
         is_older = argument.startswith("older")
         number = self._stored - 1 if is_older else self._stored
         if self.phase not in (DevicePhase.TRANSFER, DevicePhase.STORED) or number < 1:
@@ -624,7 +623,7 @@ class Walk:
         self._answered_at = self.bench.now
 
     def _packet_between(self, _: str) -> None:
-        """Frames without payload between those of the packet."""
+        """Send the next packet with empty frames in between."""
         empty = RawFrame(self.bench.encoder.to_device, b"")
         frames = self.bench.encoder.frames(self._place.next_packet)
         self._packet("", [each for frame in frames for each in (frame, empty)])
@@ -634,12 +633,12 @@ class Walk:
         self._packet("", gap_s=gap_s)
 
     def _packet_behind(self, _: str) -> None:
-        """A query and the packet, back to back."""
+        """Send a query and the next packet without a gap."""
         query = self.bench.encoder.query_version()
         self._packet("", [*query, *self.bench.encoder.frames(self._place.next_packet)])
 
     def _packet_open(self, argument: str) -> None:
-        """The next packet in a form that the profile decides about: `fr_02-1` is one of fr_02."""
+        """Send the next packet in a form of `cases.fr.forms`: `fr_02-1` is one of fr_02."""
         bench, (key, _, index) = self.bench, argument.partition("-")
         form = forms(bench.encoder)[key][int(index)]
         raw = form.before + self._place.next_packet
@@ -658,7 +657,7 @@ class Walk:
         self._acks_due.clear()
 
     def _packet_filler(self, _: str) -> None:
-        """The last packet, with other bytes than FF behind the image."""
+        """Send the last packet with bytes other than FF after the image."""
         rest = len(self._image) % PACKET_BYTES
         if self.wanted != self.total or not rest or self.bench.choice("tx_08") != "ignored":
             self._packet("")
@@ -669,7 +668,7 @@ class Walk:
     # -- end of transfer ---------------------------------------------------------------------------
 
     def _end(self, argument: str) -> None:
-        """End of transfer; with `twice`, again at once."""
+        """Send end of transfer; with `twice`, again immediately."""
         bench = self.bench
         self._feedback_due += 1
         if self.phase is not DevicePhase.STORED:
@@ -707,7 +706,7 @@ class Walk:
         self._completed()
 
     def _completed(self) -> None:
-        """The image is complete: its application runs."""
+        """The image is complete: check its application."""
         self.running_image, self.has_application = self._image, True
         self.check_application()
         self._may_restart = self._may_complete = False
@@ -734,7 +733,7 @@ class Walk:
 
 
 def _answers_update(heard: Received, not_before: float) -> bool:
-    """True for request transfer, and for a boot version that follows the update command."""
+    """True for request transfer, and for a boot version sent after the update command."""
     is_later = heard.kind is MessageKind.BOOT_VERSION and heard.at >= not_before
     return is_later or heard.kind is MessageKind.REQUEST
 
@@ -744,5 +743,5 @@ STEPS: Final = (
     *("packet", "packets", "packet-again", "packet-between", "packet-slow", "packet-behind"),
     *("packet-filler", "packet-open", "read", "end"),
 )
-"""Steps that methods of `Walk` take; the others send what has to be refused."""
+"""Steps implemented by methods of `Walk`; the other steps send invalid messages."""
 ALL_STEPS: Final = (*STEPS, *REFUSED)

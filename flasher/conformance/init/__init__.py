@@ -1,7 +1,7 @@
-"""A profile from a device: every key of it is asked on the bus, and is written with what was seen.
+"""`flasher conformance init`: determine a device's profile by asking it on the bus.
 
-The questions are asked in upgrades to the good image alone, which are all brought to their end.
-What cannot be found out stays open, and it is said why.
+All questions are asked during upgrades to the good image, which are completed. Keys that cannot be
+determined stay open, with the reason.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flasher.conformance.results import CaseEnded, RunStopped
 from flasher.conformance.subject import Subject
 
 UPGRADES: Final = 100
-"""About how often the device is erased: some forty upgrades, sizes, and what goes wrong."""
+"""Approximate number of erases: about forty upgrades, size tests and retries."""
 Question = Callable[[InitSession], Findings]
 QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (
@@ -60,9 +60,7 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (transfer_questions.buffer, ("device.buffer_bytes",)),
     (entry_questions.largest_image, ("device.largest_image_bytes",)),
 )
-"""The questions in their order, each with the keys that it answers: a later one may build on what
-an earlier one found.
-"""
+"""Questions in order, with the keys that each one answers; later ones use earlier answers."""
 LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
     "limits.feedback_s": (0.2, (Times.FEEDBACK,)),
     "limits.first_version_s": (
@@ -74,7 +72,7 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
     "limits.ack_s": (0.1, (Times.ANSWER,)),
     "limits.complete_s": (0.5, (Times.COMPLETE,)),
 }
-"""Limits: the least that is written, in seconds, and the times that they are made of."""
+"""Smallest value of a limit in seconds, and the measured times that determine it."""
 NOT_ASKED: Final = {
     "en_04": "an image with a wrong checksum would have to be completed; say what the product has",
     "limits.inter_frame_s": "it is what tm_02 was asked with (R12)",
@@ -83,7 +81,7 @@ NOT_ASKED: Final = {
     "device.application_address": "no message tells it",
     "device.application_bytes": "no message tells it; it is not less than the largest image",
 }
-"""Keys that no question is about, with the reason."""
+"""Keys that no question covers, with the reason."""
 _PATIENCE: Final[dict[str, Value]] = {
     "limits.feedback_s": 2.0,
     "limits.first_version_s": 10.0,
@@ -93,23 +91,23 @@ _PATIENCE: Final[dict[str, Value]] = {
     "limits.complete_s": 60.0,
     "limits.window_s": 2.0,
 }
-"""How long is waited before anything is known."""
+"""Limits to use before anything was measured."""
 
 
 @dataclass(frozen=True)
 class InitResult:
-    """What came of the questions. `answers` has every key of the profile, in its order."""
+    """Result of all questions. `answers` has every key of the profile, in order."""
 
     subject: str
     target: str
     answers: tuple[KeyAnswer, ...]
     stopped: str = ""
-    """Why it ended early; the answers are then not to be kept."""
+    """Why it ended early, in which case the answers must not be used."""
     was_brought_up: bool = True
     """False when the good image could not be flashed before the first question."""
 
     def profile(self, start: ConformanceProfile) -> ConformanceProfile:
-        """What was seen, and for what stays open what `start` says."""
+        """Make a profile of the answers; open keys keep their values of `start`."""
         found = {one.key: one for one in self.answers if one.value is not None}
         given = {key: one.value for key, one in found.items() if one.value is not None}
         why = {key: one.seen for key, one in found.items()}
@@ -119,7 +117,7 @@ class InitResult:
 
     @property
     def open_keys(self) -> dict[str, str]:
-        """The keys that stay open, with the reason."""
+        """Keys that stay open, with the reason."""
         return {one.key: one.seen for one in self.answers if one.value is None}
 
 
@@ -130,8 +128,8 @@ def ask_device(
     stopped: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> InitResult:
-    """Ask a device everything. Raises BusError. The good image runs before and after it; of
-    `start` is believed what no question answers.
+    """Ask the device all questions. The good image runs before and afterwards; `start` provides the
+    keys that no question answers. Raises BusError.
     """
     return _Interview(subject, start, stopped).run(progress)
 
@@ -166,7 +164,7 @@ class _Interview:
         return self._result(trouble, was_brought_up=was_brought_up)
 
     def _ask(self, question: Question, keys: tuple[str, ...]) -> None:
-        """Ask, and once more when the device did something else: a frame may have been late."""
+        """Ask a question, and again after unexpected behaviour: a frame may have been late."""
         why = self._try(question, keys)
         if why and not self._restore("before it was asked again", flash=False):
             why = self._try(question, keys) or "nothing was seen"
@@ -174,7 +172,7 @@ class _Interview:
             self._answers.setdefault(key, KeyAnswer(key, None, why))
 
     def _try(self, question: Question, keys: tuple[str, ...]) -> str:
-        """Ask; returns what the device did else, or ""."""
+        """Ask a question once; returns the unexpected behaviour of the device, or ""."""
         session = InitSession(self._subject, self._profile(), self._stopped)
         why, trials = "", list[Trial]()
         try:
@@ -208,13 +206,13 @@ class _Interview:
             yield limit_answer(key, values_s, least_s, self._subject.port.uncertainty_s)
 
     def _profile(self) -> ConformanceProfile:
-        """All that is known by now; where nothing is, with patience."""
+        """Make a profile of the answers so far, with long limits where nothing was measured."""
         found = (*self._answers.values(), *self._limits())
         given = {one.key: one.value for one in found if one.value is not None}
         return ConformanceProfile({**_PATIENCE, **self._start.given, **given})
 
     def _restore(self, when: str, *, flash: bool) -> str:
-        """Let the good image run; returns what went wrong, or ""."""
+        """Restore the good image; returns what went wrong, or ""."""
         done = restore(self._subject, self._profile(), flash=flash, stopped=self._stopped)
         if done.ok:
             return ""

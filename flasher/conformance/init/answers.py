@@ -1,4 +1,4 @@
-"""What a device answered, and what a profile says by it."""
+"""Derives values of profile keys from a device's answers and measured times."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Final, NamedTuple
 from flasher.conformance.profile import Value, profile_keys
 
 MARGIN: Final = 3
-"""A limit is so many times the longest time that was measured, or its least value."""
+"""Factor between the longest measured time and the limit."""
 _SHOWN: Final = 6
 _EITHER: Final = "either"
 
 
 @dataclass(frozen=True)
 class KeyAnswer:
-    """What is written for a key of the profile; `value` is None where it stays open. `seen` says
-    what was seen, or why it stays open.
+    """Value determined for a profile key, None where it stays open; `seen` is the observation or
+    the reason.
     """
 
     key: str
@@ -28,15 +28,13 @@ class KeyAnswer:
 
 
 class Trial(NamedTuple):
-    """One stimulus, its answer, and the value of the key that has it; "" for an answer that no
-    value describes.
-    """
+    """One stimulus, its answer, and the value of the key that it supports; "" when none fits."""
 
     value: str
     answer: str
     stimulus: str
     link: str = "to"
-    """Stands between answer and stimulus; "" where the answer stands behind."""
+    """Word between answer and stimulus; "" when the answer comes last."""
 
     def __str__(self) -> str:
         if not self.link:
@@ -45,11 +43,11 @@ class Trial(NamedTuple):
 
 
 Findings = Iterator[KeyAnswer | Trial | str]
-"""What a question finds: answers, trials for its choice, or why all of its keys stay open."""
+"""What a question yields: answers, trials for its choice, or why all its keys stay open."""
 
 
 def decide(key: str, trials: Sequence[Trial]) -> KeyAnswer:
-    """The value that all trials agree in; where they differ, `either` if the key has it."""
+    """The value on which all trials agree; `either` when they differ and the key allows it."""
     seen, values = _summary(trials), {trial.value for trial in trials}
     allowed = profile_keys()[key].choices
     if not values <= set(allowed):
@@ -62,7 +60,7 @@ def decide(key: str, trials: Sequence[Trial]) -> KeyAnswer:
 
 
 def _summary(trials: Sequence[Trial]) -> str:
-    """Every answer to every stimulus, with how often it came."""
+    """List every answer to every stimulus with its count."""
     total = Counter(trial.stimulus for trial in trials)
     counts = Counter((str(trial), trial.stimulus) for trial in trials)
     found = [
@@ -77,7 +75,7 @@ def _summary(trials: Sequence[Trial]) -> str:
 
 
 def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> KeyAnswer:
-    """A limit from what was measured: with a margin, so never shorter than what it took."""
+    """Derive a limit from measured times, with a margin."""
     if not values_s:
         return KeyAnswer(key, None, "it was never measured")
     longest_s = max(values_s)
@@ -92,6 +90,6 @@ def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: 
 
 
 def rounded_up(value: float) -> float:
-    """With two digits, never less."""
+    """Round up to two significant digits."""
     step = 10.0 ** (floor(log10(value)) - 1)
     return round(ceil(round(value / step, 6)) * step, 9)

@@ -22,21 +22,21 @@ from flasher.conformance.wire import (
 )
 
 _TOLERANCE_S: Final = 0.005
-"""The least that is written: a boot version may wait for frames of others."""
+"""Smallest tolerance to write: a boot version may wait for other frames."""
 _WINDOW_MAX_S: Final = 10.0
 _RESTART_S: Final = 5.0
-"""How long a restart behind complete is waited for."""
+"""How long to wait for a restart after complete."""
 _RESOLUTION_S: Final = 0.001
 _SILENT_S: Final = 5.0
-"""After so long without a boot version a bootloader is taken to listen silently."""
+"""A bootloader without a boot version for this long is assumed to listen silently."""
 _ERASE_LEAST_S: Final = 10.0
 _ERASE_MOST_S: Final = 120.0
 _UNKNOWN: Final = 0x7704
-"""A command that nobody has."""
+"""An unused command."""
 
 
 def burst(session: InitSession) -> Findings:
-    """The announcements after a reset, and after power-up."""
+    """Determine reset command, number and spacing of boot versions, by resets and power cycles."""
     bench = session.bench
     counts: list[int] = []
     gaps_s: list[float] = []
@@ -85,7 +85,7 @@ def burst(session: InitSession) -> Findings:
 
 
 def upgrade(session: InitSession) -> Findings:
-    """Plain upgrades, for their times and for what follows complete."""
+    """Determine what follows complete, and measure plain upgrades."""
     bench = session.bench
     for _ in range(REPEATS):
         session.begin()
@@ -123,7 +123,7 @@ def _first_sign(session: InitSession) -> Received | None:
 
 
 def in_burst(session: InitSession) -> Findings:
-    """Update command between the announcements."""
+    """Determine whether an update command between announcements is accepted."""
     bench = session.bench
     count = bench.number("versions")
     if count < 2:
@@ -139,7 +139,7 @@ def in_burst(session: InitSession) -> Findings:
 
 
 def window(session: InitSession) -> Findings:
-    """The window's end behind the last announcement, by bisection."""
+    """Determine the end of the window after the last announcement, by bisection."""
     bench = session.bench
     at_s, taken = _offer_at(session, 0.0)
     if not taken:
@@ -190,8 +190,8 @@ def window(session: InitSession) -> Findings:
 
 
 def _offer_at(session: InitSession, offset_s: float) -> tuple[float, bool]:
-    """Update command so long behind the last boot version; when it was there, and if it is taken.
-    The good image runs again afterwards.
+    """Send the update command `offset_s` after the last boot version. Returns its actual offset and
+    whether it was accepted. The good image runs again afterwards.
     """
     bench = session.bench
     frames = bench.encoder.update(len(session.image))
@@ -212,7 +212,7 @@ def _offer_at(session: InitSession, offset_s: float) -> tuple[float, bool]:
 
 
 def reset_in_bootloader(session: InitSession) -> Findings:
-    """Reset between the announcements."""
+    """Determine the effect of a reset between announcements."""
     bench = session.bench
     count = bench.number("versions")
     place = min(2, count)
@@ -227,7 +227,7 @@ def reset_in_bootloader(session: InitSession) -> Findings:
 
 
 def rejected_update(session: InitSession) -> Findings:
-    """Update commands that no bootloader takes."""
+    """Determine the answer to update commands that have to be rejected."""
     bench = session.bench
     other = next(iter(bench.encoder.others()))
     stimuli = {
@@ -248,7 +248,7 @@ def rejected_update(session: InitSession) -> Findings:
 
 
 def feedback(session: InitSession) -> Findings:
-    """General feedback of the bootloader, to an unknown write and to those of an upgrade."""
+    """Determine whether the bootloader sends general feedback to writes."""
     bench = session.bench
     unknown = bench.encoder.message(WRITE, _UNKNOWN, bytes(_UNKNOWN & 0xFF))
     for _ in range(REPEATS):
@@ -267,7 +267,7 @@ def feedback(session: InitSession) -> Findings:
 
 
 def update_twice(session: InitSession) -> Findings:
-    """Two update commands in a row."""
+    """Determine the answer to two consecutive update commands."""
     bench = session.bench
     update = bench.encoder.update(len(session.image))
     for _ in range(REPEATS):
@@ -285,7 +285,7 @@ def update_twice(session: InitSession) -> Findings:
 
 
 def application(session: InitSession) -> Findings:
-    """Messages of the upgrade to the running application."""
+    """Determine the running application's answer to upgrade messages."""
     bench = session.bench
     for stimulus, frames in bench.encoder.upgrade_messages(len(session.image)).items():
         for _ in range(REPEATS):
@@ -298,7 +298,7 @@ def application(session: InitSession) -> Findings:
 
 
 def _choice_for(heard: list[Received]) -> str:
-    """The value for one answer, or none."""
+    """The value for one answer or silence; "" for anything else."""
     if not heard:
         return "silence"
     names = {MessageKind.NAK: "nak", MessageKind.FEEDBACK: "feedback"}
@@ -309,7 +309,7 @@ def _choice_for(heard: list[Received]) -> str:
 
 
 def _why_no_exit(session: InitSession) -> str:
-    """Why nothing ends a transfer of this device; empty when something does."""
+    """Why no transfer of this device can be ended early; "" when one can."""
     if needs_power(session.bench.profile) and not session.bench.subject.has_power:
         return "only power would end a transfer, and none is controlled"
     can_leave = (
@@ -321,7 +321,7 @@ def _why_no_exit(session: InitSession) -> str:
 
 
 def without_application(session: InitSession) -> Findings:
-    """A bootloader that has nothing to start."""
+    """Determine what a bootloader without an application does."""
     bench = session.bench
     why = _why_no_exit(session)
     if why:
@@ -347,7 +347,7 @@ def without_application(session: InitSession) -> Findings:
 
 
 def largest_image(session: InitSession) -> Findings:
-    """The largest size that an update command is taken with."""
+    """Determine the largest size for which an update command is accepted."""
     bench = session.bench
     restarts_at_once = bench.choice("up_08") == "starts_over"
     why = "" if restarts_at_once else _why_no_exit(session)
@@ -386,7 +386,7 @@ def largest_image(session: InitSession) -> Findings:
 
 
 def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float) -> bool:
-    """True for request transfer. A NAK, or a bootloader that announces itself on, says no."""
+    """True when request transfer follows, False after a NAK or further announcements."""
     bench = session.bench
     bench.forget()
     sent = bench.send(frames)
@@ -404,5 +404,5 @@ def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float
 
 
 def _rounded_up(value_s: float) -> float:
-    """To tenths of a millisecond, never less."""
+    """Round up to tenths of a millisecond."""
     return ceil(value_s * 10_000 - 1e-6) / 10_000

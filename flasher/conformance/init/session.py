@@ -1,6 +1,5 @@
-"""A device that is asked: the bench of one question, in upgrades to the good image alone. Whatever
-is tried in such a transfer, the right packets and the end can follow, so that the device runs again
-without a way out of a transfer.
+"""Session of one question of `init`: a transfer of the good image that can always be completed, so
+that the device runs again without leaving the transfer.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from flasher.conformance.wire import (
 )
 
 REPEATS: Final = 3
-"""How often a question is asked."""
+"""How often to repeat a trial."""
 _LIMIT_S: Final = 7200.0
 _ASK_S: Final = 0.05
 _BURST_GAP_S: Final = 1.5
-"""Two boot versions of a burst are not so far apart."""
+"""Longer than the gap between two boot versions of a burst."""
 _VERSIONS_MAX: Final = 100
 _QUIET_START_S: Final = 2.0
-"""No window is longer, as far as a device is waited for that tells no version."""
+"""Longest assumed window of a device that reports no version."""
 
 
 class InitSession(PacketTransfer):
-    """A device whose good image runs, when the question begins and when it ends."""
+    """Bench and transfer for one question; the good image runs before and after it."""
 
     def __init__(
         self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
@@ -43,8 +42,8 @@ class InitSession(PacketTransfer):
         super().__init__(bench, subject.good_image)
 
     def settle(self) -> None:
-        """Wait until a device that tells no version has certainly left its bootloader: it may have
-        been reset to see whether its application runs.
+        """Wait until a device without a version query has left its bootloader, which a reset to
+        test its application may have entered.
         """
         bench = self.bench
         if not bench.encoder.has_version_query:
@@ -55,11 +54,11 @@ class InitSession(PacketTransfer):
     # -- the application --------------------------------------------------------------------------
 
     def await_application(self, name: str = "", since: float = 0.0) -> None:
-        """Wait until the application answers; `name` is what the time since then is recorded as."""
+        """Wait until the application answers; records the time since `since` under `name`."""
         bench = self.bench
         within_s = bench.limit("start_s") + bench.host.burst_s
         if not bench.encoder.has_version_query:
-            # A reset would be the only question, and begin all anew.
+            # The only query would be a reset, which restarts the bootloader.
             self.settle()
             if name:
                 runs = bench.application_runs()
@@ -76,7 +75,7 @@ class InitSession(PacketTransfer):
     # -- the bootloader ---------------------------------------------------------------------------
 
     def enter(self, version: int = 1) -> Received:
-        """Reset the application; returns that boot version of the burst."""
+        """Reset the application and return boot version number `version` of the burst."""
         bench = self.bench
         found = bench.reset_measured(bench.limit("first_version_s"))
         for _ in range(version - 1):
@@ -84,7 +83,7 @@ class InitSession(PacketTransfer):
         return found
 
     def more_versions(self) -> list[Received]:
-        """The boot versions that follow, until none comes any more."""
+        """Collect boot versions until no more arrive."""
         found: list[Received] = []
         while len(found) < _VERSIONS_MAX:
             heard = self.bench.wait_for(MessageKind.BOOT_VERSION, within_s=_BURST_GAP_S)
@@ -94,7 +93,7 @@ class InitSession(PacketTransfer):
         return found
 
     def offer_update(self, frames: Sequence[RawFrame]) -> bool:
-        """Send what may be an update command for the good image; True when it is taken."""
+        """Send a possible update command for the good image; True when it is accepted."""
         bench = self.bench
         sent = bench.send(frames)
         heard = bench.wait_for(MessageKind.REQUEST)
@@ -104,34 +103,35 @@ class InitSession(PacketTransfer):
         return heard is not None
 
     def begin(self) -> None:
-        """From the running application to request transfer."""
+        """Reset the running application and get request transfer."""
         self.enter()
         self.update()
 
     def update(self) -> None:
-        """From a bootloader that listens to request transfer."""
+        """Get request transfer from a listening bootloader."""
         self.bench.update(len(self.image))
         self.stored = 0
 
     # -- the transfer -----------------------------------------------------------------------------
 
     def packets(self, last: int | None = None) -> None:
-        """All packets up to the `last` one of these, or of the image."""
+        """Send the packets up to `last` (default: the last of the image)."""
         final = self.total if last is None else last
         self.bench.forget()
         self.bench.packets(self.image, self.stored + 1, final)
         self.stored = max(self.stored, final)
 
     def finish(self) -> None:
-        """The packets that are left, and the end; the application starts."""
+        """Send the remaining packets and end of transfer; wait for the application."""
         self.packets()
         self.bench.end_transfer()
         self.await_application()
 
     def reach(self, stored: int, left: int) -> None:
-        """So many packets stored at the least and so many left, if need be in a new transfer.
+        """Send packets until at least `stored` are stored and `left` remain, in a new transfer if
+        necessary.
 
-        Raises Unsupported for an image that is too small for that.
+        Raises Unsupported when the image is too small.
         """
         if self.total < stored + left:
             raise Unsupported(f"the good image has less than {stored + left} packets")
@@ -143,8 +143,8 @@ class InitSession(PacketTransfer):
     def offer(
         self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
     ) -> bool:
-        """Send frames that hold the next packet; True when it is acknowledged. It is stored
-        afterwards, one way or the other.
+        """Send frames that contain the next packet; True when it is acknowledged. Otherwise sends
+        it unchanged, so that it is stored afterwards in any case.
         """
         taken = any(map(self.is_accepted, self.answers(frames, gap_s=gap_s, gaps=gaps)))
         if taken:
@@ -154,7 +154,7 @@ class InitSession(PacketTransfer):
         return taken
 
     def deliver_packet(self) -> None:
-        """The next packet as it should be, more than once if need be."""
+        """Send the next packet unchanged until it is acknowledged."""
         bench = self.bench
         bench.forget()
         trouble = bench.host.deliver_packet(self.image, self.stored + 1, bench.now)
@@ -162,7 +162,7 @@ class InitSession(PacketTransfer):
         self.stored += 1
 
     def feedback_since(self, moment: float) -> int:
-        """How many messages of general feedback came after that time, heard or not."""
+        """Count general feedback since `moment`, including messages that were not collected."""
         bench = self.bench
         decoder, since_s = DeviceDecoder(bench.encoder), moment - bench.tester.began_at
         return sum(
@@ -174,5 +174,5 @@ class InitSession(PacketTransfer):
 
 
 def answer_text(heard: Sequence[Received]) -> str:
-    """Some answers in words."""
+    """Answers as text, "silence" without any."""
     return describe(heard) if heard else "silence"

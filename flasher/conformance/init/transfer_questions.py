@@ -1,4 +1,4 @@
-"""Questions inside a transfer of the good image, and about its end."""
+"""Questions about packets, pauses and resets in a transfer, and about its end."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _PACKETS_READ_BACK: Final = 33
 def _repeat_trial(
     session: InitSession, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
 ) -> Iterator[Trial]:
-    """Send that some times. `choice_words` are those for the answers, "NAK" for any other NAK."""
+    """Send `frames` several times; `words` maps answers to values, with "NAK" for any other NAK."""
     for _ in range(REPEATS):
         session.bench.forget()
         session.bench.send(frames)
@@ -55,7 +55,7 @@ def _repeat_trial(
 
 
 def repeated_packet(session: InitSession) -> Findings:
-    """The packet stored last, again."""
+    """Determine the answer to a repetition of the last stored packet."""
     session.begin()
     for stored in (1, 2):
         session.reach(stored, 1)
@@ -65,7 +65,7 @@ def repeated_packet(session: InitSession) -> Findings:
 
 
 def older_packet(session: InitSession) -> Findings:
-    """A packet before the one stored last."""
+    """Determine the answer to a packet older than the last stored one."""
     session.begin()
     session.reach(3, 1)
     for number in (1, 2):
@@ -76,7 +76,7 @@ def older_packet(session: InitSession) -> Findings:
 
 
 def bad_packet(session: InitSession) -> Findings:
-    """Packets that are damaged, or make no sense."""
+    """Determine the answer to damaged or impossible packets."""
     trials = list[Trial]()
     session.begin()
     session.reach(2, 3)
@@ -108,7 +108,7 @@ def bad_packet(session: InitSession) -> Findings:
         trials += _repeat_trial(session, stimulus, frames, {**words, "silence": "silence"})
     session.deliver_packet()
     session.finish()
-    # A NAK with the one number that both ways give says only that there is a NAK.
+    # A NAK with the only number that both rules give does not tell them apart.
     telling = {trial.value for trial in trials} - {"nak"}
     if len(telling) == 1:
         (value,) = telling
@@ -122,7 +122,7 @@ def bad_packet(session: InitSession) -> Findings:
 
 
 def lost_frame(session: InitSession) -> Findings:
-    """Packets of which a frame is lost."""
+    """Determine the answer to packets with a lost frame."""
     bench = session.bench
     session.begin()
     for index in _LOST_FRAMES:
@@ -147,7 +147,7 @@ def lost_frame(session: InitSession) -> Findings:
 
 
 def filler(session: InitSession) -> Findings:
-    """Other bytes than FF behind the end of the image, in the last packet."""
+    """Determine whether bytes other than FF after the end of the image are accepted."""
     bench = session.bench
     rest = session.image[(session.total - 1) * PACKET_BYTES :]
     if len(rest) == PACKET_BYTES:
@@ -171,7 +171,7 @@ def filler(session: InitSession) -> Findings:
 
 
 def splits(session: InitSession) -> Findings:
-    """Messages in frames of other sizes."""
+    """Determine whether messages in other frame sizes are accepted."""
     bench = session.bench
     for _ in range(REPEATS):
         session.enter()
@@ -192,7 +192,7 @@ def splits(session: InitSession) -> Findings:
 
 
 def in_forms(session: InitSession, key: str) -> Findings:
-    """Packets in the forms that one key of the profile decides about."""
+    """Determine whether the packet forms of one profile key are accepted."""
     session.begin()
     for form in forms(session.bench.encoder)[key]:
         for _ in range(REPEATS):
@@ -209,7 +209,7 @@ def _offer_form(session: InitSession, form: PacketForm, key: str) -> Trial:
 
 
 def padded(session: InitSession) -> Findings:
-    """Update command and end of transfer, their last frames filled up."""
+    """Determine whether padded update commands and ends of transfer are accepted."""
     bench = session.bench
     within_s = bench.limit("complete_s")
     if bench.choice("tx_12") == "announces":  # while the transfer still lasts
@@ -239,7 +239,7 @@ def padded(session: InitSession) -> Findings:
 
 
 def gaps(session: InitSession) -> Findings:
-    """Packets with gaps between their frames."""
+    """Determine whether packets with gaps between their frames are accepted."""
     session.begin()
     for gap_s, count in session.bench.gaps(session.frames(), _SHARES):
         for _ in range(REPEATS):
@@ -263,7 +263,7 @@ def _accepted_trial(
 
 
 def update_again(session: InitSession) -> Findings:
-    """Update command after packet 3, for the same size and for another one."""
+    """Determine the effect of an update command after packet 3, for the same and another size."""
     bench = session.bench
     for _ in range(REPEATS):
         session.begin()
@@ -283,7 +283,7 @@ def update_again(session: InitSession) -> Findings:
 
 
 def pause(session: InitSession) -> Findings:
-    """Pauses in the transfer."""
+    """Determine the effect of a pause in the transfer."""
     bench = session.bench
     places, found_s = (1, 0, session.total), list[float]()
     for stored in places:
@@ -313,11 +313,11 @@ def pause(session: InitSession) -> Findings:
 
 
 def reset_again(session: InitSession) -> Findings:
-    """Reset before packet 1, amid the packets and before the end."""
+    """Determine the effect of a reset before, between and after the packets."""
     bench = session.bench
     within_s = bench.limit("first_version_s")
     if bench.choice("tx_12") == "announces":
-        # Later than that, it is the pause that ends the transfer.
+        # Later than that, the pause ends the transfer.
         within_s = min(within_s, _BEFORE_PAUSE * bench.limit("pause_s"))
     for stored in (0, 1, session.total):
         session.begin()
@@ -337,7 +337,7 @@ def reset_again(session: InitSession) -> Findings:
 
 
 def end_again(session: InitSession) -> Findings:
-    """End of transfer once more, right after complete."""
+    """Determine the answer to a second end of transfer after complete."""
     bench = session.bench
     for _ in range(REPEATS):
         session.begin()
@@ -348,7 +348,7 @@ def end_again(session: InitSession) -> Findings:
             heard = bench.collect(bench.limit("ack_s"))
         heard = [one for one in heard if one.kind in _END_ANSWERS]
         kinds = [one.kind for one in heard]
-        # An application that runs already may confirm what it does not know (R17).
+        # A running application may send general feedback to an unknown message (R17).
         words = {
             (): "silence",
             (MessageKind.FEEDBACK,): "silence",
@@ -359,7 +359,7 @@ def end_again(session: InitSession) -> Findings:
 
 
 def buffer(session: InitSession) -> Findings:
-    """What is acknowledged and not yet in the flash."""
+    """Determine how many acknowledged bytes are not yet in the flash."""
     bench = session.bench
     if not bench.subject.has_readback:
         yield "the bench has no readback"
@@ -372,7 +372,7 @@ def buffer(session: InitSession) -> Findings:
         same = bench.difference(wanted)
         lacking = max(lacking, 0 if same is None else len(wanted) - same)
     session.finish()
-    # The last packet may be on its way into the flash when its ACK comes (PW-01).
+    # The last packet may still be being written when its ACK arrives (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
     seen = f"after ACK 1 to {count} at most {lacking} bytes were not in the flash"
     yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may be on its way")
