@@ -22,9 +22,9 @@ from flasher.conformance.wire import (
     MEMORY_BYTES,
     PACKET_FRAMES,
     Encoder,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     packet_count,
     reported_version,
@@ -107,18 +107,18 @@ class Bench:
         """Reset the device and return its first boot version; does not judge general feedback."""
         self.forget()
         self.send(self.encoder.reset())
-        return self.await_message(MessageKind.BOOT_VERSION)
+        return self.await_message(Reply.BOOT_VERSION)
 
     def reset_measured(self, within_s: float) -> Received:
         """Like `reset_to_bootloader`, and measure general feedback and boot version."""
         self.forget()
         with self.tester.collecting_feedback():
             sent = self.send(self.encoder.reset())
-            heard = self.wait_for(MessageKind.FEEDBACK, MessageKind.BOOT_VERSION, within_s=within_s)
-        if heard is not None and heard.kind is MessageKind.FEEDBACK:
-            self.measure(Times.FEEDBACK, heard.at - sent.left_at)
-            heard = self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
-        found = self.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
+            reply = self.wait_for(Reply.FEEDBACK, Reply.BOOT_VERSION, within_s=within_s)
+        if reply is not None and reply.kind is Reply.FEEDBACK:
+            self.measure(Times.FEEDBACK, reply.at - sent.left_at)
+            reply = self.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+        found = self.require_received(reply, Reply.BOOT_VERSION.value, within_s)
         self.measure(Times.FIRST, found.at - sent.left_at)
         return found
 
@@ -135,7 +135,7 @@ class Bench:
         spacing_s = self.limit("version_spacing_s") + self.limit("version_spacing_tolerance_s")
         last_at = self.now + gaps * spacing_s
         for _ in range(gaps):
-            self.wait_for(MessageKind.BOOT_VERSION, within_s=last_at - self.now)
+            self.wait_for(Reply.BOOT_VERSION, within_s=last_at - self.now)
         self.wait(self.limit("window_s") / 2)
         self.forget()
 
@@ -146,20 +146,20 @@ class Bench:
 
     def next_version(self) -> Received:
         """Wait for the next boot version of the burst."""
-        return self.expect(MessageKind.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
+        return self.expect(Reply.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
 
     def update(self, size_bytes: int) -> Received:
         """Send the update command, repeated at every boot version (R2), until request transfer."""
         limit_s = self.limit("erase_s")
-        heard: Received | None = None
+        reply: Received | None = None
         for _ in range(UPDATES_MAX):
             sent = self.send(self.encoder.update(size_bytes))
-            heard = self.host.request_or_version(sent.left_at, limit_s)
-            if heard is None or heard.kind is MessageKind.REQUEST:
+            reply = self.host.request_or_version(sent.left_at, limit_s)
+            if reply is None or reply.kind is Reply.REQUEST:
                 break
-        if heard is not None and heard.kind is not MessageKind.REQUEST:
-            heard = None
-        found = self.require_received(heard, MessageKind.REQUEST.value, limit_s)
+        if reply is not None and reply.kind is not Reply.REQUEST:
+            reply = None
+        found = self.require_received(reply, Reply.REQUEST.value, limit_s)
         self.measure(Times.REQUEST, found.at - sent.left_at)
         return found
 
@@ -173,8 +173,8 @@ class Bench:
     def packet(self, image: bytes, number: int) -> None:
         """Send a packet of `image` and require its ACK."""
         sent = self.send_packet(image, number)
-        heard = self.expect(MessageKind.ACK, number=number)
-        self.measure(Times.ANSWER, heard.at - sent.left_at)
+        reply = self.expect(Reply.ACK, number=number)
+        self.measure(Times.ANSWER, reply.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
         """Send packets `first` to `last` (default: the last of the image) and require each ACK."""
@@ -195,17 +195,17 @@ class Bench:
         """Check for a NAK with one of `numbers` (None: any), for silence, or for either. `choice`
         is "silence", "either" or a word for a NAK.
         """
-        heard = self.answers()
+        replies = self.answers()
         known = sorted({number for number in numbers if number is not None})
         is_open = None in numbers
         right = [
-            one for one in heard if one.kind is MessageKind.NAK and (is_open or one.number in known)
+            one for one in replies if one.kind is Reply.NAK and (is_open or one.number in known)
         ]
         nak = "NAK" if is_open else f"NAK {' or '.join(map(str, known))}"
         expected = {"silence": {0: "silence"}, "either": {1: nak, 0: "silence"}}
         wanted = expected.get(choice, {1: nak})
-        ok = len(heard) == len(right) in wanted
-        return self.check(ok, f"rejected: {' or '.join(wanted.values())}", describe(heard))
+        ok = len(replies) == len(right) in wanted
+        return self.check(ok, f"rejected: {' or '.join(wanted.values())}", describe(replies))
 
     def repetition_answers(self, number: int) -> list[str]:
         """Correct answers when the last stored packet is sent again (tx_02)."""
@@ -233,8 +233,8 @@ class Bench:
     def end_transfer(self) -> None:
         """Send end of transfer and require complete."""
         sent = self.send(self.encoder.end())
-        heard = self.expect(MessageKind.COMPLETE)
-        self.measure(Times.COMPLETE, heard.at - sent.left_at)
+        reply = self.expect(Reply.COMPLETE)
+        self.measure(Times.COMPLETE, reply.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
         """Send the packets from `first` on and the end of transfer; check that the image runs."""
@@ -368,8 +368,8 @@ class Bench:
         """
         if self.choice("up_08") == "either" and not self.subject.has_power:
             sent = self.send(self.encoder.update(size_bytes))
-            heard = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
-            if heard is not None and heard.kind is MessageKind.REQUEST:
+            reply = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+            if reply is not None and reply.kind is Reply.REQUEST:
                 return
         if self.choice("up_08") != "starts_over":
             self.leave_transfer()
@@ -393,16 +393,16 @@ class Bench:
         elif "either" in (pause, reset):
             self.send(self.encoder.reset())
             within_s += _PAUSES * self.limit("pause_s")
-            if self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is None:
+            if self.wait_for(Reply.BOOT_VERSION, within_s=within_s) is None:
                 raise Unsupported("no power control, and neither reset nor a pause ends a transfer")
             return
         else:
             raise Unsupported("no power control, and nothing else ends a transfer (tx_12, tx_13)")
         if not self.subject.has_power:
-            self.await_message(MessageKind.BOOT_VERSION, within_s=within_s)
-        elif self.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is None:
+            self.await_message(Reply.BOOT_VERSION, within_s=within_s)
+        elif self.wait_for(Reply.BOOT_VERSION, within_s=within_s) is None:
             self.power_cycle()
-            self.await_message(MessageKind.BOOT_VERSION)
+            self.await_message(Reply.BOOT_VERSION)
 
     def erase_application(self) -> None:
         """Erase the application and wait until the bootloader announces itself."""

@@ -42,7 +42,7 @@ GROUPS: Final = {
 WEAR: Final = {"SO-01": 1000, "SP-01": 50, "SP-02": 60}
 """Cases that run only when they or their groups are named, with the default number of upgrades."""
 NOT_IMPLEMENTED: Final[dict[str, str]] = {
-    "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line",
+    "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line"
 }
 """Bootloader cases that software cannot run, with the reason; reported as unsupported."""
 HOST_CASES: Final = (
@@ -243,10 +243,7 @@ MISSING_ON_BARE_BENCH: Final = {
     ),
     Requirement.SECOND_IMAGE: ("a second good image", "--second-image"),
     Requirement.BUS_OFF: ("a way to make the device go bus-off", _SIMULATED),
-    Requirement.TIMED_CUT: (
-        "power cuts at the moment of a flash operation or a frame",
-        _SIMULATED,
-    ),
+    Requirement.TIMED_CUT: ("power cuts at the moment of a flash operation or a frame", _SIMULATED),
     Requirement.ERROR_FRAMES: ("an adapter that sends error frames", _SIMULATED),
 }
 """What a bench of device, adapter and good image lacks: text, and the option that adds it."""

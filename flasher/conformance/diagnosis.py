@@ -8,7 +8,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 from flasher.conformance.results import TraceEntry
-from flasher.conformance.wire import DeviceDecoder, Encoder, MessageKind, RawFrame, Received, crc
+from flasher.conformance.wire import DeviceDecoder, Encoder, RawFrame, Received, Reply, crc
 
 _SHOWN: Final = 6
 _OTHER_HEADER: Final = b"\xaa\x55"
@@ -69,20 +69,20 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
     """Explain what was received and which change would fix it, the likeliest cause first. With
     `has_wires`, silence may be a wiring problem.
     """
-    heard = [(entry.frame, entry.at_s) for entry in trace if not entry.sent]
-    frames = [frame for frame, _ in heard if not frame.is_error]
+    replies = [(entry.frame, entry.at_s) for entry in trace if not entry.sent]
+    frames = [frame for frame, _ in replies if not frame.is_error]
     own = f"{encoder.to_tool:03X}"
     if not frames:
-        errors = f"{len(heard)} error frames and " if heard else ""
+        errors = f"{len(replies)} error frames and " if replies else ""
         parts = "the device's power, the wiring and its termination, the bit rate, the channel"
         why = f": check {parts}, and whether the device is a {encoder.target}" if has_wires else ""
         return [f"{errors}no frame at all was received{why}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
         return [_diagnose_senders(frames, encoder)]
     decoder = DeviceDecoder(encoder)
-    messages = [found for frame, at in heard for found in decoder.feed(frame, at)]
+    messages = [found for frame, at in replies for found in decoder.feed(frame, at)]
     to_tool = [message for message in messages if message.can_id == encoder.to_tool]
-    damaged = [message for message in to_tool if message.kind is MessageKind.DAMAGED]
+    damaged = [message for message in to_tool if message.kind is Reply.DAMAGED]
     if damaged:
         return [_diagnose_framing(damaged, own)]
     return _diagnose_protocol(to_tool, own, encoder) or [
@@ -140,15 +140,15 @@ def _diagnose_framing(damaged: Sequence[Received], own: str) -> str:
 
 def _diagnose_protocol(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
     """Intact messages arrived: list what contradicts the protocol."""
-    names = {one.boot_name for one in messages if one.kind is MessageKind.BOOT_VERSION}
+    names = {one.boot_name for one in messages if one.kind is Reply.BOOT_VERSION}
     for other in encoder.others():
         if other.boot_name in names:
             return [f"{own} announces itself as {other.boot_name}: the name of another device"]
-    numbers = {one.number for one in messages if one.kind in (MessageKind.ACK, MessageKind.NAK)}
+    numbers = {one.number for one in messages if one.kind in (Reply.ACK, Reply.NAK)}
     if numbers and all(number and not number & 0xFF for number in numbers):
         shown = ", ".join(str(number) for number in sorted(numbers)[:_SHOWN])
         return [f"{own} speaks; the numbers of its ACK and NAK are sent high byte first: {shown}"]
-    if names and not any(one.kind is MessageKind.REQUEST for one in messages):
+    if names and not any(one.kind is Reply.REQUEST for one in messages):
         why = "does it check another CRC, or listen elsewhere (up_04_burst in the profile)?"
         return [f"{own} announces itself, and answers no update command: {why}"]
     return []

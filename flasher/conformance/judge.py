@@ -11,15 +11,9 @@ from contextlib import contextmanager
 from math import ceil, inf
 from typing import Final
 
-from flasher.conformance.results import (
-    CaseStopped,
-    CaseVerdict,
-    Check,
-    CheckOutcome,
-    Measurement,
-)
+from flasher.conformance.results import CaseStopped, CaseVerdict, Check, CheckOutcome, Measurement
 from flasher.conformance.tester import BusTester
-from flasher.conformance.wire import MessageKind, Received, describe
+from flasher.conformance.wire import Received, Reply, describe
 
 
 class Times:
@@ -100,7 +94,7 @@ class Judge:
             raise CaseStopped(expected)
         return received
 
-    def await_message(self, kind: MessageKind, *, within_s: float | None = None) -> Received:
+    def await_message(self, kind: Reply, *, within_s: float | None = None) -> Received:
         """Wait for a message of `kind`, skipping others, by default for the profile's limit for it.
         Ends the case without one.
         """
@@ -110,11 +104,11 @@ class Judge:
 
     def expect(
         self,
-        kind: MessageKind,
+        kind: Reply,
         *,
         within_s: float | None = None,
         number: int | None = None,
-        ignoring: Sequence[MessageKind] = (),
+        ignoring: Sequence[Reply] = (),
     ) -> Received:
         """Require that the next message is of `kind` (with this packet number) and arrives
         `within_s`, by default the profile's limit for it. Messages of the kinds `ignoring` are
@@ -131,11 +125,7 @@ class Judge:
         return found
 
     def expect_silence(
-        self,
-        for_s: float | None = None,
-        *,
-        ignoring: Sequence[MessageKind] = (),
-        why: str = "no answer",
+        self, for_s: float | None = None, *, ignoring: Sequence[Reply] = (), why: str = "no answer"
     ) -> bool:
         """Check that no message arrives for `for_s` (default: `limits.silence_s`), except the kinds
         `ignoring`.
@@ -144,7 +134,7 @@ class Judge:
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
 
-    def check_only(self, received: Sequence[Received], *kinds: MessageKind, why: str) -> bool:
+    def check_only(self, received: Sequence[Received], *kinds: Reply, why: str) -> bool:
         """Check that only messages of these kinds were received."""
         others = [one for one in received if one.kind not in kinds]
         return self.check(not others, why, describe(others))

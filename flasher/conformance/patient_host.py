@@ -9,13 +9,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
-from flasher.conformance.wire import (
-    MEMORY_BYTES,
-    MessageKind,
-    Received,
-    packet_count,
-    reported_version,
-)
+from flasher.conformance.wire import MEMORY_BYTES, Received, Reply, packet_count, reported_version
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
@@ -39,12 +33,7 @@ _WINDOW_MAX_S: Final = 1.0
 """Longest window to assume when the profile does not define it (up_04)."""
 LEFTOVER_S: Final = 0.06
 """A boot version this soon after request transfer was sent before it (R11)."""
-_PACKET_ANSWERS: Final = (
-    MessageKind.ACK,
-    MessageKind.NAK,
-    MessageKind.BOOT_VERSION,
-    MessageKind.COMPLETE,
-)
+_PACKET_ANSWERS: Final = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION, Reply.COMPLETE)
 
 
 class UpgradeResult(NamedTuple):
@@ -79,8 +68,8 @@ class PatientHost:
 
         Raises Unsupported for a target without a version query.
         """
-        heard = self.version_answer(within_s)
-        return None if heard is None else heard.firmware
+        reply = self.version_answer(within_s)
+        return None if reply is None else reply.firmware
 
     def version_answer(
         self, within_s: float, *, every_s: float = _QUERY_PERIOD_S
@@ -88,19 +77,19 @@ class PatientHost:
         """Query the version every `every_s` and return the first answer. Raises Unsupported."""
         if not self._encoder.has_version_query:
             raise Unsupported("the document has no version query for this target")
-        tester, kind = self._tester, MessageKind.VERSION_INFORMATION
+        tester, kind = self._tester, Reply.VERSION_INFORMATION
         deadline, unanswered = tester.now + within_s, 0
         while tester.now < deadline:
             tester.send(self._encoder.query_version())
-            heard = tester.wait_for(kind, within_s=min(every_s, deadline - tester.now))
-            if heard is None:
+            reply = tester.wait_for(kind, within_s=min(every_s, deadline - tester.now))
+            if reply is None:
                 unanswered += 1
                 continue
             # Collect the answers to earlier queries, so that none of them arrives later.
             late_s = _QUERY_PERIOD_S + _QUIET_S
             while unanswered and tester.wait_for(kind, within_s=late_s) is not None:
                 unanswered -= 1
-            return heard
+            return reply
         return None
 
     def application_runs(self, within_s: float | None = None) -> bool:
@@ -117,19 +106,16 @@ class PatientHost:
         while True:
             with tester.collecting_feedback():
                 tester.send(self._encoder.reset())
-                runs = tester.wait_for(MessageKind.FEEDBACK) is not None
+                runs = tester.wait_for(Reply.FEEDBACK) is not None
             if runs or tester.now >= deadline:
                 # A message sent before the end of a burst that the reset started would be lost.
-                if tester.wait_for(MessageKind.BOOT_VERSION) is not None:
+                if tester.wait_for(Reply.BOOT_VERSION) is not None:
                     tester.wait(self.burst_s + _SETTLE_S)
                     tester.forget()
                 return runs
             # The reset may have started a burst (RS-02), which another reset would restart.
             quiet_s = self.burst_s + _SETTLE_S
-            while (
-                tester.wait_for(MessageKind.BOOT_VERSION, within_s=quiet_s)
-                and tester.now < deadline
-            ):
+            while tester.wait_for(Reply.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
                 pass
 
     def read_memory(self, start: int, size_bytes: int) -> bytes | None:
@@ -142,16 +128,16 @@ class PatientHost:
             wanted = at.to_bytes(4, "little") + (at + piece).to_bytes(4, "little")
             for _ in range(_QUERY_TRIES):
                 tester.send(self._encoder.query_memory(at, at + piece))
-                heard = tester.wait_for(
-                    MessageKind.MEMORY,
+                reply = tester.wait_for(
+                    Reply.MEMORY,
                     within_s=_QUERY_PERIOD_S,
                     unlike=lambda one, wanted=wanted: not one.data.startswith(wanted),  # type: ignore[misc]
                 )
-                if heard is not None:
+                if reply is not None:
                     break
             else:
                 return None
-            found += heard.data[len(wanted) :][:piece]
+            found += reply.data[len(wanted) :][:piece]
         return found
 
     def send_packet(self, image: bytes, number: int) -> Sent:
@@ -174,7 +160,7 @@ class PatientHost:
             if not self._request_transfer(len(image), blind=blind and not attempt):
                 return ended
             ended = self.transfer(image)
-            if ended.ok or not ended.reason.startswith(MessageKind.BOOT_VERSION.value):
+            if ended.ok or not ended.reason.startswith(Reply.BOOT_VERSION.value):
                 return ended
         return ended
 
@@ -183,16 +169,16 @@ class PatientHost:
         limit = self._profile.limit
         limit_s = limit("first_version_s")
         first_s = min(_BLIND_S, limit_s) if blind else limit_s
-        heard = self._tester.wait_for(MessageKind.BOOT_VERSION, within_s=first_s)
+        reply = self._tester.wait_for(Reply.BOOT_VERSION, within_s=first_s)
         for _ in range(UPDATES_MAX):
-            if heard is None and not blind:
+            if reply is None and not blind:
                 return False
             sent = self._tester.send(self._encoder.update(size_bytes))
             # A boot version may have been the last one before a restart (RS-02).
             within_s = max(limit("erase_s"), limit("pause_s") + limit_s if blind else limit_s)
-            heard = self.request_or_version(sent.left_at, within_s)
-            if heard is None or heard.kind is MessageKind.REQUEST:
-                return heard is not None
+            reply = self.request_or_version(sent.left_at, within_s)
+            if reply is None or reply.kind is Reply.REQUEST:
+                return reply is not None
             blind = False
         return False
 
@@ -200,10 +186,10 @@ class PatientHost:
         """Wait for request transfer, or for a boot version sent after the update command (R2)."""
         not_before = asked_at + UPDATE_SPACING_S
         return self._tester.wait_for(
-            MessageKind.REQUEST,
-            MessageKind.BOOT_VERSION,
+            Reply.REQUEST,
+            Reply.BOOT_VERSION,
             within_s=within_s,
-            unlike=lambda one: one.kind is MessageKind.BOOT_VERSION and one.at < not_before,
+            unlike=lambda one: one.kind is Reply.BOOT_VERSION and one.at < not_before,
         )
 
     def transfer(self, image: bytes) -> UpgradeResult:
@@ -222,10 +208,10 @@ class PatientHost:
         refusals = 0
         for _ in range(END_TRIES):
             self._tester.send(self._encoder.end())
-            heard = self._tester.wait_for(MessageKind.COMPLETE, MessageKind.NAK)
-            if heard is not None and heard.kind is MessageKind.COMPLETE:
+            reply = self._tester.wait_for(Reply.COMPLETE, Reply.NAK)
+            if reply is not None and reply.kind is Reply.COMPLETE:
                 return UpgradeResult(ok=True)
-            refusals += heard is not None
+            refusals += reply is not None
             if refusals == 2:
                 return UpgradeResult(ok=False, reason="the image was refused")
         wanted = reported_version(self._encoder.target, image)
@@ -239,27 +225,27 @@ class PatientHost:
         """
 
         def is_stale(one: Received) -> bool:
-            if one.kind is MessageKind.BOOT_VERSION:
+            if one.kind is Reply.BOOT_VERSION:
                 return one.at < began_at + LEFTOVER_S
-            return one.kind is MessageKind.ACK and one.number != number
+            return one.kind is Reply.ACK and one.number != number
 
         last = "no answer"
         for tries in range(1, PACKET_TRIES + 1):
             self.send_packet(image, number)
             # A repeated update command may cause a second erase (R25, R16).
-            kinds = (*_PACKET_ANSWERS, MessageKind.REQUEST) if number == 1 else _PACKET_ANSWERS
-            heard = self._tester.wait_for(*kinds, unlike=is_stale)
-            if heard is None and number == 1 and tries == PACKET_TRIES - 1:
+            kinds = (*_PACKET_ANSWERS, Reply.REQUEST) if number == 1 else _PACKET_ANSWERS
+            reply = self._tester.wait_for(*kinds, unlike=is_stale)
+            if reply is None and number == 1 and tries == PACKET_TRIES - 1:
                 erase_s = self._profile.limit("erase_s")
-                self._tester.wait_for(MessageKind.REQUEST, within_s=erase_s)
-            if heard is None or heard.kind is MessageKind.REQUEST:
+                self._tester.wait_for(Reply.REQUEST, within_s=erase_s)
+            if reply is None or reply.kind is Reply.REQUEST:
                 continue
-            last = str(heard)
-            if heard.kind is MessageKind.BOOT_VERSION:
+            last = str(reply)
+            if reply.kind is Reply.BOOT_VERSION:
                 return last
-            is_next = heard.kind is MessageKind.NAK and heard.number == number + 1
+            is_next = reply.kind is Reply.NAK and reply.number == number + 1
             by_profile = is_next and tries > 1 and self._profile.choice("tx_02") != "ack"
-            if not by_profile and heard.kind is not MessageKind.ACK:
+            if not by_profile and reply.kind is not Reply.ACK:
                 continue
             # Wait until the answers to all copies have arrived.
             quiet_after = PACKET_TRIES if tries > 1 else 0

@@ -20,7 +20,7 @@ from flasher.conformance.results import (
     TraceEntry,
 )
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import MessageKind, reported_version
+from flasher.conformance.wire import Reply, reported_version
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
@@ -100,11 +100,11 @@ def is_reachable(
     within_s = profile.limit("first_version_s") + profile.limit("pause_s")
     try:
         bench.send(bench.encoder.reset())
-        if bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is not None:
+        if bench.wait_for(Reply.BOOT_VERSION, within_s=within_s) is not None:
             return True
         if subject.has_power:
             bench.power_cycle()
-            return bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s) is not None
+            return bench.wait_for(Reply.BOOT_VERSION, within_s=within_s) is not None
     except RunStopped:
         raise
     except CaseEnded:

@@ -330,12 +330,7 @@ class SuiteRun:
         got = "; ".join((*failed.diagnosis, failed.reason))
         check = Check("", CheckOutcome.FAIL, "the device can be upgraded", got, at_s)
         return CaseResult(
-            BRING_UP,
-            CaseVerdict.FAIL,
-            repeat,
-            checks=(check,),
-            duration_s=at_s,
-            trace=failed.trace,
+            BRING_UP, CaseVerdict.FAIL, repeat, checks=(check,), duration_s=at_s, trace=failed.trace
         )
 
     def _must_stop(self) -> bool:

@@ -22,21 +22,21 @@ from flasher.conformance.wire import (
     WRITE,
     DeviceDecoder,
     Encoder,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
 )
 
 TRACE_FRAMES: Final = 20_000
 """Largest number of frames to keep of a case, the newest ones."""
 _LIMITS: Final = {
-    MessageKind.FEEDBACK: "feedback_s",
-    MessageKind.BOOT_VERSION: "first_version_s",
-    MessageKind.REQUEST: "erase_s",
-    MessageKind.ACK: "ack_s",
-    MessageKind.NAK: "ack_s",
-    MessageKind.COMPLETE: "complete_s",
-    MessageKind.VERSION_INFORMATION: "start_s",
+    Reply.FEEDBACK: "feedback_s",
+    Reply.BOOT_VERSION: "first_version_s",
+    Reply.REQUEST: "erase_s",
+    Reply.ACK: "ack_s",
+    Reply.NAK: "ack_s",
+    Reply.COMPLETE: "complete_s",
+    Reply.VERSION_INFORMATION: "start_s",
 }
 _RECEIVED_LIMIT: Final = 50_000
 """Largest number of messages to keep, so that a babbling device does not exhaust memory."""
@@ -110,7 +110,7 @@ class BusTester:
         self.collects_feedback = profile.choice("fr_10") == "silence"
         """False: general feedback to a write (R15) only appears in the trace."""
         self.collects_application = False
-        """Set by cases that need `MessageKind.APPLICATION`, which otherwise only appears in the
+        """Set by cases that need `Reply.APPLICATION`, which otherwise only appears in the
         trace.
         """
         self.frames_sent = 0
@@ -220,7 +220,7 @@ class BusTester:
 
     def wait_for(
         self,
-        *kinds: MessageKind,
+        *kinds: Reply,
         within_s: float | None = None,
         unlike: Callable[[Received], bool] | None = None,
     ) -> Received | None:
@@ -233,7 +233,7 @@ class BusTester:
                 return received
         return None
 
-    def limit_s(self, kind: MessageKind) -> float:
+    def limit_s(self, kind: Reply) -> float:
         """The profile's limit for an answer of this kind. Raises KeyError without one."""
         return self.profile.limit(_LIMITS[kind])
 
@@ -283,16 +283,16 @@ class BusTester:
         self.frames_received += 1
         copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
         for _ in range(copies):
-            heard = self._decoder.feed(frame, at)
-            self._received.extend(filter(self._is_collected, heard))
+            reply = self._decoder.feed(frame, at)
+            self._received.extend(filter(self._is_collected, reply))
 
     def _is_collected(self, one: Received) -> bool:
-        if one.kind is MessageKind.FEEDBACK and not self.collects_feedback:
+        if one.kind is Reply.FEEDBACK and not self.collects_feedback:
             is_late = one.first_at - self._written_at > self.profile.limit("feedback_s")
             if self._feedback_due and not is_late:
                 self._feedback_due -= 1
                 return False
-        return self.collects_application or one.kind is not MessageKind.APPLICATION
+        return self.collects_application or one.kind is not Reply.APPLICATION
 
     def _send_disturbed(self, frame: RawFrame) -> None:
         fault = self._faults.get((False, self.frames_sent - self._fault_origin[0]))

@@ -99,8 +99,8 @@ def boot_versions(report: RunReport) -> tuple[str, ...]:
     """Distinct boot versions in the frames of a run."""
     found: dict[str, None] = {}
     for result in report.results:
-        heard = [entry for entry in result.trace[:_FIRST_FRAMES] if not entry.sent]
-        for row in _decoded(heard):
+        replies = [entry for entry in result.trace[:_FIRST_FRAMES] if not entry.sent]
+        for row in _decoded(replies):
             if row.seen.command == BOOT_VERSION:
                 found[" ".join(field.text for field in row.seen.fields)] = None
     return tuple(found)

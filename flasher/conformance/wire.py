@@ -277,7 +277,7 @@ _FIRMWARE_AT: Final = slice(48, 64)
 _BOOT_VERSION_TEXT: Final = re.compile(rb"V\d\.\d\.\d")
 
 
-class MessageKind(Enum):
+class Reply(Enum):
     """Kind of a message from the device; reports use the value."""
 
     FEEDBACK = "general feedback"
@@ -296,13 +296,13 @@ class MessageKind(Enum):
 
 
 _KINDS: Final = {
-    FEEDBACK: (MessageKind.FEEDBACK, b"ACK"),
-    BOOT_VERSION: (MessageKind.BOOT_VERSION, None),
-    REQUEST: (MessageKind.REQUEST, b"\0\0"),
-    ACK: (MessageKind.ACK, None),
-    NAK: (MessageKind.NAK, None),
-    COMPLETE: (MessageKind.COMPLETE, b"\0\0"),
-    MEMORY: (MessageKind.MEMORY, None),
+    FEEDBACK: (Reply.FEEDBACK, b"ACK"),
+    BOOT_VERSION: (Reply.BOOT_VERSION, None),
+    REQUEST: (Reply.REQUEST, b"\0\0"),
+    ACK: (Reply.ACK, None),
+    NAK: (Reply.NAK, None),
+    COMPLETE: (Reply.COMPLETE, b"\0\0"),
+    MEMORY: (Reply.MEMORY, None),
 }
 """Commands from device to tool, with their data where the document defines it."""
 
@@ -311,7 +311,7 @@ _KINDS: Final = {
 class Received:
     """A message from the device; the times of its first and last frame are in seconds."""
 
-    kind: MessageKind
+    kind: Reply
     first_at: float
     at: float
     can_id: int
@@ -343,20 +343,20 @@ class Received:
 
     def __str__(self) -> str:
         """Text for reports; device bytes are in hexadecimal or escaped."""
-        if self.kind in (MessageKind.ACK, MessageKind.NAK):
+        if self.kind in (Reply.ACK, Reply.NAK):
             return f"{self.kind.value} {self.number}"
-        if self.kind is MessageKind.BOOT_VERSION:
+        if self.kind is Reply.BOOT_VERSION:
             return f"boot version {self.data.decode('latin-1')!a}"
-        if self.kind is MessageKind.OTHER:
+        if self.kind is Reply.OTHER:
             return f"{self.can_id:03X} {self.command:04X} {self.data.hex().upper()}".rstrip()
-        if self.kind is MessageKind.DAMAGED:
+        if self.kind is Reply.DAMAGED:
             return f"{self.kind.value} {self.can_id:03X} {self.raw.hex().upper()}"
         return str(self.kind.value)
 
 
 class DeviceDecoder:
     """Assembles messages of the device per CAN id and ignores other senders. Bytes that do not form
-    a message become `MessageKind.DAMAGED`.
+    a message become `Reply.DAMAGED`.
 
     A message starts at the start of a CAN frame (R19); bytes after its tail are padding.
     """
@@ -374,45 +374,41 @@ class DeviceDecoder:
             return
         first_at, last_at, so_far = self._partial.pop(can_id, (at, at, b""))
         if so_far and at - last_at > self._timeout_s:
-            yield Received(MessageKind.DAMAGED, first_at, last_at, can_id, so_far)
+            yield Received(Reply.DAMAGED, first_at, last_at, can_id, so_far)
             first_at, so_far = at, b""
         if not so_far and not frame.data.startswith(b"\x55\xaa"):
-            yield Received(MessageKind.DAMAGED, at, at, can_id, frame.data)
+            yield Received(Reply.DAMAGED, at, at, can_id, frame.data)
             return
         raw = so_far + frame.data
         if len(raw) < 4 or len(raw) < _OVERHEAD_BYTES + raw[3]:
             self._partial[can_id] = (first_at, at, raw)
             return
         size = _OVERHEAD_BYTES + raw[3]
-        heard = self._judge(raw[:size], first_at, at, can_id)
-        yield replace(heard, padding=raw[size:]) if raw[size:] else heard
+        reply = self._judge(raw[:size], first_at, at, can_id)
+        yield replace(reply, padding=raw[size:]) if raw[size:] else reply
 
     def _judge(self, raw: bytes, first_at: float, at: float, can_id: int) -> Received:
         if not is_intact(can_id, raw):
-            return Received(MessageKind.DAMAGED, first_at, at, can_id, raw)
+            return Received(Reply.DAMAGED, first_at, at, can_id, raw)
         mode, command, data = raw[2], int.from_bytes(raw[4:6], "big"), raw[6:-5]
         kind = self._kind(can_id, mode, command, data)
         return Received(kind, first_at, at, can_id, raw, mode, command, data)
 
-    def _kind(self, can_id: int, mode: int, command: int, data: bytes) -> MessageKind:
+    def _kind(self, can_id: int, mode: int, command: int, data: bytes) -> Reply:
         if can_id != self._ids.to_tool and command not in _KINDS:
             is_version = can_id == self._ids.to_all and command == VERSION_INFORMATION
-            return (
-                MessageKind.VERSION_INFORMATION
-                if is_version and mode == REPORT
-                else MessageKind.APPLICATION
-            )
+            return Reply.VERSION_INFORMATION if is_version and mode == REPORT else Reply.APPLICATION
         if mode != REPORT:
-            return MessageKind.OTHER
-        kind, fixed = _KINDS.get(command, (MessageKind.OTHER, None))
+            return Reply.OTHER
+        kind, fixed = _KINDS.get(command, (Reply.OTHER, None))
         if can_id != self._ids.to_tool or (fixed is not None and data != fixed):
-            return MessageKind.OTHER
+            return Reply.OTHER
         return kind
 
 
-def describe(heard: Sequence[Received]) -> str:
+def describe(replies: Sequence[Received]) -> str:
     """Messages in one line, with repetitions counted; "nothing" for none."""
-    runs = [(text, len(list(same))) for text, same in groupby(map(str, heard))]
+    runs = [(text, len(list(same))) for text, same in groupby(map(str, replies))]
     shown = [text if count == 1 else f"{text} ({count} times)" for text, count in runs[:8]]
     if len(runs) > len(shown):
         shown.append(f"and {len(runs) - len(shown)} more")

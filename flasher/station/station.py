@@ -459,7 +459,7 @@ class Station:
         """Save something for the process, then reply."""
         run, number = self._going(socket), asked.number
         if run is None:
-            reply = Reply(number, error="The run is not one of this station.")
+            reply = WriteReply(number, error="The run is not one of this station.")
             self.supervisor.send(socket, reply)
             return
         write_id, claim = None, run.claim
@@ -478,7 +478,7 @@ class Station:
             self._feed(socket, self._not_saved(socket, claim.serial, claim.run_id, error))
             self.supervisor.send(socket, Reply(number, error=error.what))
         else:
-            self.supervisor.send(socket, Reply(number, write_id))
+            self.supervisor.send(socket, WriteReply(number, write_id))
 
     def _save_step(
         self, socket: str, claim: Claim, step: StepEnded, measurements: Sequence[Measurement]

@@ -42,7 +42,6 @@ from flasher.station.messages import (
     PresenceChanged,
     Quit,
     Ready,
-    Reply,
     RunEvent,
     RunResult,
     ToWorker,

@@ -11,7 +11,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, profile_of_mock
 from flasher.conformance.results import CaseLimitReached, CaseStopped
 from flasher.conformance.tester import FaultKind, LineFault
-from flasher.conformance.wire import MessageKind, RawFrame, packet_count
+from flasher.conformance.wire import RawFrame, Reply, packet_count
 from tests.loops import each
 
 from .bench import PROFILE, subject
@@ -47,8 +47,8 @@ def test_a_frame_of_the_device_can_be_lost_on_its_way() -> None:
     bench = made()
     with bench.disturb(LineFault(FaultKind.DROP, 0, incoming=True)):
         bench.send(bench.encoder.reset())
-        heard = bench.collect(0.04)
-    assert [one.kind for one in heard] == [MessageKind.DAMAGED]
+        replies = bench.collect(0.04)
+    assert [one.kind for one in replies] == [Reply.DAMAGED]
     with pytest.raises(ValueError, match="cannot be"):
         LineFault(FaultKind.SWAP, 0, incoming=True)
 
@@ -73,7 +73,7 @@ def test_no_wait_goes_beyond_the_limit_of_the_case() -> None:
 def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
     bench = made()
     with pytest.raises(CaseStopped):
-        bench.expect(MessageKind.ACK, within_s=0.1, number=3)
+        bench.expect(Reply.ACK, within_s=0.1, number=3)
     (check,) = bench.judge.checks
     assert (check.expected, check.got) == ("ACK 3", "nothing within 0.1 s")
 
@@ -96,9 +96,9 @@ def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
     bench.subject.cut_in_operation(0, 0.5, 0.3)
     bench.send(bench.encoder.update(len(GOOD_IMAGE)))
     # Torn while it was erased: no application, and the bootloader announces itself.
-    assert bench.wait_for(MessageKind.REQUEST, within_s=0.2) is None
+    assert bench.wait_for(Reply.REQUEST, within_s=0.2) is None
     assert bench.subject.take_cut()
-    assert bench.wait_for(MessageKind.BOOT_VERSION, within_s=1.0) is not None
+    assert bench.wait_for(Reply.BOOT_VERSION, within_s=1.0) is not None
     assert bench.application_version() is None
     bench.check_upgrade()
     bench.subject.cut_in_operation(10_000, 0.5, 0.1)

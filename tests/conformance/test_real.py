@@ -125,10 +125,10 @@ def test_remote_and_extended_frames_are_sent_and_known_again() -> None:
         RawFrame(0x752 << 18, b"\x01", is_extended=True),
     ):
         port.send(frame)
-        heard = other.receive(1.0)
-        assert heard is not None
-        assert (heard.is_remote, heard.is_extended) == (frame.is_remote, frame.is_extended)
-        assert not heard.is_payload
+        reply = other.receive(1.0)
+        assert reply is not None
+        assert (reply.is_remote, reply.is_extended) == (frame.is_remote, frame.is_extended)
+        assert not reply.is_payload
 
 
 def test_what_a_link_cannot_send_is_unsupported() -> None:

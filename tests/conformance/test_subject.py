@@ -230,13 +230,13 @@ def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() 
     with open_subject(
         _FLAWS + "SendsWithoutEnd", "bms", None, good_image=None, second_image=None
     ) as (device, _):
-        heard = []
+        replies = []
         for off_bus_at in (0.05, 0.1):
             while (arrival := device.port.receive(off_bus_at)) is not None:
-                heard.append(arrival)
+                replies.append(arrival)
             device.bus_off(0.01)
-    assert max(arrival.frame.data[0] for arrival in heard) == 2  # it is asked while one has room
-    times = [arrival.at for arrival in heard]
+    assert max(arrival.frame.data[0] for arrival in replies) == 2  # it is asked while one has room
+    times = [arrival.at for arrival in replies]
     gaps = [late - early for early, late in pairwise(times)]
     assert len(times) > 150
     assert [gap > 0.001 for gap in gaps].count(True) == 1  # back to back, except for the bus-off

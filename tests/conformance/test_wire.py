@@ -6,9 +6,9 @@ from flasher.conformance import wire
 from flasher.conformance.wire import (
     DeviceDecoder,
     Encoder,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     build,
     describe,
     split,
@@ -22,9 +22,9 @@ def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Rec
     """What is made of frames, given in hexadecimal."""
     listener = DeviceDecoder(BMS)
     return [
-        heard
+        reply
         for index, payload in enumerate(payloads.split())
-        for heard in listener.feed(RawFrame(can_id, bytes.fromhex(payload)), index * gap_s)
+        for reply in listener.feed(RawFrame(can_id, bytes.fromhex(payload)), index * gap_s)
     ]
 
 
@@ -76,19 +76,19 @@ def test_a_packet_is_18_whole_frames() -> None:
 @each(
     "payloads, kind, shown",
     [
-        ("55AA0C0555034143 4BB209FC46F0", MessageKind.FEEDBACK, "general feedback"),
+        ("55AA0C0555034143 4BB209FC46F0", Reply.FEEDBACK, "general feedback"),
         (
             "55AA0C0BC109424D 5356312E322E33E6 57D854F0",
-            MessageKind.BOOT_VERSION,
+            Reply.BOOT_VERSION,
             "boot version 'BMSV1.2.3'",
         ),
-        ("55AA0C04C4020000 337142F8F0", MessageKind.REQUEST, "request transfer"),
-        ("55AA0C04C2020100 0027EA05F0", MessageKind.ACK, "ACK 1"),
-        ("55AA0C04C3020100 E883BC00F0", MessageKind.NAK, "NAK 1"),
-        ("55AA0C04C5020000 DBD514FDF0", MessageKind.COMPLETE, "complete"),
+        ("55AA0C04C4020000 337142F8F0", Reply.REQUEST, "request transfer"),
+        ("55AA0C04C2020100 0027EA05F0", Reply.ACK, "ACK 1"),
+        ("55AA0C04C3020100 E883BC00F0", Reply.NAK, "NAK 1"),
+        ("55AA0C04C5020000 DBD514FDF0", Reply.COMPLETE, "complete"),
     ],
 )
-def test_what_the_device_says_is_named(payloads: str, kind: MessageKind, shown: str) -> None:
+def test_what_the_device_says_is_named(payloads: str, kind: Reply, shown: str) -> None:
     (heard,) = listen(payloads)
     assert heard.kind is kind
     assert str(heard) == shown
@@ -104,41 +104,41 @@ def test_what_the_device_says_is_named(payloads: str, kind: MessageKind, shown: 
     ],
 )
 def test_what_is_damaged_is_said_to_be(payloads: str) -> None:
-    assert [heard.kind for heard in listen(payloads)] == [MessageKind.DAMAGED]
+    assert [reply.kind for reply in listen(payloads)] == [Reply.DAMAGED]
 
 
 def test_a_message_that_stops_midway_is_damaged_once_another_begins() -> None:
     whole = "55AA0C04C2020100 0027EA05F0"
-    heard = listen(f"55AA0C04C2020100 {whole}", gap_s=0.2)
-    assert [one.kind for one in heard] == [
-        MessageKind.DAMAGED,
-        MessageKind.DAMAGED,
-        MessageKind.DAMAGED,
+    replies = listen(f"55AA0C04C2020100 {whole}", gap_s=0.2)
+    assert [one.kind for one in replies] == [
+        Reply.DAMAGED,
+        Reply.DAMAGED,
+        Reply.DAMAGED,
     ]
     listener = DeviceDecoder(BMS)
     frames = split(0x725, bytes.fromhex(whole.replace(" ", "")))
     times = [(frames[0], 0.0), (frames[0], 0.2), (frames[1], 0.201)]
     found = [one for frame, at in times for one in listener.feed(frame, at)]
-    assert [one.kind for one in found] == [MessageKind.DAMAGED, MessageKind.ACK]
+    assert [one.kind for one in found] == [Reply.DAMAGED, Reply.ACK]
 
 
 @each(
     "can_id, command, kinds",
     [
-        (0x720, wire.ACK, [MessageKind.OTHER]),  # a wrong id of the same sender
-        (0x720, 0x1402, [MessageKind.APPLICATION]),
+        (0x720, wire.ACK, [Reply.OTHER]),  # a wrong id of the same sender
+        (0x720, 0x1402, [Reply.APPLICATION]),
         (0x715, wire.ACK, []),  # another sender
-        (0x725, 0x1402, [MessageKind.OTHER]),
+        (0x725, 0x1402, [Reply.OTHER]),
     ],
 )
-def test_what_counts_depends_on_the_id(can_id: int, command: int, kinds: list[MessageKind]) -> None:
+def test_what_counts_depends_on_the_id(can_id: int, command: int, kinds: list[Reply]) -> None:
     message = split(can_id, build(can_id, wire.REPORT, command, b"\1\0"))
-    assert [heard.kind for heard in listen(said(message), can_id=can_id)] == kinds
+    assert [reply.kind for reply in listen(said(message), can_id=can_id)] == kinds
 
 
 def test_an_answer_with_other_data_is_another_message() -> None:
     request = split(0x725, build(0x725, wire.REPORT, wire.REQUEST, b"\0\1"))
-    assert [heard.kind for heard in listen(said(request))] == [MessageKind.OTHER]
+    assert [reply.kind for reply in listen(said(request))] == [Reply.OTHER]
 
 
 def test_frames_that_are_no_payload_are_nothing() -> None:

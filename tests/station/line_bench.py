@@ -16,7 +16,6 @@ from flasher.station.messages import (
     FromWorker,
     PresenceChanged,
     Ready,
-    Reply,
     RunResult,
     ToWorker,
     WorkerSetup,
@@ -201,7 +200,7 @@ class LineBench:
         number = 1 + sum(isinstance(message, Reply) for message in port.heard)
         self.say(socket, Ask(number, what, measurements))
         reply = port.heard[-1]
-        assert isinstance(reply, Reply)
+        assert isinstance(reply, WriteReply)
         assert reply.number == number
         return reply
 

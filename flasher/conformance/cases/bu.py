@@ -17,9 +17,9 @@ from flasher.conformance.wire import (
     ACK,
     FEEDBACK,
     REQUEST,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     packet_count,
 )
@@ -153,8 +153,8 @@ def bus_off(bench: Bench) -> None:
         bench.subject.bus_off(off_s)
         bench.wait(off_s / 2)
         bench.forget()
-        heard = bench.collect(off_s / 2 + bench.host.burst_s)
-        versions = [one for one in heard if one.kind is MessageKind.BOOT_VERSION]
+        replies = bench.collect(off_s / 2 + bench.host.burst_s)
+        versions = [one for one in replies if one.kind is Reply.BOOT_VERSION]
         bench.check(not versions, "the application runs by then", describe(versions))
         bench.check_application()
 
@@ -219,7 +219,7 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
     """
     limit = bench.limit
     names: list[str] = []
-    heard: Received | None = None
+    reply: Received | None = None
     message = "reset"
     bench.forget()
     for _ in range(_ENTRIES_MAX):
@@ -228,27 +228,25 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
         if message == "reset":
             within_s = limit("feedback_s") if disturbance.name else limit("first_version_s")
             with disturbance.send(bench, bench.encoder.reset()):
-                heard = bench.wait_for(
-                    MessageKind.BOOT_VERSION, MessageKind.REQUEST, within_s=within_s
-                )
+                reply = bench.wait_for(Reply.BOOT_VERSION, Reply.REQUEST, within_s=within_s)
         else:
             within_s = bench.host.burst_s if disturbance.name else limit("erase_s")
             with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
-                heard = bench.host.request_or_version(sent.left_at, within_s)
+                reply = bench.host.request_or_version(sent.left_at, within_s)
             # The device may still be in the bootloader: request transfer may be lost (UP-05).
-            if heard is None and not (
+            if reply is None and not (
                 bench.encoder.has_version_query and bench.application_version() is not None
             ):
                 sent = bench.send(bench.encoder.update(len(image)))
-                heard = bench.host.request_or_version(sent.left_at, limit("silence_s"))
-        if heard is not None and heard.kind is MessageKind.REQUEST:
+                reply = bench.host.request_or_version(sent.left_at, limit("silence_s"))
+        if reply is not None and reply.kind is Reply.REQUEST:
             break
         # A device that ignores the reset may wait for packet 1: request transfer was lost (R26).
         is_deaf = message == "reset" and not disturbance.name
-        message = "update command" if heard is not None or is_deaf else "reset"
+        message = "update command" if reply is not None or is_deaf else "reset"
     with bench.step("; ".join(names) or "undisturbed"):
-        is_there = heard is not None and heard.kind is MessageKind.REQUEST
-        bench.require(is_there, MessageKind.REQUEST.value, heard or "nothing after many tries")
+        is_there = reply is not None and reply.kind is Reply.REQUEST
+        bench.require(is_there, Reply.REQUEST.value, reply or "nothing after many tries")
 
 
 def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
@@ -260,11 +258,11 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         disturbance = _next(left, "packet")
         with bench.step(f"packet {number}, {disturbance.name}" if disturbance.name else "packets"):
             with disturbance.send(bench, bench.encoder.packet_of(image, number)):
-                heard = bench.wait_for(MessageKind.ACK, MessageKind.NAK)
+                reply = bench.wait_for(Reply.ACK, Reply.NAK)
             last = ""
-            if heard is None or heard.kind is not MessageKind.ACK or heard.number != number:
+            if reply is None or reply.kind is not Reply.ACK or reply.number != number:
                 last = bench.host.deliver_packet(image, number, began_at)
-            if last.startswith(MessageKind.BOOT_VERSION.value):
+            if last.startswith(Reply.BOOT_VERSION.value):
                 bench.info(f"the device restarts: {disturbance.name}")
                 return False
             if disturbance.name or last:
@@ -277,19 +275,17 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     rejected the image explicitly, with two NAKs (R6).
     """
     names: list[str] = []
-    heard: Received | None = None
+    reply: Received | None = None
     # Stop before the device takes the silence for a pause in the transfer (TX-12).
     give_up_at = bench.now + bench.limit("pause_s") / 2
-    while heard is None and bench.now < give_up_at and left["end of transfer"]:
+    while reply is None and bench.now < give_up_at and left["end of transfer"]:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            heard = bench.wait_for(
-                MessageKind.COMPLETE, MessageKind.NAK, within_s=bench.limit("silence_s")
-            )
+            reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=bench.limit("silence_s"))
         if disturbance.hits_answer:
             break
-    if heard is not None and heard.kind is MessageKind.COMPLETE:
+    if reply is not None and reply.kind is Reply.COMPLETE:
         return True
     with bench.step("; ".join(names) or "end of transfer"):
         done = bench.host.deliver_end(image)

@@ -18,9 +18,9 @@ from flasher.conformance.wire import (
     REPORT,
     REQUEST,
     Encoder,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     build,
     inverted,
     packet_count,
@@ -109,28 +109,28 @@ def load(bench: Bench) -> None:
             bench.send(_FOREIGN)
             bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
         bench.send(_under_load(bench.encoder.reset()))
-        _expect_under_load(bench, MessageKind.BOOT_VERSION)
+        _expect_under_load(bench, Reply.BOOT_VERSION)
         bench.wait_until_listening()
     with bench.step("update command under load"):
         bench.send(_under_load(bench.encoder.update(len(image))))
-        _expect_under_load(bench, MessageKind.REQUEST)
+        _expect_under_load(bench, Reply.REQUEST)
     with bench.step("packets under load"):
         for number in range(1, loaded):
             bench.send(_under_load(bench.encoder.packet_of(image, number)))
-            heard = _expect_under_load(bench, MessageKind.ACK)
-            bench.require(heard.number == number, f"ACK {number}", heard)
+            reply = _expect_under_load(bench, Reply.ACK)
+            bench.require(reply.number == number, f"ACK {number}", reply)
     with bench.step("a babbling node in the transfer"):
         began_at = bench.now
         bench.send_packet(image, loaded)
         _babble(bench)
         heard_all = bench.collect(bench.limit("ack_s"))
-        if not any(one.kind is MessageKind.ACK and one.number == loaded for one in heard_all):
+        if not any(one.kind is Reply.ACK and one.number == loaded for one in heard_all):
             trouble = bench.host.deliver_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
     with bench.step("end of transfer, then a busy bus"):
         bench.packets(image, loaded + 1)
         bench.send([*bench.encoder.end(), *_SHORT_BABBLE])
-        bench.expect(MessageKind.COMPLETE)
+        bench.expect(Reply.COMPLETE)
         bench.check_image(image)
 
 
@@ -152,14 +152,14 @@ def two_upgrades(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.wait_until_listening()
             _send_interleaved(bench, bench.encoder.update(len(image)), other.update(len(image)))
-            bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
+            bench.expect(Reply.REQUEST, ignoring=(Reply.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
                 # The other target's packet has other data; its next packet is sent alone.
                 inverse = inverted(packet_payload(image, number))
                 own = bench.encoder.packet_of(image, number)
                 _send_interleaved(bench, own, other.packet(number, total, inverse))
-                bench.expect(MessageKind.ACK, number=number)
+                bench.expect(Reply.ACK, number=number)
                 bench.send(other.answer(ACK, number.to_bytes(2, "little")))
                 if number < total:
                     bench.send(other.packet(number + 1, total, inverse))
@@ -190,14 +190,14 @@ def application_traffic(bench: Bench) -> None:
     with bench.step("during the announcements"):
         bench.reset_to_bootloader()
         bench.send(traffic)
-        heard = bench.collect(bench.limit("version_spacing_s"))
-        bench.check_only(heard, MessageKind.BOOT_VERSION, why="no answer")
+        replies = bench.collect(bench.limit("version_spacing_s"))
+        bench.check_only(replies, Reply.BOOT_VERSION, why="no answer")
         bench.update(len(image))
     middle = max(1, total // 2)
     for before, first, last in (("packet 1", 1, middle), ("a packet", middle + 1, total)):
         with bench.step(f"before {before}"):
             bench.send(traffic)
-            bench.expect_silence(ignoring=(MessageKind.BOOT_VERSION,) if first == 1 else ())
+            bench.expect_silence(ignoring=(Reply.BOOT_VERSION,) if first == 1 else ())
             bench.packets(image, first, last)
     with bench.step("before the end"):
         bench.send(traffic)
@@ -214,15 +214,15 @@ def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
     return [one for frame in frames for one in (*_FOREIGN, frame)]
 
 
-def _expect_under_load(bench: Bench, kind: MessageKind) -> Received:
+def _expect_under_load(bench: Bench, kind: Reply) -> Received:
     """Wait for a message of this kind while the load continues."""
     within_s = bench.tester.limit_s(kind)
     until = bench.now + within_s
-    heard: Received | None = None
-    while heard is None and bench.now < until:
+    reply: Received | None = None
+    while reply is None and bench.now < until:
         bench.send(_FOREIGN)
-        heard = bench.wait_for(kind, within_s=_FOREIGN_BITS / bench.port.bitrate_bps)
-    return bench.require_received(heard, kind.value, within_s)
+        reply = bench.wait_for(kind, within_s=_FOREIGN_BITS / bench.port.bitrate_bps)
+    return bench.require_received(reply, kind.value, within_s)
 
 
 def _babble(bench: Bench) -> None:

@@ -18,9 +18,9 @@ from flasher.conformance.wire import (
     REPORT,
     RESET,
     RESET_TEXT,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     build,
     crc,
     describe,
@@ -110,8 +110,8 @@ def bursts(bench: Bench) -> None:
             frames = probe.frames()
             with bench.disturb(fault):
                 bench.send(frames)
-                heard = bench.collect(probe.settle_s())
-            _require_none_accepted(bench, f"a packet whose {fault}", heard)
+                replies = bench.collect(probe.settle_s())
+            _require_none_accepted(bench, f"a packet whose {fault}", replies)
         bench.succeed(f"none of {len(faults)} packets is accepted", "none was")
     probe.send_next()
     probe.check_stored()
@@ -252,16 +252,16 @@ class _WrittenMessages:
 
     def expect_first_nak(self, within_s: float) -> None:
         """Require that the next message is exactly NAK 1; another or no NAK is TX-01's concern."""
-        heard = self._bench.next_message(within_s)
+        reply = self._bench.next_message(within_s)
         if (
-            heard is None
-            or heard.kind is MessageKind.ACK
-            or (heard.kind is MessageKind.NAK and heard.number != 1)
+            reply is None
+            or reply.kind is Reply.ACK
+            or (reply.kind is Reply.NAK and reply.number != 1)
         ):
-            why = f"the damaged packet 1 got {heard or 'no answer'}"
+            why = f"the damaged packet 1 got {reply or 'no answer'}"
             self._bench.unsupported("NAK 1, byte for byte", why)
         else:
-            self._judge("nak", self._written["nak"], heard)
+            self._judge("nak", self._written["nak"], reply)
 
     def enter(self, update: list[RawFrame]) -> None:
         """Reset the application and send this update command until request transfer."""
@@ -270,33 +270,31 @@ class _WrittenMessages:
         is_own = (encoder.reset_command, encoder.reset_data) != (RESET, RESET_TEXT)
         with bench.tester.collecting_feedback():
             bench.send(encoder.reset() if is_own else self.frames("reset"))
-            heard = bench.next_message(limit("first_version_s"))
-        if (
-            heard is None or heard.kind is not MessageKind.BOOT_VERSION
-        ):  # one without feedback: RS-01
-            self._judge("feedback", self._written["feedback"], heard)
-            heard = bench.next_message(limit("first_version_s"))
+            reply = bench.next_message(limit("first_version_s"))
+        if reply is None or reply.kind is not Reply.BOOT_VERSION:  # one without feedback: RS-01
+            self._judge("feedback", self._written["feedback"], reply)
+            reply = bench.next_message(limit("first_version_s"))
         # The version text is the product's own.
-        text = heard.data[3:] if heard is not None else b""
+        text = reply.data[3:] if reply is not None else b""
         version = build(encoder.to_tool, REPORT, BOOT_VERSION, encoder.boot_name.encode() + text)
-        self._judge("boot version", version, heard)
+        self._judge("boot version", version, reply)
         for _ in range(UPDATES_MAX):
             sent = bench.send(update)
             for _ in range(UPDATES_MAX):
-                heard = bench.next_message(limit("erase_s"))
+                reply = bench.next_message(limit("erase_s"))
                 # Boot versions sent before the update command was received do not count (R2).
-                is_version = heard is not None and heard.kind is MessageKind.BOOT_VERSION
-                if heard is None or not is_version or heard.at > sent.left_at + UPDATE_SPACING_S:
+                is_version = reply is not None and reply.kind is Reply.BOOT_VERSION
+                if reply is None or not is_version or reply.at > sent.left_at + UPDATE_SPACING_S:
                     break
-            if heard is None or heard.kind is not MessageKind.BOOT_VERSION:
+            if reply is None or reply.kind is not Reply.BOOT_VERSION:
                 break
-        self._judge("request", self._written["request"], heard)
+        self._judge("request", self._written["request"], reply)
 
-    def _judge(self, name: str, wanted: bytes, heard: Received | None) -> None:
+    def _judge(self, name: str, wanted: bytes, reply: Received | None) -> None:
         where = self._bench.encoder.to_tool
-        raw = b"" if heard is None else heard.raw + heard.padding
-        got = "nothing" if heard is None else f"{heard.can_id:03X} {raw.hex(' ').upper()}"
-        ok = heard is not None and (heard.can_id, raw) == (where, wanted)
+        raw = b"" if reply is None else reply.raw + reply.padding
+        got = "nothing" if reply is None else f"{reply.can_id:03X} {raw.hex(' ').upper()}"
+        ok = reply is not None and (reply.can_id, raw) == (where, wanted)
         self._bench.require(ok, f"{name}: {where:03X} {wanted.hex(' ').upper()}", got)
 
 
@@ -378,9 +376,9 @@ def _check_none_accepted(
         name, damage = left.pop(0)
         probe.keep_alive()
         bench.send(bench.encoder.frames(damage(probe.raw())))
-        heard = bench.collect(max(bench.limit("ack_s"), probe.settle_s()))
-        _require_none_accepted(bench, f"a packet with {name}", heard)
-        answers = bool(heard)
+        replies = bench.collect(max(bench.limit("ack_s"), probe.settle_s()))
+        _require_none_accepted(bench, f"a packet with {name}", replies)
+        answers = bool(replies)
     size = _SILENT_BATCH if framed and not answers else 1
     for start in range(0, len(left), size):
         batch = left[start : start + size]
@@ -390,17 +388,17 @@ def _check_none_accepted(
             bench.send(bench.encoder.frames(damage(raw)))
         if framed and answers:
             one = bench.next_message(bench.limit("ack_s"))
-            heard = [] if one is None else [one]
+            replies = [] if one is None else [one]
         else:
-            heard = bench.collect(probe.settle_s())
+            replies = bench.collect(probe.settle_s())
         first, last = batch[0][0], batch[-1][0]
         names = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
-        _require_none_accepted(bench, f"a packet with {names}", heard)
+        _require_none_accepted(bench, f"a packet with {names}", replies)
     _require_none_accepted(bench, "the last ones", bench.collect(probe.settle_s()))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
 
 
-def _require_none_accepted(bench: Bench, what: str, heard: Sequence[Received]) -> None:
+def _require_none_accepted(bench: Bench, what: str, replies: Sequence[Received]) -> None:
     """Require NAK or silence; TX-01 checks which, and with which number."""
-    if any(one.kind is not MessageKind.NAK for one in heard):
-        bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003
+    if any(one.kind is not Reply.NAK for one in replies):
+        bench.require(False, f"NAK or no answer to {what}", describe(replies))  # noqa: FBT003

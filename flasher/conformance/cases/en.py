@@ -7,15 +7,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import check_out_of_turn, transfer_image
 from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
-from flasher.conformance.wire import (
-    END,
-    WRITE,
-    MessageKind,
-    Received,
-    describe,
-    packet_count,
-    version_in,
-)
+from flasher.conformance.wire import END, WRITE, Received, Reply, describe, packet_count, version_in
 
 _RESET_PERIOD_S: Final = 0.2
 """Interval at which a tool repeats a command (4.3)."""
@@ -23,13 +15,7 @@ _WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
 """Values to send in place of 04."""
 _NO_APPLICATION_S: Final = 1.0
 """How long to query an application that must not run."""
-_UPGRADE_KINDS: Final = (
-    MessageKind.REQUEST,
-    MessageKind.ACK,
-    MessageKind.NAK,
-    MessageKind.COMPLETE,
-    MessageKind.FEEDBACK,
-)
+_UPGRADE_KINDS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
 """Possible answers to end of transfer; a starting application may send other reports."""
 
 
@@ -53,11 +39,11 @@ def end(bench: Bench) -> None:
     bench.packets(image)
     bench.end_transfer()
     with bench.step("after complete"):
-        heard = bench.wait_for(MessageKind.BOOT_VERSION)
+        reply = bench.wait_for(Reply.BOOT_VERSION)
         if bench.choice("en_03") != "either":
             restarts = bench.choice("en_03") == "restarts"
             expected = "the bootloader announces itself" if restarts else "no boot version"
-            bench.check(restarts == (heard is not None), expected, heard or "no boot version")
+            bench.check(restarts == (reply is not None), expected, reply or "no boot version")
         bench.check_image(image)
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
@@ -90,58 +76,56 @@ def end_early_and_twice(bench: Bench) -> None:
             done = stored
             bench.send(bench.encoder.end())
             # A NAK of any number (R6) and no other message.
-            bench.expect(MessageKind.NAK, within_s=bench.limit("complete_s"))
-            bench.expect_silence(bench.limit("ack_s"), ignoring=(MessageKind.BOOT_VERSION,))
+            bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
+            bench.expect_silence(bench.limit("ack_s"), ignoring=(Reply.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
-            heard = bench.wait_for(MessageKind.ACK, MessageKind.NAK, MessageKind.BOOT_VERSION)
-            if str(heard) == f"ACK {stored + 1}":
-                bench.succeed(f"ACK {stored + 1}", heard)
+            reply = bench.wait_for(Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
+            if str(reply) == f"ACK {stored + 1}":
+                bench.succeed(f"ACK {stored + 1}", reply)
                 done += 1
             else:
                 bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
-                _restart_transfer(bench, image, stored, heard)
+                _restart_transfer(bench, image, stored, reply)
     bench.packets(image, done + 1)
     for mark in _WRONG_MARKS:
         with bench.step(f"end of transfer with {mark:02X}"):
             bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
             answers = bench.collect(bench.limit("ack_s"))
-            ok = not any(one.kind in (MessageKind.COMPLETE, MessageKind.ACK) for one in answers)
+            ok = not any(one.kind in (Reply.COMPLETE, Reply.ACK) for one in answers)
             bench.require(ok, "rejected", describe(answers))
-        if any(one.kind in (MessageKind.NAK, MessageKind.BOOT_VERSION) for one in answers):
+        if any(one.kind in (Reply.NAK, Reply.BOOT_VERSION) for one in answers):
             bench.send_packet(image, total)
-            known = bench.wait_for(
-                MessageKind.ACK, MessageKind.NAK, unlike=lambda one: one.number < total
-            )
+            known = bench.wait_for(Reply.ACK, Reply.NAK, unlike=lambda one: one.number < total)
             if known is None:
                 _restart_transfer(bench, image, total)
             break
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
-        _check_second_end(bench, MessageKind.COMPLETE)
+        _check_second_end(bench, Reply.COMPLETE)
         bench.check_image(image)
 
 
 def _restart_transfer(
-    bench: Bench, image: bytes, stored: int, heard: Received | None = None
+    bench: Bench, image: bytes, stored: int, reply: Received | None = None
 ) -> None:
-    """Send packets 1 to `stored` in a new transfer; `heard` is the last message received."""
+    """Send packets 1 to `stored` in a new transfer; `reply` is the last message received."""
     bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
-    found = heard if heard is not None and heard.kind is MessageKind.BOOT_VERSION else None
-    found = found or bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+    found = reply if reply is not None and reply.kind is Reply.BOOT_VERSION else None
+    found = found or bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
     if bench.choice("rs_03") == "announces":
         bench.require_received(found, "the transfer goes on, or boot version", within_s)
     bench.update(len(image))
     bench.packets(image, 1, stored)
 
 
-def _check_second_end(bench: Bench, first_answer: MessageKind) -> None:
+def _check_second_end(bench: Bench, first_answer: Reply) -> None:
     """Send end of transfer again, immediately after its answer, and check the second answer."""
     bench.send(bench.encoder.end())
-    heard = bench.collect(bench.limit("ack_s"))
-    answers = [one for one in heard if one.kind in _UPGRADE_KINDS]
+    replies = bench.collect(bench.limit("ack_s"))
+    answers = [one for one in replies if one.kind in _UPGRADE_KINDS]
     # A running application may send general feedback to an unknown message (R17).
-    silence: list[list[MessageKind]] = [[], [MessageKind.FEEDBACK]]
+    silence: list[list[Reply]] = [[], [Reply.FEEDBACK]]
     allowed = {
         "same_answer": [[first_answer]],
         "silence": silence,
@@ -167,14 +151,14 @@ def wrong_checksum(bench: Bench) -> None:
     bench.start_transfer(len(image))
     bench.packets(image)
     bench.send(bench.encoder.end())
-    bench.expect(MessageKind.NAK, within_s=bench.limit("complete_s"))
+    bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
     with bench.step("end of transfer again"):
-        _check_second_end(bench, MessageKind.NAK)
+        _check_second_end(bench, Reply.NAK)
     with bench.step("afterwards"):
         within_s = bench.limit("refused_s")
-        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+        reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
         if bench.choice("rs_03") == "announces":  # else it may listen silently
-            bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
+            bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
         bench.wait(bench.host.burst_s)
         runs = bench.application_runs(_NO_APPLICATION_S)
         bench.check(not runs, "no application runs", "it answers" if runs else "no answer")
@@ -205,15 +189,15 @@ def in_a_row(bench: Bench) -> None:
                 # A device that is starting its application receives nothing: repeat the reset until
                 # it answers (4.3).
                 within_s = bench.limit("start_s") + bench.limit("first_version_s")
-                deadline, heard = bench.now + within_s, None
-                while heard is None and bench.now < deadline:
+                deadline, reply = bench.now + within_s, None
+                while reply is None and bench.now < deadline:
                     with bench.tester.collecting_feedback():
                         bench.send(bench.encoder.reset())
-                        kinds = (MessageKind.FEEDBACK, MessageKind.BOOT_VERSION)
-                        heard = bench.wait_for(*kinds, within_s=_RESET_PERIOD_S)
-                if heard is not None and heard.kind is MessageKind.FEEDBACK:
-                    heard = bench.wait_for(MessageKind.BOOT_VERSION)
-                bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
+                        kinds = (Reply.FEEDBACK, Reply.BOOT_VERSION)
+                        reply = bench.wait_for(*kinds, within_s=_RESET_PERIOD_S)
+                if reply is not None and reply.kind is Reply.FEEDBACK:
+                    reply = bench.wait_for(Reply.BOOT_VERSION)
+                bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
             bench.update(len(image))
             bench.packets(image)
             bench.end_transfer()

@@ -24,8 +24,8 @@ from flasher.conformance.wire import (
     UPDATE,
     WRITE,
     Encoder,
-    MessageKind,
     RawFrame,
+    Reply,
     build,
     joined,
     message_crc,
@@ -260,13 +260,13 @@ def padded(bench: Bench) -> None:
         within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
             within_s = min(within_s, bench.limit("pause_s") / 2)
-        heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
-        ok = complies(choice, heard is not None)
-        bench.check(ok, f"end of transfer {choice}", heard or "nothing")
-        if heard is None:
+        reply = bench.wait_for(Reply.COMPLETE, within_s=within_s)
+        ok = complies(choice, reply is not None)
+        bench.check(ok, f"end of transfer {choice}", reply or "nothing")
+        if reply is None:
             bench.end_transfer()
         else:
-            bench.measure(Times.COMPLETE, heard.at - sent.left_at)
+            bench.measure(Times.COMPLETE, reply.at - sent.left_at)
         bench.check_image(image)
 
 
@@ -288,7 +288,7 @@ def back_to_back(bench: Bench) -> None:
         with bench.step(f"{count} times a query, then a packet"):
             # CO-04 checks whether a bootloader answers a query.
             frames = count * query + probe.frames()
-            probe.offer(frames, ACCEPTED, ignoring=(MessageKind.FEEDBACK, MessageKind.OTHER))
+            probe.offer(frames, ACCEPTED, ignoring=(Reply.FEEDBACK, Reply.OTHER))
     with bench.step("the last packet again, then the next one"):
         bench.forget()
         frames, number = probe.frames(), probe.number
@@ -296,7 +296,7 @@ def back_to_back(bench: Bench) -> None:
         first = bench.next_message(bench.limit("ack_s"))
         allowed = bench.repetition_answers(number - 1)
         bench.require(str(first) in allowed, " or ".join(allowed), first or "nothing")
-        bench.expect(MessageKind.ACK, number=number)
+        bench.expect(Reply.ACK, number=number)
 
 
 @case(

@@ -10,9 +10,9 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     joined,
     packet_count,
@@ -62,9 +62,9 @@ class PacketTransfer:
         """Longer than a bootloader waits for the rest of a message."""
         return 2 * self.bench.limit("inter_frame_s")
 
-    def is_accepted(self, heard: Received) -> bool:
+    def is_accepted(self, reply: Received) -> bool:
         """True for the ACK of the next packet."""
-        return heard.kind is MessageKind.ACK and heard.number == self.number
+        return reply.kind is Reply.ACK and reply.number == self.number
 
     def answers(
         self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
@@ -77,12 +77,12 @@ class PacketTransfer:
         bench.send(frames, gap_s=gap_s, gaps=gaps)
         # Long enough that no partial message is left when the next packet arrives.
         deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
-        heard: list[Received] = []
+        replies: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
-            heard.append(one)
+            replies.append(one)
             if self.is_accepted(one):
-                return heard + bench.collect(_QUIET_S)
-        return heard
+                return replies + bench.collect(_QUIET_S)
+        return replies
 
 
 class Probe(PacketTransfer):
@@ -114,11 +114,11 @@ class Probe(PacketTransfer):
             bench.reset_to_bootloader()
             bench.wait_until_listening()
         sent = bench.send(frames)
-        heard = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
-        taken = heard is not None and heard.kind is MessageKind.REQUEST
-        bench.check(complies(wanted, taken), f"update command {wanted}", heard or "no answer")
+        reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
+        taken = reply is not None and reply.kind is Reply.REQUEST
+        bench.check(complies(wanted, taken), f"update command {wanted}", reply or "no answer")
         if not taken:
-            if reset and heard is None:  # by now the application was started
+            if reset and reply is None:  # by now the application was started
                 bench.reset_to_bootloader()
             bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
@@ -134,14 +134,14 @@ class Probe(PacketTransfer):
         is_burst = bench.number("versions") > 1
         half_s = bench.limit("window_s") / 2
         deadline = bench.now + (4 * bench.limit("version_spacing_s") if is_burst else half_s)
-        heard: list[Received] = []
+        replies: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
-            heard.append(one)
-            if one.kind is not MessageKind.NAK:
+            replies.append(one)
+            if one.kind is not Reply.NAK:
                 break
-        ok = all(one.kind in (MessageKind.NAK, MessageKind.BOOT_VERSION) for one in heard)
-        goes_on = not is_burst or (bool(heard) and heard[-1].kind is MessageKind.BOOT_VERSION)
-        bench.require(ok and goes_on, "boot version, at most NAK before it", describe(heard))
+        ok = all(one.kind in (Reply.NAK, Reply.BOOT_VERSION) for one in replies)
+        goes_on = not is_burst or (bool(replies) and replies[-1].kind is Reply.BOOT_VERSION)
+        bench.require(ok and goes_on, "boot version, at most NAK before it", describe(replies))
         bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
 
@@ -174,23 +174,23 @@ class Probe(PacketTransfer):
         *,
         gap_s: float = 0.0,
         gaps: int | None = None,
-        ignoring: Sequence[MessageKind] = (),
+        ignoring: Sequence[Reply] = (),
     ) -> bool:
         """Send `frames` like `answers` and check whether the next packet is accepted as `wanted`;
         if it is not, send it unchanged. Ignores messages of the kinds `ignoring`. Returns whether
         the packet was accepted.
         """
-        heard = self.answers(frames, gap_s=gap_s, gaps=gaps)
-        taken = any(map(self.is_accepted, heard))
-        allowed = (MessageKind.NAK, *ignoring)
-        others = [one for one in heard if one.kind not in allowed and not self.is_accepted(one)]
+        replies = self.answers(frames, gap_s=gap_s, gaps=gaps)
+        taken = any(map(self.is_accepted, replies))
+        allowed = (Reply.NAK, *ignoring)
+        others = [one for one in replies if one.kind not in allowed and not self.is_accepted(one)]
         expected = {
             ACCEPTED: f"ACK {self.number}",
             REJECTED: "NAK or no answer",
             EITHER: f"ACK {self.number}, NAK or no answer",
         }
         ok = complies(wanted, taken) and not others
-        self.bench.check(ok, expected[wanted], describe(heard))
+        self.bench.check(ok, expected[wanted], describe(replies))
         if taken:
             self._note_stored()
         else:
@@ -204,9 +204,9 @@ class Probe(PacketTransfer):
         bench = self.bench
         bench.forget()
         bench.send(frames)
-        heard = bench.collect(self.settle_s())
-        ok = all(one.kind is MessageKind.NAK for one in heard)
-        bench.require(ok, "NAK or no answer", describe(heard))
+        replies = bench.collect(self.settle_s())
+        ok = all(one.kind is Reply.NAK for one in replies)
+        bench.require(ok, "NAK or no answer", describe(replies))
         self.send_next()
 
     def check_stored(self) -> None:

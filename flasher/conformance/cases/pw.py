@@ -13,8 +13,8 @@ from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
 from flasher.conformance.wire import (
     PACKET_BYTES,
     PACKET_FRAMES,
-    MessageKind,
     Received,
+    Reply,
     packet_count,
     version_in,
 )
@@ -118,7 +118,7 @@ def second_cut(bench: Bench) -> None:
         with bench.step("first cut"):
             _upgrade_up_to(bench, upgrade, _Cut(1, 9))
             bench.power_cycle(_OFF_S)
-            bench.await_message(MessageKind.BOOT_VERSION)
+            bench.await_message(Reply.BOOT_VERSION)
         with bench.step(f"second cut {_cut_text(cut, total)}"):
             upgrade.runs = False
             _upgrade_up_to(bench, upgrade, cut)
@@ -219,16 +219,16 @@ def _check_after_cut(
     """Check that the device announces itself (`first` is its boot version) or starts an
     application, and that only a complete image runs.
     """
-    if first is None and bench.wait_for(MessageKind.BOOT_VERSION) is None:
+    if first is None and bench.wait_for(Reply.BOOT_VERSION) is None:
         # RS-05 checks that it should have announced itself.
         upgrade.runs = _check_whole(bench, upgrade)
         bench.require(
-            upgrade.runs, MessageKind.BOOT_VERSION.value, "neither boot version nor application"
+            upgrade.runs, Reply.BOOT_VERSION.value, "neither boot version nor application"
         )
         return
     spacing_s = bench.limit("version_spacing_s") + bench.limit("version_spacing_tolerance_s")
-    heard = bench.collect(bench.host.burst_s + 2 * spacing_s)
-    announced = 1 + sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
+    replies = bench.collect(bench.host.burst_s + 2 * spacing_s)
+    announced = 1 + sum(one.kind is Reply.BOOT_VERSION for one in replies)
     # More than a burst means that it has no application to start.
     upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
     if not upgrade.runs:
@@ -279,8 +279,8 @@ def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     upgrade.end_was_sent = upgrade.runs = False
     bench.reset_to_bootloader()
     bench.wait_until_listening()
-    heard = bench.update(len(upgrade.new))
-    erase_s = heard.at - bench.tester.left_at
+    reply = bench.update(len(upgrade.new))
+    erase_s = reply.at - bench.tester.left_at
     for share in _ERASE_SHARES:
         with bench.step(f"at {share:.0%} of the time until request transfer"):
             _restore_old_image(bench, upgrade)
@@ -325,23 +325,21 @@ def _upgrade_until_cut(bench: Bench, upgrade: _InterruptedUpgrade) -> Received |
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
     sent = bench.send(bench.encoder.update(len(upgrade.new)))
-    heard = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
-    upgrade.was_requested = heard is not None and heard.kind is MessageKind.REQUEST
+    reply = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
+    upgrade.was_requested = reply is not None and reply.kind is Reply.REQUEST
     for number in range(1, packet_count(len(upgrade.new)) + 1):
-        if heard is None or heard.kind is MessageKind.BOOT_VERSION:
-            return heard
+        if reply is None or reply.kind is Reply.BOOT_VERSION:
+            return reply
         bench.send_packet(upgrade.new, number)
-        heard = bench.wait_for(
-            MessageKind.ACK, MessageKind.BOOT_VERSION, within_s=limit("ack_s") + back_s
-        )
-    if heard is None or heard.kind is MessageKind.BOOT_VERSION:
-        return heard
+        reply = bench.wait_for(Reply.ACK, Reply.BOOT_VERSION, within_s=limit("ack_s") + back_s)
+    if reply is None or reply.kind is Reply.BOOT_VERSION:
+        return reply
     upgrade.end_was_sent = True
     bench.send(bench.encoder.end())
-    heard = bench.wait_for(
-        MessageKind.COMPLETE, MessageKind.BOOT_VERSION, within_s=limit("complete_s") + back_s
+    reply = bench.wait_for(
+        Reply.COMPLETE, Reply.BOOT_VERSION, within_s=limit("complete_s") + back_s
     )
-    return heard if heard is not None and heard.kind is MessageKind.BOOT_VERSION else None
+    return reply if reply is not None and reply.kind is Reply.BOOT_VERSION else None
 
 
 def _cut_after_ack(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
@@ -373,7 +371,7 @@ def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         bench.packets(upgrade.new)
         bench.end_transfer()
         bench.power_cycle(_OFF_S)
-        bench.wait_for(MessageKind.BOOT_VERSION)  # without one: RS-05
+        bench.wait_for(Reply.BOOT_VERSION)  # without one: RS-05
         bench.collect(bench.host.burst_s)
         bench.check_image(upgrade.new)
         upgrade.runs = True

@@ -13,9 +13,9 @@ from flasher.conformance.wire import (
     RESET,
     RESET_TEXT,
     WRITE,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     build,
     describe,
     split,
@@ -50,9 +50,9 @@ _LISTENS_S: Final = 16.0
 def reset(bench: Bench) -> None:
     with bench.tester.collecting_feedback():
         sent = bench.send(bench.encoder.reset())
-        feedback = bench.expect(MessageKind.FEEDBACK)
+        feedback = bench.expect(Reply.FEEDBACK)
     bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
-    first = bench.expect(MessageKind.BOOT_VERSION)
+    first = bench.expect(Reply.BOOT_VERSION)
     bench.measure(Times.FIRST, first.at - sent.left_at)
     _check_burst(bench, first)
 
@@ -69,7 +69,7 @@ def reset_again(bench: Bench) -> None:
     count = bench.number("versions")
     with bench.step("two resets in a row"):
         bench.send(bench.encoder.reset() + bench.encoder.reset())
-        first = bench.wait_for(MessageKind.BOOT_VERSION)
+        first = bench.wait_for(Reply.BOOT_VERSION)
         bench.require(first is not None, "boot version", first or "nothing")
         # The second reset may reach a bootloader that already announces itself.
         restarts = bench.choice("rs_02") != "ignored"
@@ -86,7 +86,7 @@ def reset_again(bench: Bench) -> None:
         elif bench.choice("rs_02") == "ignored":
             _check_count(bench, count - 2, "the burst continues")
         else:
-            bench.expect(MessageKind.BOOT_VERSION)
+            bench.expect(Reply.BOOT_VERSION)
             _check_count(bench, count - 1, "a new complete burst")
         bench.check_application()
 
@@ -116,7 +116,7 @@ def no_update(bench: Bench) -> None:
         elif bench.choice("rs_03") == "announces":
             # The document gives no period (R14); each may take as long as the first one.
             more, wanted = 0, 2 * count + 1
-            while more < wanted and bench.wait_for(MessageKind.BOOT_VERSION) is not None:
+            while more < wanted and bench.wait_for(Reply.BOOT_VERSION) is not None:
                 more += 1
             expected = f"it continues to announce: {wanted} more boot versions"
             bench.check(more == wanted, expected, f"{more} boot versions")
@@ -164,7 +164,7 @@ def no_reset(bench: Bench) -> None:
 def power_up(bench: Bench) -> None:
     bench.power_cycle()
     on_at = bench.now
-    first = bench.expect(MessageKind.BOOT_VERSION)
+    first = bench.expect(Reply.BOOT_VERSION)
     bench.measure(Times.POWERED, first.at - on_at)
     _check_burst(bench, first)
 
@@ -183,9 +183,9 @@ def _check_burst(bench: Bench, first: Received) -> None:
             high_s=spacing_s + tolerance_s,
         )
     name = bench.encoder.boot_name
-    for heard in burst:
-        ok = heard.boot_name == name and heard.has_good_version_text
-        bench.check(ok, f"boot version of name {name} and text Vx.x.x", heard)
+    for reply in burst:
+        ok = reply.boot_name == name and reply.has_good_version_text
+        bench.check(ok, f"boot version of name {name} and text Vx.x.x", reply)
     _check_count(bench, 0, f"no more than {count} boot versions")
 
 
@@ -193,16 +193,14 @@ def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
     """Check that exactly `count` boot versions, or one of `others`, and no other messages arrive
     until burst and window are over.
     """
-    heard = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
+    replies = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
     wanted = " or ".join(map(str, (count, *others)))
-    bench.check(_versions(heard) in (count, *others), f"{expected}: {wanted}", describe(heard))
-    bench.check_only(
-        heard, MessageKind.BOOT_VERSION, MessageKind.FEEDBACK, why="nothing but boot versions"
-    )
+    bench.check(_versions(replies) in (count, *others), f"{expected}: {wanted}", describe(replies))
+    bench.check_only(replies, Reply.BOOT_VERSION, Reply.FEEDBACK, why="nothing but boot versions")
 
 
-def _versions(heard: list[Received]) -> int:
-    return sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
+def _versions(replies: list[Received]) -> int:
+    return sum(one.kind is Reply.BOOT_VERSION for one in replies)
 
 
 def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
@@ -210,6 +208,5 @@ def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
     with bench.step(step):
         bench.send(frames)
         bench.expect_silence(
-            ignoring=(MessageKind.FEEDBACK, MessageKind.OTHER, MessageKind.VERSION_INFORMATION),
-            why="no restart",
+            ignoring=(Reply.FEEDBACK, Reply.OTHER, Reply.VERSION_INFORMATION), why="no restart"
         )

@@ -20,9 +20,9 @@ from flasher.conformance.wire import (
     REPORT,
     UPDATE,
     WRITE,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     packet_count,
 )
@@ -80,15 +80,15 @@ def endless(bench: Bench) -> None:
     with bench.step("in a pause of the transfer"):
         if bench.choice("tx_12") == "announces":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            heard = _send_slowly_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
-            bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
+            reply = _send_slowly_until(bench, Reply.BOOT_VERSION, limit_s, [])
+            bench.check(reply is not None, f"boot version within {limit_s:g} s", reply or "none")
         elif bench.choice("tx_12") == "either":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            _send_slowly_until(bench, MessageKind.BOOT_VERSION, limit_s, [])
+            _send_slowly_until(bench, Reply.BOOT_VERSION, limit_s, [])
             bench.collect(2 * bench.limit("inter_frame_s"))
             bench.send_packet(image, len(floods) + 1)
-            heard = bench.wait_for(MessageKind.ACK, MessageKind.BOOT_VERSION)
-            if heard is not None and heard.kind is MessageKind.ACK:
+            reply = bench.wait_for(Reply.ACK, Reply.BOOT_VERSION)
+            if reply is not None and reply.kind is Reply.ACK:
                 bench.finish(image, len(floods) + 2)
             else:  # it gave the transfer up, and may announce itself or listen silently
                 bench.update(len(image))
@@ -106,11 +106,11 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
             bench.send(frames)
     if bench.encoder.has_version_query:
         limit_s = bench.limit("start_s")
-        heard = _send_slowly_until(
-            bench, MessageKind.VERSION_INFORMATION, limit_s, bench.encoder.query_version()
+        reply = _send_slowly_until(
+            bench, Reply.VERSION_INFORMATION, limit_s, bench.encoder.query_version()
         )
         expected = f"an application that answers within {limit_s:g} s"
-        bench.check(heard is not None, expected, heard or "none")
+        bench.check(reply is not None, expected, reply or "none")
         # Many queries were sent: discard late answers.
         bench.collect(bench.limit("silence_s"))
     else:
@@ -120,21 +120,21 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
 
 
 def _send_slowly_until(
-    bench: Bench, kind: MessageKind, within_s: float, query: list[RawFrame]
+    bench: Bench, kind: Reply, within_s: float, query: list[RawFrame]
 ) -> Received | None:
     """Send useless messages slowly, with `query` between them, until `kind` is received."""
     deadline = bench.now + within_s
     encoder = bench.encoder
     drops = cycle((encoder.message(READ, _UNKNOWN), encoder.frames(_HEADS * 2)))
-    heard: Received | None = None
-    while heard is None and bench.now < deadline:
+    reply: Received | None = None
+    while reply is None and bench.now < deadline:
         # A pause, so that the query is not taken for the rest of a partial message.
         bench.send([*next(drops)])
         bench.wait(bench.limit("inter_frame_s") + _SLOW_GAP_S if query else 0.0)
         if query:
             bench.send(query)
-        heard = bench.wait_for(kind, within_s=_SLOW_GAP_S)
-    return heard
+        reply = bench.wait_for(kind, within_s=_SLOW_GAP_S)
+    return reply
 
 
 # -- noise ----------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def noise(bench: Bench) -> None:
         bench.reset_to_bootloader()
         bench.send(bench.encoder.update(len(image)))
         _send_noise(bench)
-        bench.wait_for(MessageKind.REQUEST)
+        bench.wait_for(Reply.REQUEST)
         done = _continue_transfer(bench, image, 0)
     for stored in (1, 3, packet_count(len(image))):
         with bench.step(f"after packet {stored}"):
@@ -185,11 +185,11 @@ def _continue_transfer(bench: Bench, image: bytes, stored: int) -> int:
     bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     if stored < packet_count(len(image)):
         bench.send_packet(image, stored + 1)
-        if bench.wait_for(MessageKind.ACK, unlike=lambda one: one.number != stored + 1) is not None:
+        if bench.wait_for(Reply.ACK, unlike=lambda one: one.number != stored + 1) is not None:
             return stored + 1
     else:
         bench.send(bench.encoder.end())
-        if bench.wait_for(MessageKind.COMPLETE) is not None:
+        if bench.wait_for(Reply.COMPLETE) is not None:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
     done = bench.upgrade(image, blind=bench.choice("up_08") != "rejected")
@@ -264,9 +264,9 @@ def outside(bench: Bench) -> None:
         for number, named in numbers:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, marker))
-                heard = bench.answers()
-                ok = all(one.kind is MessageKind.NAK for one in heard)
-                bench.check(ok, "NAK or silence", describe(heard))
+                replies = bench.answers()
+                ok = all(one.kind is Reply.NAK for one in replies)
+                bench.check(ok, "NAK or silence", describe(replies))
     expected = "none of the rejected data in the flash"
     if not bench.subject.has_readback:
         bench.unsupported(expected, "the bench has no readback")

@@ -7,15 +7,10 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.tm import (
-    check_times,
-    measure_burst,
-    measure_end,
-    measure_packets,
-)
+from flasher.conformance.cases.tm import check_times, measure_burst, measure_end, measure_packets
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
 from flasher.conformance.judge import Times
-from flasher.conformance.wire import MessageKind, reported_version
+from flasher.conformance.wire import Reply, reported_version
 
 _START_AGAIN: Final = "window's end to an application that answers"
 _TAKEN: Final = "last boot version to an update command that is taken"
@@ -69,8 +64,8 @@ def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> 
         bench.wait_until(since + limit_s)
         return
     within_s = _PATIENCE * limit_s
-    heard = bench.host.version_answer(since + within_s - bench.now, every_s=_ASK_S)
-    found = bench.require_received(heard, "an application that answers", within_s)
+    reply = bench.host.version_answer(since + within_s - bench.now, every_s=_ASK_S)
+    found = bench.require_received(reply, "an application that answers", within_s)
     bench.measure(name, max(0.0, found.at - since))
 
 
@@ -98,12 +93,12 @@ def window(bench: Bench) -> None:
     offsets_s += [window_s * (0.95 + 0.1 * (at + 0.5) / close) for at in range(close)]
     for offset_s in sorted(offsets_s):
         with bench.step(f"{offset_s * 1000:.1f} ms after the last boot version"):
-            heard = bench.reset_to_bootloader()
+            reply = bench.reset_to_bootloader()
             for _ in range(bench.number("versions") - 1):
-                heard = bench.next_version()
-            sent = bench.send(frames, at=heard.at + max(offset_s - wire_s, 0.0))
-            at_s = sent.left_at - heard.at
-            request = bench.wait_for(MessageKind.REQUEST)
+                reply = bench.next_version()
+            sent = bench.send(frames, at=reply.at + max(offset_s - wire_s, 0.0))
+            at_s = sent.left_at - reply.at
+            request = bench.wait_for(Reply.REQUEST)
             (not_taken if request is None else taken).append(at_s)
             bench.measure(_NOT_TAKEN if request is None else _TAKEN, at_s)
             got = "rejected" if request is None else "accepted"

@@ -9,12 +9,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import ACCEPTED, EITHER, Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.judge import Times
-from flasher.conformance.wire import (
-    PACKET_FRAMES,
-    MessageKind,
-    Received,
-    packet_count,
-)
+from flasher.conformance.wire import PACKET_FRAMES, Received, Reply, packet_count
 
 _SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
 _RESETS: Final = 5
@@ -109,11 +104,11 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
     last = bench.reset_measured(_PATIENCE * bench.limit("first_version_s"))
     for _ in range(bench.number("versions") - 1):
         within_s = _PATIENCE * bench.limit("version_spacing_s")
-        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
-        if heard is None:
+        reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+        if reply is None:
             break
-        bench.measure(Times.SPACING, heard.at - last.at)
-        last = heard
+        bench.measure(Times.SPACING, reply.at - last.at)
+        last = reply
     if wait:
         bench.collect(bench.host.burst_s)
     return last
@@ -124,14 +119,14 @@ def measure_packets(bench: Bench, image: bytes) -> None:
     limit_s = _PATIENCE * bench.limit("ack_s")
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
-        heard = bench.expect(MessageKind.ACK, within_s=limit_s, number=number)
-        bench.measure(Times.ANSWER, heard.at - sent.left_at)
+        reply = bench.expect(Reply.ACK, within_s=limit_s, number=number)
+        bench.measure(Times.ANSWER, reply.at - sent.left_at)
 
 
 def measure_end(bench: Bench) -> Received:
     """Send end of transfer and measure the time to complete, which is returned."""
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")
-    heard = bench.await_message(MessageKind.COMPLETE, within_s=within_s)
-    bench.measure(Times.COMPLETE, heard.at - sent.left_at)
-    return heard
+    reply = bench.await_message(Reply.COMPLETE, within_s=within_s)
+    bench.measure(Times.COMPLETE, reply.at - sent.left_at)
+    return reply

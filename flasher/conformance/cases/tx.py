@@ -16,9 +16,9 @@ from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     inverted,
     joined,
@@ -71,7 +71,7 @@ def _transfer_stopping_at(bench: Bench, image: bytes, numbers: Iterable[int]) ->
         with bench.step(f"packet {number} as it should be"):
             bench.send_packet(image, number)
             # After a lost frame a NAK may come as late as the next message (FR-05).
-            bench.expect(MessageKind.ACK, number=number, ignoring=(MessageKind.NAK,))
+            bench.expect(Reply.ACK, number=number, ignoring=(Reply.NAK,))
         done = number
     bench.finish(image, done + 1)
 
@@ -83,13 +83,9 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     bench.reset_to_bootloader()
     bench.wait_until_listening()
     bench.send(frames)
-    heard = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
-    positive = [
-        one
-        for one in heard
-        if one.kind in (MessageKind.ACK, MessageKind.COMPLETE, MessageKind.REQUEST)
-    ]
-    bench.check(not positive, "neither ACK nor complete", describe(positive or heard))
+    replies = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
+    positive = [one for one in replies if one.kind in (Reply.ACK, Reply.COMPLETE, Reply.REQUEST)]
+    bench.check(not positive, "neither ACK nor complete", describe(positive or replies))
 
 
 # -- damage ---------------------------------------------------------------------------------------
@@ -177,9 +173,9 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
                 bench.send(bench.encoder.packet(number, total, payload))
-                heard = describe(bench.answers())
+                replies = describe(bench.answers())
                 expected = f"{' or '.join(allowed)} for the repeated packet"
-                bench.check(heard in (*allowed, *more), expected, heard)
+                bench.check(replies in (*allowed, *more), expected, replies)
 
 
 # -- wrong heads ----------------------------------------------------------------------------------
@@ -225,8 +221,8 @@ def out_of_order(bench: Bench) -> None:
                     allowed = [f"ACK {number}"]
                     if choice == "either":
                         allowed += ["nothing", f"NAK {number}", f"NAK {_STORED + 1}"]
-                    heard = describe(bench.answers())
-                    bench.check(heard in allowed, " or ".join(allowed), heard)
+                    replies = describe(bench.answers())
+                    bench.check(replies in allowed, " or ".join(allowed), replies)
 
 
 @case(
@@ -309,12 +305,12 @@ def many_packets(bench: Bench) -> None:
             return
         bench.send(bench.encoder.end())
         within_s = bench.limit("complete_s")
-        heard = bench.wait_for(MessageKind.COMPLETE, MessageKind.NAK, within_s=within_s)
-        if heard is not None and heard.kind is MessageKind.NAK:
+        reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
+        if reply is not None and reply.kind is Reply.NAK:
             why = "the device rejects the padded good image by a check of its own"
             bench.unsupported("the largest image runs", why)
             return
-        bench.require_received(heard, MessageKind.COMPLETE.value, within_s)
+        bench.require_received(reply, Reply.COMPLETE.value, within_s)
         bench.check_image(whole)
 
 
@@ -323,11 +319,11 @@ def _send_all(bench: Bench, image: bytes) -> bool:
     total = packet_count(len(image))
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
-        heard = bench.next_message(bench.limit("ack_s"))
-        if heard is None or (heard.kind, heard.number) != (MessageKind.ACK, number):
-            bench.fail(f"ACK {number}", heard or "nothing")
+        reply = bench.next_message(bench.limit("ack_s"))
+        if reply is None or (reply.kind, reply.number) != (Reply.ACK, number):
+            bench.fail(f"ACK {number}", reply or "nothing")
             return False
-        bench.measure(Times.ANSWER, heard.at - sent.left_at)
+        bench.measure(Times.ANSWER, reply.at - sent.left_at)
     bench.succeed(f"ACK 1 to {total}", "all of them")
     return True
 
@@ -365,13 +361,13 @@ def other_filler(bench: Bench) -> None:
     bench.packets(image, 1, total - 1)
     bench.send(bench.encoder.packet(total, total, rest.ljust(PACKET_BYTES, b"\x00")))
     if bench.choice("tx_08") == "either":
-        heard = bench.next_message(bench.limit("ack_s"))
-        is_there = heard is None or heard.kind is MessageKind.NAK or str(heard) == f"ACK {total}"
-        bench.check(is_there, f"ACK {total}, NAK or silence", heard or "nothing")
-        taken = heard is not None and heard.kind is MessageKind.ACK
+        reply = bench.next_message(bench.limit("ack_s"))
+        is_there = reply is None or reply.kind is Reply.NAK or str(reply) == f"ACK {total}"
+        bench.check(is_there, f"ACK {total}, NAK or silence", reply or "nothing")
+        taken = reply is not None and reply.kind is Reply.ACK
         bench.finish(image, total + 1 if taken else total)
     elif bench.choice("tx_08") == "ignored":
-        bench.expect(MessageKind.ACK, number=total)
+        bench.expect(Reply.ACK, number=total)
         bench.finish(image, total + 1)
     else:
         bench.check_packet_rejected(total, total)
@@ -438,8 +434,8 @@ def _announces(bench: Bench) -> None:
             bench.packets(image, 2 if stored == 1 else 1, stored)
             began_at = bench.now
             within_s = pause_s + bench.limit("first_version_s")
-            heard = bench.expect(MessageKind.BOOT_VERSION, within_s=within_s)
-            bench.measure("pause to boot version", heard.at - began_at)
+            reply = bench.expect(Reply.BOOT_VERSION, within_s=within_s)
+            bench.measure("pause to boot version", reply.at - began_at)
     with bench.step("upgrade after the pauses"):
         bench.update(len(bench.good_image))
         bench.finish(bench.good_image)
@@ -458,9 +454,9 @@ def _announces_or_waits(bench: Bench) -> None:
     for stored in (1, packet_count(len(image))):
         with bench.step(_step_text("a pause", stored)):
             bench.packets(image, 2, stored)
-            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=pause_s)
-            bench.info(f"after {pause_s:g} s: {heard or 'nothing'}")
-            if heard is not None:
+            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=pause_s)
+            bench.info(f"after {pause_s:g} s: {reply or 'nothing'}")
+            if reply is not None:
                 bench.update(len(image))
                 bench.packets(image, 1, stored)
     bench.finish(image, packet_count(len(image)) + 1)
@@ -469,7 +465,7 @@ def _announces_or_waits(bench: Bench) -> None:
         bench.packet(image, 1)
         bench.send(bench.encoder.update(len(image)))
         within_s = bench.limit("pause_s") / 2
-        if bench.wait_for(MessageKind.REQUEST, within_s=within_s) is None:
+        if bench.wait_for(Reply.REQUEST, within_s=within_s) is None:
             bench.unsupported("a new upgrade after a pause", "an update command does not start one")
             return
         bench.packet(image, 1)
@@ -526,10 +522,10 @@ def reset(bench: Bench) -> None:
             if choice == "ignored":
                 bench.expect_silence(why="silence, no restart")
                 continue
-            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
             if choice == "restarts":
-                bench.require_received(heard, MessageKind.BOOT_VERSION.value, within_s)
-            if heard is not None:
+                bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
+            if reply is not None:
                 bench.update(len(image))
                 bench.packets(image, 1, stored)
     bench.finish(image, total + 1)
@@ -549,17 +545,17 @@ def _reset_while_it_erases(bench: Bench) -> None:
     # Boot versions sent before the update command arrived do not count (R11).
     bench.wait(UPDATE_SPACING_S)
     within_s = bench.limit("erase_s") + bench.limit("first_version_s")
-    heard = bench.wait_for(MessageKind.REQUEST, MessageKind.BOOT_VERSION, within_s=within_s)
-    found = bench.require_received(heard, "request transfer, or boot version", within_s)
+    reply = bench.wait_for(Reply.REQUEST, Reply.BOOT_VERSION, within_s=within_s)
+    found = bench.require_received(reply, "request transfer, or boot version", within_s)
     restarts: Received | None = found
-    if found.kind is MessageKind.REQUEST and bench.choice("tx_13") != "ignored":
+    if found.kind is Reply.REQUEST and bench.choice("tx_13") != "ignored":
         # The device may process the reset after the erase; earlier boot versions do not count.
         restarts = bench.wait_for(
-            MessageKind.BOOT_VERSION,
+            Reply.BOOT_VERSION,
             within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),
             unlike=lambda one: one.at < found.at + LEFTOVER_S,
         )
-    if restarts is not None and restarts.kind is MessageKind.BOOT_VERSION:
+    if restarts is not None and restarts.kind is Reply.BOOT_VERSION:
         bench.update(len(image))
     bench.finish(image)
 

@@ -12,9 +12,9 @@ from flasher.conformance.wire import (
     READ,
     UPDATE,
     WRITE,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     inverted,
     packet_count,
@@ -89,9 +89,7 @@ def without_reset(bench: Bench) -> None:
     for step, frames in bench.encoder.upgrade_messages(len(image)).items():
         with bench.step(step), bench.tester.collecting_feedback():
             bench.send(frames)
-            _check_answer(
-                bench, bench.collect(bench.limit("silence_s")), MessageKind.FEEDBACK, choice
-            )
+            _check_answer(bench, bench.collect(bench.limit("silence_s")), Reply.FEEDBACK, choice)
     bench.check_application()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
@@ -221,10 +219,10 @@ def in_transfer(bench: Bench) -> None:
             bench.packets(begun, 1, _FIRST_PACKETS)
             bench.send(bench.encoder.update(len(image) if starts_over else size))
             if starts_over:
-                bench.expect(MessageKind.REQUEST)
+                bench.expect(Reply.REQUEST)
                 bench.finish(image)
             else:
-                bench.expect_silence(ignoring=(MessageKind.NAK,), why="no request transfer")
+                bench.expect_silence(ignoring=(Reply.NAK,), why="no request transfer")
                 bench.finish(image, _FIRST_PACKETS + 1)
     if starts_over:
         with bench.step("many in a row"):
@@ -232,7 +230,7 @@ def in_transfer(bench: Bench) -> None:
             for _ in range(_MANY):
                 bench.packet(image, 1)
                 bench.send(bench.encoder.update(len(image)))
-                bench.expect(MessageKind.REQUEST)
+                bench.expect(Reply.REQUEST)
             bench.finish(image)
 
 
@@ -244,14 +242,12 @@ def _starts_over(bench: Bench) -> bool:
     bench.start_transfer(len(image))
     bench.packets(image, 1, _FIRST_PACKETS)
     bench.send(bench.encoder.update(len(image)))
-    heard = bench.wait_for(MessageKind.REQUEST, within_s=bench.limit("pause_s") / 2)
-    if heard is None:
+    reply = bench.wait_for(Reply.REQUEST, within_s=bench.limit("pause_s") / 2)
+    if reply is None:
         bench.send_packet(image, number)
-        heard = bench.wait_for(
-            MessageKind.ACK, MessageKind.REQUEST, within_s=bench.limit("erase_s")
-        )
-    found = bench.require_received(heard, "request transfer, or the transfer continues", 0.0)
-    starts_over = found.kind is MessageKind.REQUEST
+        reply = bench.wait_for(Reply.ACK, Reply.REQUEST, within_s=bench.limit("erase_s"))
+    found = bench.require_received(reply, "request transfer, or the transfer continues", 0.0)
+    starts_over = found.kind is Reply.REQUEST
     bench.info("the device starts over" if starts_over else "the device continues")
     bench.finish(image, 1 if starts_over else number + 1)
     return starts_over
@@ -262,21 +258,17 @@ def _finish_requested(bench: Bench, choice: str) -> None:
     again at a second one (R16); `choice` says how many may come.
     """
     image = bench.good_image
-    heard = bench.collect(_SOON_S)
-    bench.check_only(
-        heard, MessageKind.BOOT_VERSION, MessageKind.REQUEST, why="request transfer, or nothing"
-    )
-    more = sum(one.kind is MessageKind.REQUEST for one in heard)
+    replies = bench.collect(_SOON_S)
+    bench.check_only(replies, Reply.BOOT_VERSION, Reply.REQUEST, why="request transfer, or nothing")
+    more = sum(one.kind is Reply.REQUEST for one in replies)
     copies = 0
     acknowledged: Received | None = None
     while acknowledged is None:
         copies += 1
         sent = bench.send_packet(image, 1)
-        found = bench.wait_for(
-            MessageKind.ACK, MessageKind.REQUEST, within_s=bench.limit("erase_s")
-        )
+        found = bench.wait_for(Reply.ACK, Reply.REQUEST, within_s=bench.limit("erase_s"))
         found = bench.require_received(found, "ACK 1, or request transfer", bench.limit("erase_s"))
-        if found.kind is MessageKind.ACK:
+        if found.kind is Reply.ACK:
             acknowledged = found
         else:
             more += 1
@@ -286,7 +278,7 @@ def _finish_requested(bench: Bench, choice: str) -> None:
         bench.measure(Times.ANSWER, acknowledged.at - sent.left_at)
     else:  # each of them may be answered (R10)
         late = bench.collect(_SOON_S)
-        bench.check_only(late, MessageKind.ACK, MessageKind.NAK, why="answers to packet 1")
+        bench.check_only(late, Reply.ACK, Reply.NAK, why="answers to packet 1")
     wanted = {"once": (0,), "each": (1,)}.get(choice, (0, 1))
     bench.check(more in wanted, f"request transfer more than once: {choice}", f"{more} times more")
     bench.finish(image, 2)
@@ -304,7 +296,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
         return
     # A device that accepted it against the profile has no application when this time is over.
     within_s = limit("erase_s") if choice == "either" else limit("silence_s")
-    request = bench.wait_for(MessageKind.REQUEST, within_s=within_s)
+    request = bench.wait_for(Reply.REQUEST, within_s=within_s)
     ok = request is None or choice == "either"
     bench.check(ok, f"update command {choice}", request or "no request transfer")
     if request is None:
@@ -315,15 +307,15 @@ def _offer_update(bench: Bench, choice: str) -> None:
 
 def _expect_request(bench: Bench) -> None:
     """Expect request transfer, ignoring boot versions still on their way."""
-    bench.expect(MessageKind.REQUEST, ignoring=(MessageKind.BOOT_VERSION,))
+    bench.expect(Reply.REQUEST, ignoring=(Reply.BOOT_VERSION,))
 
 
 def _enter_at(bench: Bench, version: int) -> float:
     """Reset, wait for boot version number `version` of the burst (from 1) and return its time."""
-    heard = bench.reset_to_bootloader()
+    reply = bench.reset_to_bootloader()
     for _ in range(version - 1):
-        heard = bench.next_version()
-    return heard.at
+        reply = bench.next_version()
+    return reply.at
 
 
 def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
@@ -333,14 +325,14 @@ def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> No
     with bench.step(step):
         bench.reset_to_bootloader()
         bench.send(frames)
-        heard = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
-        answers = [one for one in heard if one.kind is not MessageKind.BOOT_VERSION]
-        _check_answer(bench, answers, MessageKind.NAK, bench.choice("up_02"), "rejected by ")
+        replies = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
+        answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
+        _check_answer(bench, answers, Reply.NAK, bench.choice("up_02"), "rejected by ")
         bench.check_image(bench.good_image)
 
 
 def _check_answer(
-    bench: Bench, answers: list[Received], kind: MessageKind, choice: str, prefix: str = ""
+    bench: Bench, answers: list[Received], kind: Reply, choice: str, prefix: str = ""
 ) -> None:
     """Check for one message of `kind` or none, as `choice` says: "silence", "either" or a word for
     the message.

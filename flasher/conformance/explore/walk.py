@@ -29,9 +29,9 @@ from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.profile import choice_words
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    MessageKind,
     RawFrame,
     Received,
+    Reply,
     describe,
     inverted,
     joined,
@@ -186,20 +186,18 @@ class Walk:
     ) -> Received | None:
         """Judge all messages until one satisfies `until`, which is returned, or time runs out."""
         deadline = self.bench.now + within_s
-        while (heard := self.bench.next_message(deadline - self.bench.now)) is not None:
-            self._judge(heard)
-            if until is not None and until(heard):
-                return heard
+        while (reply := self.bench.next_message(deadline - self.bench.now)) is not None:
+            self._judge(reply)
+            if until is not None and until(reply):
+                return reply
         return None
 
-    def _await(
-        self, kind: MessageKind, within_s: float, after: str, number: int | None = None
-    ) -> None:
+    def _await(self, kind: Reply, within_s: float, after: str, number: int | None = None) -> None:
         """Wait for a message of `kind`. Raises Violation without one."""
-        heard = self._listen(
+        reply = self._listen(
             within_s, lambda one: one.kind is kind and number in (None, one.number)
         )
-        if heard is None:
+        if reply is None:
             named = kind.value if number is None else f"{kind.value} {number}"
             raise Violation(f"no {kind.value}", f"no {named} within {within_s:g} s after {after}")
         self._answered_at = self.bench.now
@@ -214,56 +212,56 @@ class Walk:
         self._listen(max(bench.limit("ack_s"), broken_s))
         self._naks_due = 0
 
-    def _judge(self, heard: Received) -> None:
-        match heard.kind:
-            case MessageKind.FEEDBACK:
+    def _judge(self, reply: Received) -> None:
+        match reply.kind:
+            case Reply.FEEDBACK:
                 if not self._feedback_due:
                     raise Violation("feedback", "general feedback without a write")
                 self._feedback_due -= 1
-            case MessageKind.BOOT_VERSION:
-                self._judge_version(heard)
-            case MessageKind.REQUEST:
+            case Reply.BOOT_VERSION:
+                self._judge_version(reply)
+            case Reply.REQUEST:
                 if not self._updates_unanswered:
                     raise Violation("request", "request transfer without a valid update command")
                 self._updates_unanswered -= 1
-                self._begin_transfer(heard.at)
-            case MessageKind.ACK | MessageKind.NAK:
-                self._judge_number(heard)
-            case MessageKind.COMPLETE:
+                self._begin_transfer(reply.at)
+            case Reply.ACK | Reply.NAK:
+                self._judge_number(reply)
+            case Reply.COMPLETE:
                 if not self._may_complete:
                     raise Violation("complete", "complete without all packets and a valid end")
-            case MessageKind.OTHER if heard.can_id in self._nodes_asked:
+            case Reply.OTHER if reply.can_id in self._nodes_asked:
                 pass
-            case MessageKind.DAMAGED if self._may_send_partial:
+            case Reply.DAMAGED if self._may_send_partial:
                 self._may_send_partial = False
-            case MessageKind.OTHER | MessageKind.DAMAGED:
-                raise Violation("form", f"{heard}: no message that a device sends")
+            case Reply.OTHER | Reply.DAMAGED:
+                raise Violation("form", f"{reply}: no message that a device sends")
 
-    def _judge_number(self, heard: Received) -> None:
-        if heard.kind is MessageKind.ACK:
-            if not self._acks_due[heard.number]:
-                raise Violation("ack", f"{heard} without such a packet that is valid")
-            self._acks_due[heard.number] -= 1
-            if heard.number == self._stored + 1:
+    def _judge_number(self, reply: Received) -> None:
+        if reply.kind is Reply.ACK:
+            if not self._acks_due[reply.number]:
+                raise Violation("ack", f"{reply} without such a packet that is valid")
+            self._acks_due[reply.number] -= 1
+            if reply.number == self._stored + 1:
                 self._store()
             return
         allowed = self._nak_numbers
-        if not self._naks_due or not (allowed is None or heard.number in allowed):
-            raise Violation("nak", f"{heard} without a message that has to be refused")
+        if not self._naks_due or not (allowed is None or reply.number in allowed):
+            raise Violation("nak", f"{reply} without a message that has to be refused")
         self._naks_due -= 1
 
-    def _judge_version(self, heard: Received) -> None:
-        is_leftover = heard.at < self._requested_at + LEFTOVER_S and not self._may_restart
+    def _judge_version(self, reply: Received) -> None:
+        is_leftover = reply.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
-            raise Violation("restart", f"{heard} without a reset, a pause or power, in the phase: "
+            raise Violation("restart", f"{reply} without a reset, a pause or power, in the phase: "
                             f"{self.phase.value}")  # fmt: skip
-        if heard.boot_name != self.bench.encoder.boot_name or not heard.has_good_version_text:
-            raise Violation("form", f"{heard} is not of the form Vx.x.x of this device")
+        if reply.boot_name != self.bench.encoder.boot_name or not reply.has_good_version_text:
+            raise Violation("form", f"{reply} is not of the form Vx.x.x of this device")
         self.phase = DevicePhase.ANNOUNCING
-        self._version_at = heard.at
+        self._version_at = reply.at
         self._may_complete = False
         self._acks_due.clear()
 
@@ -291,7 +289,7 @@ class Walk:
             feedback_due = self._feedback_due
             self._may_restart = True
             bench.send(bench.encoder.reset())
-            self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+            self._await(Reply.BOOT_VERSION, bench.limit("first_version_s"), "reset")
             self._may_restart = False
             if self._feedback_due == feedback_due:
                 raise Violation("no feedback", "no general feedback to a reset of the application")
@@ -300,7 +298,7 @@ class Walk:
         self._may_restart = self._may_send_partial = choice != "ignored"
         bench.send(bench.encoder.reset())
         if choice == "restarts":
-            self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+            self._await(Reply.BOOT_VERSION, bench.limit("first_version_s"), "reset")
         else:
             self._listen_for_answers()
             if choice not in ("", "ignored") and self.phase is before:
@@ -319,20 +317,18 @@ class Walk:
         bench.send(bench.encoder.reset())
         if argument == "twice":
             bench.send(bench.encoder.reset())
-        heard = bench.collect(bench.limit("first_version_s"))
+        replies = bench.collect(bench.limit("first_version_s"))
         if argument == "twice":
-            versions = sum(one.kind is MessageKind.BOOT_VERSION for one in heard)
+            versions = sum(one.kind is Reply.BOOT_VERSION for one in replies)
             bursts = 1 if bench.choice("rs_02") == "ignored" else 2
             if versions > bursts * bench.number("versions"):
                 raise Violation("burst", f"{versions} boot versions after two resets")
             self._feedback_due = 0
             self.check_application()
             return
-        times = [one.at for one in heard if one.kind is MessageKind.BOOT_VERSION]
-        if [one.kind for one in heard[:1]] != [MessageKind.FEEDBACK] or len(times) != len(
-            heard
-        ) - 1:
-            raise Violation("burst", f"after a reset: {describe(heard)}")
+        times = [one.at for one in replies if one.kind is Reply.BOOT_VERSION]
+        if [one.kind for one in replies[:1]] != [Reply.FEEDBACK] or len(times) != len(replies) - 1:
+            raise Violation("burst", f"after a reset: {describe(replies)}")
         if len(times) != bench.number("versions"):
             raise Violation("burst", f"{len(times)} boot versions after a reset")
         spacing_s, off_s = bench.limit("version_spacing_s"), bench.port.uncertainty_s
@@ -350,7 +346,7 @@ class Walk:
         self._acks_due.clear()
         self._updates_unanswered = self._naks_due = self._feedback_due = 0
         self._may_restart = self._may_send_partial = True
-        self._await(MessageKind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
+        self._await(Reply.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
         self._may_restart = False
 
     def _wait(self, argument: str) -> None:
@@ -367,7 +363,7 @@ class Walk:
             return
         self._may_restart = True
         if choice == "announces":
-            self._await(MessageKind.BOOT_VERSION, within_s, "the last packet")
+            self._await(Reply.BOOT_VERSION, within_s, "the last packet")
         else:
             self.phase = DevicePhase.UNCLEAR
             self._listen(within_s)
@@ -395,10 +391,10 @@ class Walk:
         within_s = 4 * bench.limit("version_spacing_s")
         if self.has_application is False:  # it may restart just now
             within_s = bench.limit("first_version_s")
-        heard = self._listen(within_s, lambda one: one.kind is MessageKind.BOOT_VERSION)
-        if heard is None and self.has_application:  # its window is over, or nearly
+        reply = self._listen(within_s, lambda one: one.kind is Reply.BOOT_VERSION)
+        if reply is None and self.has_application:  # its window is over, or nearly
             self._await_start()
-        elif heard is None and self.has_application is None:
+        elif reply is None and self.has_application is None:
             self.phase = DevicePhase.UNCLEAR
 
     def _update(self, argument: str) -> None:
@@ -420,18 +416,18 @@ class Walk:
             self._updates_unanswered += 1
             self._naks_due, self._nak_numbers = 1, None
             bench.send(frames)
-            self._listen(bench.limit("erase_s"), lambda one: one.kind is MessageKind.REQUEST)
+            self._listen(bench.limit("erase_s"), lambda one: one.kind is Reply.REQUEST)
             return
         for _ in range(_UPDATES_MAX):
             self._updates_unanswered += 1
             sent = bench.send(frames)
-            heard = self._listen(
+            reply = self._listen(
                 bench.limit("erase_s"),
                 partial(_answers_update, not_before=sent.left_at + UPDATE_SPACING_S),
             )
-            if heard is None or heard.kind is MessageKind.REQUEST:
+            if reply is None or reply.kind is Reply.REQUEST:
                 break
-            is_late = heard.at > sent.left_at + LEFTOVER_S
+            is_late = reply.at > sent.left_at + LEFTOVER_S
             if is_late and bench.choice("up_04_burst") == "accepted":
                 break
             self._feedback_due += 1
@@ -439,7 +435,7 @@ class Walk:
             raise Violation("no request", "no request transfer after a valid update command")
         # A second erase for the second command is correct too (R25).
         while self._updates_unanswered and self._listen(
-            LEFTOVER_S, lambda one: one.kind is MessageKind.REQUEST
+            LEFTOVER_S, lambda one: one.kind is Reply.REQUEST
         ):
             pass
 
@@ -456,12 +452,10 @@ class Walk:
         self._updates_unanswered += 1
         bench.send(frames)
         if choice == "starts_over":
-            self._await(
-                MessageKind.REQUEST, bench.limit("erase_s"), "an update command in a transfer"
-            )
+            self._await(Reply.REQUEST, bench.limit("erase_s"), "an update command in a transfer")
             return
         self._may_restart = True  # one that ignores it has a long pause now
-        if not self._listen(bench.limit("erase_s"), lambda one: one.kind is MessageKind.REQUEST):
+        if not self._listen(bench.limit("erase_s"), lambda one: one.kind is Reply.REQUEST):
             self.phase = DevicePhase.UNCLEAR
 
     def _update_reset(self, _: str) -> None:
@@ -476,11 +470,10 @@ class Walk:
         self._feedback_due += 2
         self._may_restart = True
         bench.send([*bench.encoder.update(len(bench.good_image)), *bench.encoder.reset()])
-        heard = self._listen(
-            bench.limit("erase_s"),
-            lambda one: one.kind in (MessageKind.REQUEST, MessageKind.BOOT_VERSION),
+        reply = self._listen(
+            bench.limit("erase_s"), lambda one: one.kind in (Reply.REQUEST, Reply.BOOT_VERSION)
         )
-        if heard is None:
+        if reply is None:
             raise Violation("no request", "nothing after an update command and a reset behind it")
         self.phase, self.has_application, self.update_accepted = DevicePhase.UNCLEAR, None, True
         self._may_restart = True
@@ -508,10 +501,10 @@ class Walk:
         if not is_end:
             self._update_image = self._image_of("good")
         within_s = bench.limit("erase_s") + bench.limit("first_version_s")
-        ends = (MessageKind.BOOT_VERSION, MessageKind.REQUEST, MessageKind.COMPLETE)
-        heard = self._listen(within_s, lambda one: one.kind in ends)
+        ends = (Reply.BOOT_VERSION, Reply.REQUEST, Reply.COMPLETE)
+        reply = self._listen(within_s, lambda one: one.kind in ends)
         if not bench.subject.take_cut():  # it does less operations than that
-            if heard is not None and heard.kind is MessageKind.COMPLETE:
+            if reply is not None and reply.kind is Reply.COMPLETE:
                 self._completed()
             return
         self._updates_unanswered = 0
@@ -577,7 +570,7 @@ class Walk:
         self._naks_due, self._nak_numbers = int(not is_next), None
         bench.send(frames or self.bench.encoder.frames(self._place.packet(number)), gap_s=gap_s)
         if is_next:
-            self._await(MessageKind.ACK, bench.limit("ack_s"), f"packet {number}", number)
+            self._await(Reply.ACK, bench.limit("ack_s"), f"packet {number}", number)
         else:
             if self.phase is DevicePhase.STORED:  # the last packet again
                 self._acks_due[number] += 1
@@ -692,12 +685,10 @@ class Walk:
         bench.send(frames)
         if refused:
             self._may_restart = True
-            self._await(
-                MessageKind.NAK, bench.limit("complete_s"), "an image whose checksum is wrong"
-            )
+            self._await(Reply.NAK, bench.limit("complete_s"), "an image whose checksum is wrong")
             self.phase = DevicePhase.UNCLEAR
             return
-        self._await(MessageKind.COMPLETE, bench.limit("complete_s"), "the end of the transfer")
+        self._await(Reply.COMPLETE, bench.limit("complete_s"), "the end of the transfer")
         self.phase, self._may_restart = DevicePhase.UNCLEAR, True
         if argument == "twice":
             self._feedback_due += 1
@@ -732,10 +723,10 @@ class Walk:
         self._listen_for_answers()
 
 
-def _answers_update(heard: Received, not_before: float) -> bool:
+def _answers_update(reply: Received, not_before: float) -> bool:
     """True for request transfer, and for a boot version sent after the update command."""
-    is_later = heard.kind is MessageKind.BOOT_VERSION and heard.at >= not_before
-    return is_later or heard.kind is MessageKind.REQUEST
+    is_later = reply.kind is Reply.BOOT_VERSION and reply.at >= not_before
+    return is_later or reply.kind is Reply.REQUEST
 
 
 STEPS: Final = (

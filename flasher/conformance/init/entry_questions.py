@@ -12,14 +12,7 @@ from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import Times
 from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
-from flasher.conformance.wire import (
-    IMAGE_BYTES_MAX,
-    WRITE,
-    MessageKind,
-    RawFrame,
-    Received,
-    packet_count,
-)
+from flasher.conformance.wire import IMAGE_BYTES_MAX, WRITE, RawFrame, Received, Reply, packet_count
 
 _TOLERANCE_S: Final = 0.005
 """Smallest tolerance to write: a boot version may wait for other frames."""
@@ -45,7 +38,7 @@ def burst(session: InitSession) -> Findings:
         if turn == "power":
             bench.power_cycle()
             on_at = bench.now
-            first = bench.await_message(MessageKind.BOOT_VERSION)
+            first = bench.await_message(Reply.BOOT_VERSION)
             bench.measure(Times.POWERED, first.at - on_at)
         else:
             first = session.enter()
@@ -92,9 +85,9 @@ def upgrade(session: InitSession) -> Findings:
         session.packets()
         bench.end_transfer()
         complete_at = bench.now
-        heard = _first_sign(session)
-        if heard is not None and heard.kind is MessageKind.BOOT_VERSION:
-            bench.measure(Times.RESTARTED, heard.at - complete_at)
+        reply = _first_sign(session)
+        if reply is not None and reply.kind is Reply.BOOT_VERSION:
+            bench.measure(Times.RESTARTED, reply.at - complete_at)
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
             yield Trial("starts", "no boot version", "complete", "after")
@@ -108,15 +101,13 @@ def _first_sign(session: InitSession) -> Received | None:
     bench = session.bench
     if not bench.encoder.has_version_query:
         within_s = max(bench.limit("first_version_s"), _RESTART_S)
-        return bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+        return bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
     deadline = bench.now + bench.limit("start_s")
-    heard: Received | None = None
-    while heard is None and bench.now < deadline:
+    reply: Received | None = None
+    while reply is None and bench.now < deadline:
         bench.send(bench.encoder.query_version())
-        heard = bench.wait_for(
-            MessageKind.BOOT_VERSION, MessageKind.VERSION_INFORMATION, within_s=0.05
-        )
-    return heard
+        reply = bench.wait_for(Reply.BOOT_VERSION, Reply.VERSION_INFORMATION, within_s=0.05)
+    return reply
 
 
 # -- the window -----------------------------------------------------------------------------------
@@ -198,14 +189,14 @@ def _offer_at(session: InitSession, offset_s: float) -> tuple[float, bool]:
     wire_s = bench.tester.wire_s(frames)
     last = session.enter(bench.number("versions"))
     sent = bench.send(frames, at=last.at + max(offset_s - wire_s, 0.0))
-    heard = bench.wait_for(MessageKind.REQUEST)
-    if heard is None:
+    reply = bench.wait_for(Reply.REQUEST)
+    if reply is None:
         session.await_application()
     else:
-        bench.measure(Times.REQUEST, heard.at - sent.left_at)
+        bench.measure(Times.REQUEST, reply.at - sent.left_at)
         session.stored = 0
         session.finish()
-    return sent.left_at - last.at, heard is not None
+    return sent.left_at - last.at, reply is not None
 
 
 # -- what is not taken ----------------------------------------------------------------------------
@@ -241,8 +232,8 @@ def rejected_update(session: InitSession) -> Findings:
         for _ in range(REPEATS):
             session.enter()
             bench.send(frames)
-            heard = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
-            answers = [one for one in heard if one.kind is not MessageKind.BOOT_VERSION]
+            replies = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
+            answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
             yield Trial(_choice_for(answers), answer_text(answers), stimulus)
             session.await_application()
 
@@ -274,9 +265,9 @@ def update_twice(session: InitSession) -> Findings:
         session.enter()
         bench.wait_for_window()
         bench.send(update + update)
-        first = bench.wait_for(MessageKind.REQUEST)
+        first = bench.wait_for(Reply.REQUEST)
         more = [] if first is None else bench.collect(bench.limit("erase_s"))
-        count = (first is not None) + sum(one.kind is MessageKind.REQUEST for one in more)
+        count = (first is not None) + sum(one.kind is Reply.REQUEST for one in more)
         value = {1: "once", 2: "each"}.get(count, "")
         answer = f"request transfer {count} times"
         yield Trial(value, answer, "two update commands in a row")
@@ -292,17 +283,19 @@ def application(session: InitSession) -> Findings:
             bench.forget()
             with bench.tester.collecting_feedback():
                 bench.send(frames)
-                heard = bench.collect(bench.limit("silence_s"))
-            yield Trial(_choice_for(heard), answer_text(heard), f"{stimulus} to the application")
+                replies = bench.collect(bench.limit("silence_s"))
+            yield Trial(
+                _choice_for(replies), answer_text(replies), f"{stimulus} to the application"
+            )
     session.await_application()
 
 
-def _choice_for(heard: list[Received]) -> str:
+def _choice_for(replies: list[Received]) -> str:
     """The value for one answer or silence; "" for anything else."""
-    if not heard:
+    if not replies:
         return "silence"
-    names = {MessageKind.NAK: "nak", MessageKind.FEEDBACK: "feedback"}
-    return names.get(heard[0].kind, "") if len(heard) == 1 else ""
+    names = {Reply.NAK: "nak", Reply.FEEDBACK: "feedback"}
+    return names.get(replies[0].kind, "") if len(replies) == 1 else ""
 
 
 # -- without an application -----------------------------------------------------------------------
@@ -333,11 +326,11 @@ def without_application(session: InitSession) -> Findings:
         bench.leave_transfer()
         more, last_at = 0, bench.now
         while more < 2 * count:
-            heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=_SILENT_S)
-            if heard is None:
+            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_SILENT_S)
+            if reply is None:
                 break
-            bench.measure(Times.GAP, heard.at - last_at)
-            more, last_at = more + 1, heard.at
+            bench.measure(Times.GAP, reply.at - last_at)
+            more, last_at = more + 1, reply.at
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
         stimulus = "the first one, without an application"
@@ -391,15 +384,15 @@ def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float
     bench.forget()
     sent = bench.send(frames)
     deadline, versions = sent.left_at + within_s, 0
-    kinds = (MessageKind.REQUEST, MessageKind.NAK, MessageKind.BOOT_VERSION)
+    kinds = (Reply.REQUEST, Reply.NAK, Reply.BOOT_VERSION)
     while versions < 3:
-        heard = bench.wait_for(*kinds, within_s=deadline - bench.now)
-        if heard is None or heard.kind is MessageKind.NAK:
+        reply = bench.wait_for(*kinds, within_s=deadline - bench.now)
+        if reply is None or reply.kind is Reply.NAK:
             break
-        if heard.kind is MessageKind.REQUEST:
-            bench.measure(Times.REQUEST, heard.at - sent.left_at)
+        if reply.kind is Reply.REQUEST:
+            bench.measure(Times.REQUEST, reply.at - sent.left_at)
             return True
-        versions += heard.at > sent.left_at + UPDATE_SPACING_S
+        versions += reply.at > sent.left_at + UPDATE_SPACING_S
     return False
 
 

@@ -13,13 +13,7 @@ from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import (
-    DeviceDecoder,
-    MessageKind,
-    RawFrame,
-    Received,
-    describe,
-)
+from flasher.conformance.wire import DeviceDecoder, RawFrame, Received, Reply, describe
 
 REPEATS: Final = 3
 """How often to repeat a trial."""
@@ -48,7 +42,7 @@ class InitSession(PacketTransfer):
         bench = self.bench
         if not bench.encoder.has_version_query:
             quiet_s = max(bench.limit("first_version_s"), _QUIET_START_S)
-            while bench.wait_for(MessageKind.BOOT_VERSION, within_s=quiet_s) is not None:
+            while bench.wait_for(Reply.BOOT_VERSION, within_s=quiet_s) is not None:
                 pass
 
     # -- the application --------------------------------------------------------------------------
@@ -66,8 +60,8 @@ class InitSession(PacketTransfer):
                 bench.measure(name, bench.now - since)
                 self.settle()
             return
-        heard = bench.host.version_answer(within_s, every_s=_ASK_S)
-        found = bench.require_received(heard, "an application that answers", within_s)
+        reply = bench.host.version_answer(within_s, every_s=_ASK_S)
+        found = bench.require_received(reply, "an application that answers", within_s)
         if name:
             bench.measure(name, found.at - since)
         bench.forget()
@@ -79,28 +73,28 @@ class InitSession(PacketTransfer):
         bench = self.bench
         found = bench.reset_measured(bench.limit("first_version_s"))
         for _ in range(version - 1):
-            found = bench.await_message(MessageKind.BOOT_VERSION, within_s=_BURST_GAP_S)
+            found = bench.await_message(Reply.BOOT_VERSION, within_s=_BURST_GAP_S)
         return found
 
     def more_versions(self) -> list[Received]:
         """Collect boot versions until no more arrive."""
         found: list[Received] = []
         while len(found) < _VERSIONS_MAX:
-            heard = self.bench.wait_for(MessageKind.BOOT_VERSION, within_s=_BURST_GAP_S)
-            if heard is None:
+            reply = self.bench.wait_for(Reply.BOOT_VERSION, within_s=_BURST_GAP_S)
+            if reply is None:
                 break
-            found.append(heard)
+            found.append(reply)
         return found
 
     def offer_update(self, frames: Sequence[RawFrame]) -> bool:
         """Send a possible update command for the good image; True when it is accepted."""
         bench = self.bench
         sent = bench.send(frames)
-        heard = bench.wait_for(MessageKind.REQUEST)
-        if heard is not None:
-            bench.measure(Times.REQUEST, heard.at - sent.left_at)
+        reply = bench.wait_for(Reply.REQUEST)
+        if reply is not None:
+            bench.measure(Times.REQUEST, reply.at - sent.left_at)
             self.stored = 0
-        return heard is not None
+        return reply is not None
 
     def begin(self) -> None:
         """Reset the running application and get request transfer."""
@@ -166,13 +160,13 @@ class InitSession(PacketTransfer):
         bench = self.bench
         decoder, since_s = DeviceDecoder(bench.encoder), moment - bench.tester.began_at
         return sum(
-            heard.kind is MessageKind.FEEDBACK
+            reply.kind is Reply.FEEDBACK
             for entry in bench.tester.trace
             if not entry.sent and entry.at_s > since_s
-            for heard in decoder.feed(entry.frame, entry.at_s)
+            for reply in decoder.feed(entry.frame, entry.at_s)
         )
 
 
-def answer_text(heard: Sequence[Received]) -> str:
+def answer_text(replies: Sequence[Received]) -> str:
     """Answers as text, "silence" without any."""
-    return describe(heard) if heard else "silence"
+    return describe(replies) if replies else "silence"

@@ -13,8 +13,8 @@ from flasher.conformance.judge import Times
 from flasher.conformance.profile import choice_words
 from flasher.conformance.wire import (
     PACKET_BYTES,
-    MessageKind,
     RawFrame,
+    Reply,
     joined,
     packet_payload,
     padded_to_frame,
@@ -26,13 +26,7 @@ _SHARES: Final = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LATER_S: Final = 0.5
 _PAUSE_WATCHED_S: Final = 30.0
 _BEFORE_PAUSE: Final = 0.9
-_END_ANSWERS: Final = (
-    MessageKind.REQUEST,
-    MessageKind.ACK,
-    MessageKind.NAK,
-    MessageKind.COMPLETE,
-    MessageKind.FEEDBACK,
-)
+_END_ANSWERS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
 _PACKETS_READ_BACK: Final = 33
 
 
@@ -46,12 +40,10 @@ def _repeat_trial(
     for _ in range(REPEATS):
         session.bench.forget()
         session.bench.send(frames)
-        heard = session.bench.answers()
-        is_nak = [one.kind for one in heard] == [MessageKind.NAK]
-        value = words.get(answer_text(heard)) or words.get(
-            MessageKind.NAK.value if is_nak else "", ""
-        )
-        yield Trial(value, answer_text(heard), stimulus)
+        replies = session.bench.answers()
+        is_nak = [one.kind for one in replies] == [Reply.NAK]
+        value = words.get(answer_text(replies)) or words.get(Reply.NAK.value if is_nak else "", "")
+        yield Trial(value, answer_text(replies), stimulus)
 
 
 def repeated_packet(session: InitSession) -> Findings:
@@ -131,15 +123,15 @@ def lost_frame(session: InitSession) -> Findings:
             bench.forget()
             frames = session.frames()
             bench.send(frames[:index] + frames[index + 1 :])
-            heard = bench.answers()
+            replies = bench.answers()
             late = bench.collect(_LATER_S)
-            kinds = [one.kind for one in (*heard, *late)]
+            kinds = [one.kind for one in (*replies, *late)]
             value = {0: "silence", 1: "nak"}.get(len(kinds), "")
-            if kinds not in ([], [MessageKind.NAK]):
+            if kinds not in ([], [Reply.NAK]):
                 value = ""
             elif late:
                 value = "either"
-            answer = answer_text([*heard, *late]) + (", late" if late else "")
+            answer = answer_text([*replies, *late]) + (", late" if late else "")
             stimulus = f"a packet without its frame {index + 1}"
             yield Trial(value, answer.replace(f" {session.stored + 1}", ""), stimulus)
             session.deliver_packet()
@@ -158,10 +150,10 @@ def filler(session: InitSession) -> Findings:
         session.packets(session.total - 1)
         other = bench.encoder.packet(session.total, session.total, rest.ljust(PACKET_BYTES, b"\0"))
         bench.send(other)
-        heard = answer_text(bench.answers())
-        taken = heard == f"ACK {session.total}"
+        replies = answer_text(bench.answers())
+        taken = replies == f"ACK {session.total}"
         value = "ignored" if taken else "rejected"
-        yield Trial(value, heard, f"packet {session.total}, filled with 00")
+        yield Trial(value, replies, f"packet {session.total}, filled with 00")
         if taken:
             session.stored = session.total
         session.finish()
@@ -228,13 +220,13 @@ def padded(session: InitSession) -> Findings:
         session.packets()
         bench.forget()
         sent = bench.send(padded_to_frame(bench.encoder.end(), byte))
-        heard = bench.wait_for(MessageKind.COMPLETE, within_s=within_s)
-        yield _accepted_trial(heard is not None, f"end {said}", "ignored", "rejected")
-        if heard is None:
+        reply = bench.wait_for(Reply.COMPLETE, within_s=within_s)
+        yield _accepted_trial(reply is not None, f"end {said}", "ignored", "rejected")
+        if reply is None:
             bench.forget()
             bench.end_transfer()
         else:
-            bench.measure(Times.COMPLETE, heard.at - sent.left_at)
+            bench.measure(Times.COMPLETE, reply.at - sent.left_at)
         session.await_application()
 
 
@@ -290,13 +282,13 @@ def pause(session: InitSession) -> Findings:
         session.begin()
         session.packets(stored)
         began_at = bench.now
-        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=_PAUSE_WATCHED_S)
+        reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_PAUSE_WATCHED_S)
         stimulus = f"a pause after packet {stored}" if stored else "a pause before packet 1"
-        if heard is None:
+        if reply is None:
             answer = f"no boot version in {_PAUSE_WATCHED_S:g} s"
             yield Trial("waits", answer, stimulus, "after")
         else:
-            found_s.append(heard.at - began_at)
+            found_s.append(reply.at - began_at)
             yield Trial("announces", "boot version", stimulus, "after")
             session.update()
         session.finish()
@@ -324,11 +316,11 @@ def reset_again(session: InitSession) -> Findings:
         session.packets(stored)
         bench.forget()
         bench.send(bench.encoder.reset())
-        heard = bench.wait_for(MessageKind.BOOT_VERSION, within_s=within_s)
+        reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
         stimulus = f"reset after packet {stored}" if stored else "reset before packet 1"
-        value, answer = ("restarts", "boot version") if heard else ("ignored", "no boot version")
+        value, answer = ("restarts", "boot version") if reply else ("ignored", "no boot version")
         yield Trial(value, answer, stimulus, "after")
-        if heard is not None:
+        if reply is not None:
             session.update()
         session.finish()
 
@@ -345,16 +337,12 @@ def end_again(session: InitSession) -> Findings:
         bench.end_transfer()
         with bench.tester.collecting_feedback():
             bench.send(bench.encoder.end())
-            heard = bench.collect(bench.limit("ack_s"))
-        heard = [one for one in heard if one.kind in _END_ANSWERS]
-        kinds = [one.kind for one in heard]
+            replies = bench.collect(bench.limit("ack_s"))
+        replies = [one for one in replies if one.kind in _END_ANSWERS]
+        kinds = [one.kind for one in replies]
         # A running application may send general feedback to an unknown message (R17).
-        words = {
-            (): "silence",
-            (MessageKind.FEEDBACK,): "silence",
-            (MessageKind.COMPLETE,): "same_answer",
-        }
-        yield Trial(words.get(tuple(kinds), ""), answer_text(heard), "end of transfer again")
+        words = {(): "silence", (Reply.FEEDBACK,): "silence", (Reply.COMPLETE,): "same_answer"}
+        yield Trial(words.get(tuple(kinds), ""), answer_text(replies), "end of transfer again")
         session.await_application()
 
 
