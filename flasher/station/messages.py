@@ -111,7 +111,7 @@ class WorkerSetup:
 
 
 @dataclass(frozen=True)
-class Reply:
+class WriteReply:
     """The answer to an `Ask`. `error` is empty when it is on disk."""
 
     number: int
@@ -129,7 +129,7 @@ class Quit:
     """End; a run that goes on is stopped first."""
 
 
-ToWorker = Claim | Reply | Abort | Quit
+ToWorker = Claim | WriteReply | Abort | Quit
 
 # -- from the process -----------------------------------------------------------------------------
 

@@ -52,10 +52,10 @@ from flasher.station.messages import (
     FromWorker,
     PresenceChanged,
     Ready,
-    Reply,
     RunResult,
     WorkerSetup,
     Write,
+    WriteReply,
 )
 from flasher.station.people import Crew
 from flasher.station.recipe_file import LoadedRecipe
@@ -476,7 +476,7 @@ class Station:
         except RecordError as error:
             run.journal_error = _said(error)
             self._feed(socket, self._not_saved(socket, claim.serial, claim.run_id, error))
-            self.supervisor.send(socket, Reply(number, error=error.what))
+            self.supervisor.send(socket, WriteReply(number, error=error.what))
         else:
             self.supervisor.send(socket, WriteReply(number, write_id))
 

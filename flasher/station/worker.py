@@ -47,6 +47,7 @@ from flasher.station.messages import (
     ToWorker,
     WorkerSetup,
     Write,
+    WriteReply,
     packed,
 )
 from flasher.station.power import PowerCommand, PowerControl
@@ -95,7 +96,7 @@ class StationPipe:
         self._looked_at = float("-inf")
         self._beat_at = float("-inf")
         self._claim: Claim | None = None
-        self._replies: dict[int, Reply] = {}
+        self._replies: dict[int, WriteReply] = {}
         self.meanwhile: Callable[[], None] = lambda: None
         """Called again and again while it waits for the station."""
         self.is_aborted = False
@@ -165,7 +166,7 @@ class StationPipe:
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
         self._ask(ended, measurements)
 
-    def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> Reply:
+    def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> WriteReply:
         """Wait until it is saved. Raises StationGoneError; JournalError when it is not."""
         self._asked += 1
         self.send(Ask(self._asked, what, tuple(measurements)))
@@ -186,7 +187,7 @@ class StationPipe:
         match message:
             case Claim():
                 self._claim = message
-            case Reply():
+            case WriteReply():
                 self._replies[message.number] = message
             case Abort():
                 self.is_aborted = True

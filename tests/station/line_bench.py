@@ -20,6 +20,7 @@ from flasher.station.messages import (
     ToWorker,
     WorkerSetup,
     Write,
+    WriteReply,
     packed,
 )
 from flasher.station.people import Crew
@@ -194,10 +195,10 @@ class LineBench:
 
     def ask(
         self, socket: str, what: Write | StepEnded, measurements: tuple[Measurement, ...] = ()
-    ) -> Reply:
+    ) -> WriteReply:
         """Ask the station to save something; its reply."""
         port = self.ports[socket]
-        number = 1 + sum(isinstance(message, Reply) for message in port.heard)
+        number = 1 + sum(isinstance(message, WriteReply) for message in port.heard)
         self.say(socket, Ask(number, what, measurements))
         reply = port.heard[-1]
         assert isinstance(reply, WriteReply)

@@ -34,12 +34,12 @@ from flasher.station.messages import (
     PresenceChanged,
     Quit,
     Ready,
-    Reply,
     RunResult,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
     Write,
+    WriteReply,
     packed,
 )
 from flasher.station.presence import SILENCE_S
@@ -103,7 +103,7 @@ class Socket:
             case PresenceChanged(True, _, label):
                 channel.waiting.append(claim(label, self.trace))
             case Ask(number):
-                channel.waiting.append(Reply(number, WriteId(number), self.error))
+                channel.waiting.append(WriteReply(number, WriteId(number), self.error))
             case RunResult():
                 channel.waiting.append(Quit())
 
