@@ -251,6 +251,9 @@ class Continuity:
         for found in self._sent.feed(frame.data, now):
             if not isinstance(found, Message) or found.mode != Mode.WRITE:
                 continue
+            # An application that answers no question confirms its first reset too.
+            may_be_running = self.watcher.request is not None and not self.is_announcing
+            awaits = self._awaits_confirmation or (may_be_running and not self._has_acted)
             self._has_acted = True
             is_reset = found.command in (self._reset_command, Command.RESET)
             self._announced_on = 0 if is_reset else self._announced_on
@@ -262,6 +265,7 @@ class Continuity:
                 self._burst_until, self._requested_s = inf, None
             elif is_reset:
                 self._restart()
+                self._awaits_confirmation = awaits and found.command == Command.RESET
             elif found.command == Command.UPDATE:
                 if not self._is_identified:
                     self._stay()

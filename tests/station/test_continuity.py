@@ -126,3 +126,20 @@ def test_a_fixture_may_restart_the_unit_that_it_holds(tmp_path: Path) -> None:
     run.identify()
     run.announce(1.7)
     assert not run.continuity.lost
+
+
+@each("silence_s", [0.2, 0.3, 1.0])
+@each("is_confirmed", [False, True])
+def test_a_unit_that_answers_nothing_confirms_its_reset_or_is_another_one(
+    tmp_path: Path, is_confirmed: bool, silence_s: float
+) -> None:
+    """It announced itself when its power came, and its application has answered no question."""
+    run = Watched(tmp_path)
+    run.announce(1.0)
+    run.continuity.begin(None)
+    run.send(8.0, ResetCommand())
+    if is_confirmed:
+        run.hear(8.01, GeneralFeedbackMessage())
+    run.send(8.0 + silence_s / 2, ResetCommand())
+    run.announce(8.0 + silence_s)
+    assert bool(run.continuity.lost) == (not is_confirmed), "its last word was 6.8 s ago"
