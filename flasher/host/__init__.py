@@ -1,1 +1,1 @@
-"""The tool's side as pure machines: they know the protocol and the image, no bus and no clock."""
+"""The tool's side as pure engines: protocol and image, without bus and clock."""

@@ -1,19 +1,19 @@
-"""Detects a second device of the same kind (R27), by what a single one does not send; pure.
+"""Detects a second device of the same kind (R27) by traffic that a single one does not cause; pure.
 
 A message that was sent once is answered once. Call `asked` and `left` for every message sent,
 `heard` and `see` for everything received. Evidence of a second device:
 
-- the reset, a packet or end of transfer has more answers than copies of it have left; a question
-  has, twice in a row: an answer on a broadcast id may be one to a question that was not received;
-- two units name different versions or serial numbers, or announce different boot versions;
-- the announcements of two bootloaders alternate, or one goes on while an application sends;
-- a packet is acknowledged after a bootloader has announced itself, or has asked for the transfer
-  once more, since the last update command;
+- the reset, a packet or end of transfer has more answers than copies sent; or a query has, twice in
+  a row (an answer on a broadcast id may belong to an unseen query);
+- two units report different versions or serial numbers, or announce different boot versions;
+- the announcements of two bootloaders alternate, or one continues while an application sends;
+- a packet is acknowledged after a bootloader announced itself, or requested the transfer again,
+  since the last update command;
 - packets have ACK and NAK, though every copy has its ACK, more often than damaged frames explain.
 
-What a single device may do, or a bad line makes of it, is none: a late answer to what was sent
-again (R10), general feedback beside the bootloader's own answers (R15), request transfer again
-before the first ACK (R16), an answer that the link has doubled.
+Not evidence, because a single device or a bad line may cause it: a late answer to a repetition
+(R10), general feedback besides the bootloader's own answers (R15), another request transfer before
+the first ACK (R16), an answer doubled by the link.
 """
 
 from __future__ import annotations
@@ -37,24 +37,23 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message
 
 SECOND_DEVICE_WAIT_S: Final = 0.1
-"""How much later than the first device a second one is still heard."""
+"""How much later than the first device a second one is still detected."""
 _DOUBLED_S: Final = 0.0003
-"""The same message again within less than this was doubled by the link: on the wire, two messages
-take longer."""
+"""Maximum distance of a message doubled by the link: on the wire, two messages take longer."""
 _CLEARLY_APART_S: Final = 0.002
-"""The same answer again after more than this was sent for itself; two frames of one message, or two
-messages one behind the other, are nearer."""
+"""Minimum distance of an answer that was sent separately; frames of one message, or of consecutive
+messages, are closer."""
 _TOLERANCE: Final = 0.25
-"""How much two announcements of one bootloader may be nearer or farther than documented."""
+"""Relative tolerance of the distance between announcements of one bootloader."""
 _ODD_ANSWERS: Final = 2.0
-"""So many packets with two answers are two devices': with what is forgotten, three of twenty. A bad
-line makes one where it doubles the first frame of a packet: NAK, then ACK."""
+"""Packets with two answers that prove two devices: with the forgiven ones, three of twenty. A bad
+line makes one when it doubles the first frame of a packet: NAK, then ACK."""
 _FORGIVEN: Final = 0.05
-"""Of them are forgotten with every packet."""
+"""Reduction of that count with every packet."""
 _RUN: Final = 5
-"""So many in a row are no chance, although feedbacks are lost on a bad line."""
+"""Length of a run that is not accidental, although a bad line loses feedbacks."""
 _REMEMBERED: Final = 8
-"""Packets, and different answers to one question, that are kept."""
+"""Maximum number of stored packets, and of different answers to one query."""
 _OF_A_TRANSFER: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
 _SENDER_MASK, _RECEIVER_MASK = 0x7F0, 0x00F
 
@@ -64,44 +63,44 @@ Key = tuple[int, int]
 
 @dataclass
 class _Question:
-    """A question or a write, by what answers it. It is counted in rounds: one is over when every
-    copy is answered, or is not answered any more.
+    """A query or write, identified by its answer, and counted in rounds. A round ends when every
+    copy is answered, or no answer can follow.
     """
 
     key: Key
     item: Item | None = None
     copies: int = 0
-    """That have left in this round, whoever asked."""
+    """Copies sent in this round, by any node."""
     answers: int = 0
     asked_at: float = -inf
     answered_at: float = -inf
     is_odd: bool = False
-    """The round has an answer too many."""
+    """This round has an excess answer."""
     odd_rounds: int = 0
-    """So many that have one follow each other, up to this one."""
+    """Number of consecutive rounds with an excess answer."""
     contents: list[Content] = field(default_factory=list)
-    """Every different answer."""
+    """All different answers."""
 
 
 @dataclass
 class _Packet:
-    """Copies of one packet against its answers."""
+    """Copies and answers of one packet."""
 
     unacknowledged: int = 0
-    """Copies that have left without an ACK; it outlives an attempt, as an ACK may come late."""
+    """Copies sent without an ACK; outlives an attempt, because an ACK may be late."""
     has_ack: bool = False
     has_nak: bool = False
     acked_at: float = -inf
     is_odd: bool = False
 
     def begin(self) -> None:
-        """A new attempt."""
+        """Begin a new attempt."""
         self.has_ack = self.has_nak = self.is_odd = False
 
     @property
     def has_two_answers(self) -> bool:
-        """True when each copy has its ACK, and there were more answers. A line that spoils many
-        frames makes several NAKs of a copy, but no ACK.
+        """True if each copy has its ACK, and there were more answers. A line that spoils many
+        frames causes several NAKs per copy, but no ACK.
         """
         all_acked = self.has_ack and self.unacknowledged <= 0
         return all_acked and (self.has_nak or self.unacknowledged < 0)
@@ -109,19 +108,19 @@ class _Packet:
 
 @dataclass
 class _Announcements:
-    """Those on one id."""
+    """Announcements on one id."""
 
     boot: BootVersion | None = None
     last_at: float = -inf
     times: deque[float] = field(default_factory=lambda: deque(maxlen=4))
-    """The last ones since a reset or an update command."""
+    """Times of the last ones since a reset or an update command."""
     is_documented: bool = False
-    """Two of them came as far apart as documented, with none between."""
+    """Two consecutive ones were as far apart as documented."""
 
 
 class _Balance:
-    """Messages that left against answers that came. A device that has hung answers what came
-    meanwhile, however late: what has no answer keeps waiting for one.
+    """Counts messages sent against answers. A device that hung answers late, so unanswered messages
+    keep waiting.
     """
 
     def __init__(self) -> None:
@@ -129,13 +128,12 @@ class _Balance:
         self._has_left = False
 
     def left(self) -> None:
-        """One left."""
         self._open += 1
         self._has_left = True
 
     def is_odd(self) -> bool:
-        """An answer came; True when it answers nothing. Before anything has left, it is one to
-        somebody else.
+        """Count an answer; True if it is an excess one. Before anything was sent, it belongs to
+        another tool.
         """
         if not self._open:
             return self._has_left
@@ -144,8 +142,8 @@ class _Balance:
 
 
 class _Runs:
-    """ACKs in a row that came with a general feedback, and without: one device confirms all that it
-    receives, or nothing (R15).
+    """Runs of ACKs with and without general feedback: one device confirms every message or none
+    (R15).
     """
 
     def __init__(self) -> None:
@@ -158,7 +156,7 @@ class _Runs:
         self._has_feedback = True
 
     def note_ack(self) -> bool:
-        """An ACK came; True when there were runs of both kinds."""
+        """Count an ACK; True once there were runs of both kinds."""
         self._length = self._length + 1 if self._has_feedback is self._is_confirmed else 1
         self._is_confirmed, self._has_feedback = self._has_feedback, False
         if self._length >= _RUN:
@@ -167,16 +165,16 @@ class _Runs:
 
 
 class DuplicateDetector:
-    """What speaks for a second device on the bus."""
+    """Collects evidence of a second device on the bus."""
 
     def __init__(self, timings: Timings) -> None:
         self._seen = ""
-        """What one device does not send, as it was seen first."""
+        """First evidence; may be empty."""
         self._timings = timings
         self._questions: dict[Key, _Question] = {}
         self._announced: dict[int, _Announcements] = {}
         self._application_at: dict[int, float] = {}
-        """When an application sent something last, by sender."""
+        """Time of the last message of an application, by sender."""
         self.is_beside = False
         """The last reset was confirmed while a bootloader announced itself."""
 
@@ -185,14 +183,15 @@ class DuplicateDetector:
         self._requested_at = inf
         self._left_at = -inf
         self._lost_by = ""
-        """What came since the last update command after which a device has no transfer any more."""
+        """Message since the last update command after which a single device has no transfer any
+        more."""
         self._packets: dict[int, _Packet] = {}
         self._packet = _Packet()
-        """The one in work."""
+        """Current packet."""
         self._has_ack = False
         """Since the last update command."""
         self._feedbacks = _Balance()
-        """Those of the application, and of a bootloader that sends them as well."""
+        """Feedbacks of the application, and of a bootloader that sends them too."""
         self._confirmed = _Runs()
         self._last_row: tuple[object, float] = (None, -inf)
         self._has_ended = self._is_complete = False
@@ -201,7 +200,7 @@ class DuplicateDetector:
     # -- what is sent -----------------------------------------------------------------------------
 
     def asked(self, key: Key, now: float, item: Item | None = None) -> None:
-        """A copy of what `key` answers has left; `item` is its row, where it has one."""
+        """Note that a copy of a request was sent; `key` and `item` are its answer."""
         question = self._questions.setdefault(key, _Question(key))
         is_answered = question.answers >= question.copies
         timings = self._timings
@@ -214,7 +213,7 @@ class DuplicateDetector:
         question.asked_at = now
 
     def left(self, command: Command, now: float, packet: int = 0) -> None:
-        """A message of the upgrade has left; `packet` is the number of a packet."""
+        """Note that a message of the upgrade was sent; `packet` is the number of a packet."""
         if command is Command.RESET:
             self._forget_announcements(is_reset=True)
             self.is_beside = False
@@ -223,7 +222,7 @@ class DuplicateDetector:
         if command is Command.UPDATE:
             self._forget_announcements(is_reset=False)
             self.is_beside = False
-            self._questions.clear()  # another application will answer
+            self._questions.clear()  # another application answers from now on
             for each in self._packets.values():
                 each.begin()
             self._packet = _Packet()
@@ -238,7 +237,7 @@ class DuplicateDetector:
         self._feedbacks.left()
 
     def _packet_of(self, number: int) -> _Packet:
-        """A packet that is sent: those that had all their answers long ago are forgotten."""
+        """Return the entry of a packet, and forget packets that were fully answered long ago."""
         if number in self._packets:
             return self._packets[number]
         self._odd_answers = max(0.0, self._odd_answers - _FORGIVEN)
@@ -248,7 +247,7 @@ class DuplicateDetector:
         return self._packets.setdefault(number, _Packet())
 
     def _forget_announcements(self, *, is_reset: bool) -> None:
-        """A bootloader may begin them anew, or end them."""
+        """Forget announcements before a reset or update command."""
         for announced in self._announced.values():
             announced.times.clear()
             if is_reset:
@@ -257,12 +256,12 @@ class DuplicateDetector:
     # -- what comes -------------------------------------------------------------------------------
 
     def see(self, frame: Frame, now: float) -> None:
-        """A frame came, of anybody: only applications send to others than the tool."""
+        """Note a frame from any node: only applications send to other nodes than the tool."""
         if self._announced and frame.is_payload and frame.can_id & _RECEIVER_MASK != Node.CDL.value:
             self._application_at[frame.can_id & _SENDER_MASK] = now
 
     def heard(self, found: Message | Damage, now: float) -> None:
-        """A message came, or bytes that made none."""
+        """Process a received message or damaged bytes."""
         if isinstance(found, Damage):
             self._garbled(found, now)
             return
@@ -281,19 +280,17 @@ class DuplicateDetector:
 
     @property
     def doubts(self) -> list[Item]:
-        """What was asked and had an answer too many once: to be asked again."""
+        """Queries with an excess answer, to be repeated."""
         return [each.item for each in self._questions.values() if each.item and each.odd_rounds]
 
     @property
     def contents(self) -> dict[Key, list[Content]]:
-        """Every different answer to each question."""
+        """All different answers to each query."""
         return {key: each.contents for key, each in self._questions.items()}
 
     @property
     def evidence(self) -> str:
-        """What was seen that one device does not send, and in what the two differ by their answers;
-        empty while there is nothing.
-        """
+        """Evidence of a second device, and how the answers of the two differ; may be empty."""
         differences = "; ".join(
             f"{name} {' / '.join(values)}"
             for question in self._questions.values()
@@ -304,12 +301,12 @@ class DuplicateDetector:
         return text("{seen}: {differences}", seen=self._seen, differences=differences)
 
     def _garbled(self, damage: Damage, now: float) -> None:
-        """An answer that was begun counts: two at once spoil each other."""
+        """Count a damaged answer: two at once destroy each other."""
         data = damage.data
         command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
         second = data[FRAME_DATA_SIZE : 2 * FRAME_DATA_SIZE]
         if second and data.startswith(second):
-            return  # its first frame was doubled
+            return  # the first frame was doubled
         question = self._questions.get((damage.can_id, command))
         if question is not None:
             self._count(question, now)
@@ -344,7 +341,7 @@ class DuplicateDetector:
     # -- the upgrade ------------------------------------------------------------------------------
 
     def announces(self, answer_id: int, now: float) -> bool:
-        """True while a bootloader announces itself one time after the other."""
+        """True while a bootloader announces itself repeatedly."""
         announced = self._announced.get(answer_id)
         return announced is not None and now - announced.last_at <= self._longest_s
 
@@ -360,12 +357,12 @@ class DuplicateDetector:
             self._note_odd()
 
     def has_announced(self, answer_id: int) -> bool:
-        """True when a bootloader has announced itself since the last reset or update command."""
+        """True if a bootloader announced itself since the last reset or update command."""
         announced = self._announced.get(answer_id)
         return announced is not None and bool(announced.times)
 
     def overlap(self, answer_id: int) -> bool:
-        """True when the last two announcements are too near to each other for one bootloader."""
+        """True if the last two announcements are too close for one bootloader."""
         announced = self._announced.get(answer_id)
         if announced is None or len(announced.times) < 2:
             return False
@@ -422,7 +419,7 @@ class DuplicateDetector:
             self._see_two(
                 text("bootloaders announced {one} and {other}", one=texts[0], other=texts[1])
             )
-        # What waits in this computer is heard before something leaves: this came after that.
+        # Received frames are processed before anything is sent: this came after it.
         after_request_s = self._left_at - self._requested_at
         if after_request_s > self._timings.leftover_boot_version_s and not self._has_ended:
             self._lost_by = text("a bootloader announced itself")
@@ -439,8 +436,8 @@ class DuplicateDetector:
             self._see_two(text("two bootloaders announced themselves alternately"))
 
     def _alternate(self, times: list[float], *, is_documented: bool) -> bool:
-        """True when the four are those of two bootloaders; one that is twice as fast as documented
-        has them at equal distances.
+        """True if the last four announcements come from two bootloaders. One that is twice as fast
+        as documented has equal distances.
         """
         if len(times) < 4 or not all(
             self._shortest_s <= later - earlier <= self._longest_s
@@ -489,7 +486,7 @@ class DuplicateDetector:
 
 
 def _differences(contents: list[Content]) -> Iterator[tuple[str, list[str]]]:
-    """Each field that differs, and its values."""
+    """Yield each field that differs, with its values."""
     for name, codec in contents[0].LAYOUT if contents else ():
         values = [f"{codec.show(getattr(each, name))} {codec.unit}".strip() for each in contents]
         if len(set(values)) > 1:

@@ -1,4 +1,4 @@
-"""What happens in an upgrade, in sentences for people."""
+"""Texts of upgrade events for people."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from flasher.wording import wording, wording_of
 
 _MINUTES_FROM_S: Final = 180.0
 _TRIES_SHOWN: Final = 10
-"""Every so many tries of a message, 5 s of them without an answer, it is seen without -v."""
+"""Every tenth try of a message, after 5 s without an answer, is shown without -v."""
 
 
 def reason_text(reason: str, what: str = "") -> str:
-    """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
+    """Text of a reason of `MessageRepeated` and `AttemptStarted`."""
     return wording_of("Reason", reason).replace("{what}", what)
 
 
 def warning_text(event: object) -> str:
-    """What nobody should miss, in words; empty for any other event."""
+    """Text of an event that must not be missed; empty for any other event."""
     match event:
         case events.ShutdownHeard(sender):
             return f"the {sender} sent the command SHUTDOWN: it switches off"
@@ -27,7 +27,9 @@ def warning_text(event: object) -> str:
         case events.AdapterLost(reason, wait_s):
             return f"{reason} Waiting {wait_s:g} s for the adapter ..."
         case events.BusBlocked(reason, limit_s):
-            return f"{reason} Trying on for {_span(limit_s)}: has the device power and contact?"
+            return (
+                f"{reason} Trying on for {_span(limit_s)}: check power and contacts of the device."
+            )
         case events.SecondToolAwaited(seen, quiet_s):
             return (
                 f"another tool writes to the device ({seen}). It has no application any more: "
@@ -42,7 +44,7 @@ def warning_text(event: object) -> str:
 
 
 def progress_line(event: object) -> tuple[str, int] | None:
-    """A line and the level of verbosity that shows it; None for an event without a line."""
+    """Return a line and the verbosity level that shows it; None for an event without a line."""
     match event:
         case events.PhaseEntered(phase, _):
             return f"{wording(phase)} ...", 0

@@ -1,8 +1,8 @@
-"""Watches the whole bus while a session runs, for what no single dialogue would notice; pure.
+"""Watches the whole bus during a session for a second tool and for SHUTDOWN; pure.
 
-A second tool: a frame with the id on which only the tool speaks, and that is no echo of an own one.
-A query (mode 11) is told from all other messages: it writes nothing.
-The battery's SHUTDOWN: whatever the target is, its power goes with it.
+A second tool: a frame with the id that only the tool uses, and that is not an echo of an own frame.
+A query (mode 11) is classified apart from all other messages, because it writes nothing. SHUTDOWN
+of the battery: it removes the power of every target.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from flasher.protocol.wire import Message, Reassembler
 
 
 class ForeignFrame(NamedTuple):
-    """A frame of a second tool: what was seen; whether a transfer may go on beside it; the command
-    that it asks for, None where it is not the beginning of a query.
+    """Frame of a second tool: description, whether a transfer may continue, and the queried command
+    (None if the frame does not begin a query).
 
-    The first frame of a message tells what it is. Frames that are no beginning are harmless as long
-    as they may be the rest of a query; more of them are a message whose beginning was not heard, or
-    was taken for an echo since it is equal to an own one, as that of a packet with the same number.
+    The first frame of a message determines its kind. Other frames are harmless as long as they may
+    be the rest of a query. More of them belong to a message whose beginning was missed, or was
+    mistaken for an echo because it equals an own frame (a packet with the same number).
     """
 
     seen: str
@@ -46,7 +46,7 @@ _QUERY_REST_FRAMES: Final = 2
 
 
 class Guard:
-    """Give it every frame in both directions."""
+    """Inspects every frame of both directions."""
 
     def __init__(self, target: Target, timings: Timings) -> None:
         self._own_id = target.request_id
@@ -54,14 +54,14 @@ class Guard:
         self._battery = Reassembler(battery_id, timings.inter_frame_timeout_s)
         self._gap_s = timings.inter_frame_timeout_s
         self._rest_frames = 0
-        """Foreign frames since the last that began a message."""
+        """Foreign frames since the last one that began a message."""
         self._rest_at = 0.0
         self._events: list[object] = []
         self.shutdown_heard = False
-        """The battery has announced that it switches off."""
+        """The battery announced that it switches off."""
 
     def see(self, frame: Frame, now: float) -> ForeignFrame | None:
-        """A frame was received; returns what it is when a second tool has sent it."""
+        """Inspect a received frame; return it if a second tool sent it."""
         frame_id = frame[0]
         if frame_id == self._own_id:
             return self._judge_own(frame, now)
@@ -72,7 +72,7 @@ class Guard:
         return None
 
     def take_events(self) -> list[object]:
-        """What was noticed since the last call."""
+        """Return the events since the last call."""
         taken, self._events = self._events, []
         return taken
 

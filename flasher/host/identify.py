@@ -1,10 +1,10 @@
-"""Asks a device who it is and how it is before anything is written to it.
+"""Identification: asks a device for its identity and state before anything is written to it.
 
-Asked are the version information (where the target has a query for it) and, of the battery, the
-running information. A device that sits in its bootloader announces itself instead of answering:
-that is heard, and ends the asking at once, so that the announcement can be answered in its window.
-Before the first question it listens for a moment, for another tool may be at work (`guard` hears
-it); after the last one it listens for the answers of a second device (`duplicates`).
+It asks for the version information (if the target has a query for it) and, for the battery, the
+running information. A device in its bootloader announces itself instead of answering: that ends the
+queries at once, so that the announcement can be answered within its window. Before the first query
+it listens briefly for another tool (`guard`); after the last one it waits for answers of a second
+device (`duplicates`).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from flasher.protocol.spec import Node, Target
 from flasher.protocol.wire import Message
 
 LISTEN_FIRST_S: Final = 0.1
-"""How long every command that asks listens before it does. A tool that flashes sends more often,
-unless it waits for the device."""
+"""How long every querying command listens first. A tool that flashes sends more often, unless it
+waits for the device."""
 
 
 class IdentifyStage:
-    """Listens, then asks until it knows what can be known. With `asks` False it listens only."""
+    """Listens, then sends all queries of the target. With `asks` False it only listens."""
 
     def __init__(self, plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> None:
         self._requests = _requests(plan.target, options) if asks else []
@@ -39,21 +39,21 @@ class IdentifyStage:
         self._version_item = None if version is None else version.answer_item
         self._queries: list[Query] = []
         self.phase = Phase.LISTEN
-        """Where it stands."""
+        """Current phase."""
         self.heard: Message | None = None
-        """The boot version that the device announced; None when it did not."""
+        """Boot version announced by the device; None without one."""
         self.two_devices = ""
-        """What speaks for a second device, in words; empty while nothing does."""
+        """Evidence of a second device; may be empty."""
         self.cancelled = False
 
     @property
     def asks(self) -> bool:
-        """False where nothing is asked: other targets than the battery have no query (5.2)."""
+        """False if nothing is queried: only the battery has queries (5.2)."""
         return bool(self._requests)
 
     @property
     def seen(self) -> DeviceAnswers:
-        """What the device told."""
+        """Answers of the device."""
         answers = [query.answer for query in self._queries]
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         version = next(
@@ -62,7 +62,7 @@ class IdentifyStage:
         return DeviceAnswers(version, running)
 
     def stage(self, run: Runner[Any]) -> Stage[IdentifyStage]:
-        """Listen and ask; what came is in this object."""
+        """Listen and query; the result is this object."""
         item = self._version_item
         run.listen_always(self._answer_id, *(() if item is None else (item.can_id,)))
         run.tell(PhaseEntered(Phase.LISTEN, 1))
@@ -89,7 +89,7 @@ class IdentifyStage:
             self._look((yield until))
 
     def _look(self, came: StageInput) -> StageInput:
-        """Take what came; an announcement ends a question that is being asked."""
+        """Process an input; an announcement ends the current query."""
         self.cancelled = self.cancelled or came is Signal.CANCEL
         if not isinstance(came, Message):
             return came
@@ -100,13 +100,13 @@ class IdentifyStage:
 
 
 def identify(plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> Runner[IdentifyStage]:
-    """`IdentifyStage` as an engine."""
+    """Run `IdentifyStage` as an engine."""
     asked = IdentifyStage(plan, options, asks=asks)
     return Runner(asked.stage, bitrate_bps=plan.bitrate_bps, timings=options.timings)
 
 
 def _requests(target: Target, options: UpgradeOptions) -> list[Request]:
-    """What this target can be asked; none where the document gives no query (chapter 3)."""
+    """Return the queries of this target; may be empty (chapter 3)."""
     requests = []
     version = options.version_request_for(target)
     if version is not None:

@@ -1,9 +1,9 @@
-"""Whether this image belongs into this device, judged before the first write to it.
+"""Identity checks: whether an image is meant for a device, before the first write to it.
 
-Two halves: what the image and its manifest say by themselves (`judge_image`), and what the running
-application answers (`judge_device`). The bootloader's own name and version are judged by the
-upgrade when they are announced. Each check is waived by its own option; where there is nothing to
-check against, the finding says so.
+`judge_image` checks the image and its manifest alone, `judge_device` compares them with the answers
+of the running application. The upgrade itself checks name and version of the bootloader when it
+announces itself. Each check has its own option to waive it. If a check is impossible, its result
+says so.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from flasher.protocol.text import FirmwareVersion, printable
 
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_IN_USE_MA: Final = 1000
-"""More than lights and displays take, less than the motor."""
+"""More than lights and displays use, less than the motor."""
 
 
 class IdentityCheck(Enum):
-    """What is checked; the value names it, and the option that waives it."""
+    """Checks; the value is the name of the check and of the option that waives it."""
 
     PLAUSIBLE = "implausible"
     TARGET = "other-target"
@@ -44,7 +44,7 @@ class IdentityCheck(Enum):
 
     @property
     def option(self) -> str:
-        """The option that waives it."""
+        """Option that waives it."""
         return f"--allow-{self.value}"
 
 
@@ -56,47 +56,47 @@ WAIVABLE: Final = (
     IdentityCheck.PREVIOUS,
     IdentityCheck.IN_USE,
 )
-"""Checks that refuse; the others report."""
+"""Checks that can refuse an upgrade; the others only report."""
 _ENDINGS: Final[Mapping[IdentityCheck, Ending]] = {
     IdentityCheck.PLAUSIBLE: Ending.IMPLAUSIBLE,
     IdentityCheck.IN_USE: Ending.IN_USE,
     IdentityCheck.SAME_VERSION: Ending.UP_TO_DATE,
 }
-"""How a refused check ends the session, where it is not that the image does not belong there."""
+"""How a refused check ends the session, if not with NOT_FOR_DEVICE."""
 
 
 class CheckVerdict(Enum):
-    """What a check found; the value is its name in events."""
+    """Result of a check; the value is its name in events."""
 
     PASSED = "passed"
     UNKNOWN = "unknown"
-    """There is nothing to check against."""
+    """Nothing to compare with."""
     WARNED = "warned"
     WAIVED = "waived"
     REFUSED = "refused"
     SKIPPED = "skipped"
-    """Left alone on request."""
+    """Not upgraded, as requested."""
 
 
 class CheckResult(NamedTuple):
-    """One check and what it found, in one sentence."""
+    """A check with its result in one sentence."""
 
     check: IdentityCheck
     verdict: CheckVerdict
     text: str
     other_ways: str = ""
-    """What waives it beside its option; continues the sentence that names that."""
+    """Alternatives to the option; continues the sentence that names the option."""
     is_unchecked: bool = False
-    """True when nothing speaks against the image, but a rule could not be checked."""
+    """True if nothing contradicts, but a rule could not be checked."""
 
     @property
     def event(self) -> CheckMade:
-        """It, as it is reported."""
+        """The event that reports it."""
         return CheckMade(self.check.value, self.verdict.value, self.text)
 
     @property
     def ending(self) -> Ending | None:
-        """How it ends the session; None when it does not."""
+        """How it ends the session; None if it does not."""
         if self.verdict not in (CheckVerdict.REFUSED, CheckVerdict.SKIPPED):
             return None
         if self.is_unchecked:
@@ -105,12 +105,12 @@ class CheckResult(NamedTuple):
 
     @property
     def waiver(self) -> str:
-        """The check's name where a person may waive it."""
+        """Name of the check if it can be waived."""
         return self.check.value if self.check in WAIVABLE else ""
 
     @property
     def detail(self) -> str:
-        """What is wrong, and the option that waives it."""
+        """The problem, and the option that waives it."""
         if not self.waiver:
             return self.text
         return f"{self.text}; {self.check.option} waives this{self.other_ways}"
@@ -118,34 +118,34 @@ class CheckResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Identity:
-    """What is known and wanted about image and device before an upgrade."""
+    """Requirements and limits for the checks before an upgrade."""
 
     release: Release | None = None
-    """The image's manifest; None where there is none."""
+    """Release of the image's manifest, if any."""
     waived: frozenset[IdentityCheck] = frozenset()
     skip_same_version: bool = False
     low_charge_percent: int = DEFAULT_LOW_CHARGE_PERCENT
-    """Below this state of charge there is a warning."""
+    """Warn below this state of charge."""
     in_use_ma: int = DEFAULT_IN_USE_MA
-    """A discharge beyond this means that the vehicle is in use."""
+    """A larger discharge current means that the vehicle is in use."""
     goes_on_unchecked: bool = False
-    """Rules of the manifest that the device cannot be asked for do not refuse, but are told: for a
-    rescue, whose device runs no application."""
+    """Only report rules of the manifest that cannot be checked: for a rescue, because the device
+    runs no application."""
     cpu: Cpu = Cpu.CORTEX_M
-    """What kind of processor the device has; an image is expected to look like a program for it."""
+    """Processor type of the device; an image is expected to look like a program for it."""
 
     def vouches_for(self, image: Image) -> bool:
-        """True when there is a manifest of these very bytes."""
+        """True if the manifest is of these exact bytes."""
         return self.release is not None and self.release.sha256 == image.sha256
 
     def refusal(self, check: IdentityCheck, text: str, other_ways: str = "") -> CheckResult:
-        """A finding against the upgrade, or that it is waived."""
+        """Create the result of a failed check: refused or waived."""
         verdict = CheckVerdict.WAIVED if check in self.waived else CheckVerdict.REFUSED
         return CheckResult(check, verdict, text, other_ways)
 
     def uncheckable(self, check: IdentityCheck, text: str) -> CheckResult:
-        """A rule of the manifest that the device does not let be checked: as one that fails, but
-        that --allow-hardware waives it.
+        """Create the result for a rule of the manifest that cannot be checked. It refuses like a
+        failed rule, but --allow-hardware also waives it.
         """
         if self.goes_on_unchecked:
             return CheckResult(
@@ -158,7 +158,7 @@ class Identity:
 
 @dataclass(frozen=True)
 class DeviceAnswers:
-    """What the running application told; None where it did not answer or was not asked."""
+    """Answers of the running application; None if it did not answer or was not asked."""
 
     version: Content | None = None
     running: RunningInformation | None = None
@@ -176,7 +176,7 @@ class DeviceAnswers:
 
 
 def new_version(image: Image, release: Release | None) -> str | None:
-    """The version that the image is: its own word, else the manifest's."""
+    """Version of the image: the one inside it, else the manifest's."""
     return image.version or (release.firmware_version if release else None)
 
 
@@ -184,7 +184,9 @@ def new_version(image: Image, release: Release | None) -> str | None:
 
 
 def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[CheckResult]:
-    """What the image and its manifest say of the target, and whether it can be a program."""
+    """Check whether the image and its manifest match the target, and whether it can be a
+    program.
+    """
     yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
@@ -208,7 +210,7 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
-    """Whether the bytes can be a program for the device; nothing where they look like one."""
+    """Check whether the bytes can be a program for the device; no result if they look like one."""
     found = find_doubt(image)
     if found is None:
         return
@@ -229,7 +231,9 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
 def judge_device(
     image: Image, target: Target, identity: Identity, seen: DeviceAnswers
 ) -> Iterator[CheckResult]:
-    """What the running application says of the image. `seen` is empty where it did not answer."""
+    """Compare the image with the answers of the running application; `seen` is empty if it did not
+    answer.
+    """
     if seen.version is None:
         yield _untold(identity, target)
     else:
@@ -240,7 +244,7 @@ def judge_device(
 
 
 def _untold(identity: Identity, target: Target) -> CheckResult:
-    """The application does not answer, or there is no question for its versions."""
+    """Result when the application does not answer, or has no query for its versions."""
     release = identity.release
     hardware = release is not None and bool(release.hardware_versions)
     previous = release is not None and release.rules_previous
@@ -289,7 +293,7 @@ def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
 
 
 def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckResult]:
-    """The running version against the new one, and against the manifest's rule."""
+    """Compare the running version with the new one and with the manifest's rule."""
     release = identity.release
     if release is not None:
         yield from _previous(release, identity, running)
@@ -322,7 +326,7 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
 
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:
-    """The manifest's rule on the version that is replaced, where it has one."""
+    """Check the manifest's rule about the replaced version, if any."""
     if not release.rules_previous:
         return
     if release.fits_previous(running):
@@ -341,7 +345,7 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
-    """Charge and current; a discharging current is negative (5.1)."""
+    """Check charge and current; a discharging current is negative (5.1)."""
     if running.mean_current_ma < -identity.in_use_ma:
         sentence = text(
             "the battery gives {current_ma} mA, more than {limit_ma} mA",

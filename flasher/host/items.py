@@ -1,8 +1,7 @@
-"""What the tool may read from and write to a device, by name; all of it from the catalogue.
+"""Items that the tool can read from and write to a device, by name; derived from the catalogue.
 
-The name is the catalogue's title with dashes ("serial-number"). What can be written but has no
-query of its own is read as a field of the answer that holds it: the serial number and the model
-stand in the version information.
+The name is the catalogue's title with dashes ("serial-number"). A writable item without a query of
+its own (serial number, model) is read as a field of the version information.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _DATE: Final = re.compile(r"([0-9]{4})-?([0-9]{2})-?([0-9]{2})")
 
 @dataclass(frozen=True)
 class Readable:
-    """Something that can be read: the query, and one field of its answer or (empty) all of it."""
+    """Readable item: its query, and one field of the answer (empty: all of it)."""
 
     name: str
     item: Item
@@ -40,7 +39,7 @@ class Readable:
 
     @property
     def content(self) -> type[Content]:
-        """What the answer carries. Raises ValueError for an item that is not asked for."""
+        """Content type of the answer. Raises ValueError for an item without answer."""
         answer = catalogue.answer_of(self.item)
         if answer is None:
             raise ValueError(f"{self.item.name} has no answer")
@@ -49,7 +48,7 @@ class Readable:
 
 @dataclass(frozen=True)
 class Writable:
-    """Something that can be written, and how it is read back."""
+    """Writable item, and how to read it back."""
 
     name: str
     item: Item
@@ -57,19 +56,19 @@ class Writable:
 
     @property
     def fields(self) -> tuple[tuple[str, Codec], ...]:
-        """Name and codec of what is given when it is written."""
+        """Name and codec of each value to write."""
         return meaningful_fields(self.item.content)
 
 
 def meaningful_fields(content: type[Content]) -> tuple[tuple[str, Codec], ...]:
-    """The fields of a content without the reserved ones."""
+    """Return the fields of a content without reserved ones."""
     return tuple(
         (name, codec) for name, codec in content.LAYOUT if not isinstance(codec, ReservedField)
     )
 
 
 def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
-    """What the documents let the tool read from the target, by name; memory is apart."""
+    """Return the readable items of the target by name, without memory."""
     queries = {
         name: Readable(name, item)
         for name, item in _named(target, dialect, Mode.READ)
@@ -84,7 +83,7 @@ def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
 
 
 def writable(target: Target, dialect: Dialect) -> dict[str, Writable]:
-    """What the documents let the tool write to the target, by name."""
+    """Return the writable items of the target by name."""
     reads = readable(target, dialect)
     return {
         name: Writable(name, item, reads[name])
@@ -104,7 +103,7 @@ def _named(target: Target, dialect: Dialect, mode: Mode) -> list[tuple[str, Item
 
 
 def _holder(item: Item, queries: Mapping[str, Readable]) -> Readable | None:
-    """The query whose answer has the one field that `item` writes."""
+    """Return the query whose answer contains the one field that `item` writes."""
     (field, codec), *more = meaningful_fields(item.content)
     for query in queries.values():
         if not more and (field, codec) in query.content.LAYOUT:
@@ -116,7 +115,7 @@ NamedItem = TypeVar("NamedItem", Readable, Writable)
 
 
 def find_item(name: str, among: Mapping[str, NamedItem], target: Target, verb: str) -> NamedItem:
-    """The item with this name. Raises UsageError, with the closest name, when there is none."""
+    """Find an item by name. Raises UsageError with the closest name."""
     wanted = name.lower().replace("_", "-").replace(" ", "-")
     if wanted in among:
         return among[wanted]
@@ -136,9 +135,10 @@ def find_item(name: str, among: Mapping[str, NamedItem], target: Target, verb: s
 
 
 def make_content(writable: Writable, values: Sequence[object]) -> Content:
-    """The content to write from one value a field: text, a date (YYYYMMDD), bytes in hexadecimal.
+    """Create the content to write, from one value per field: text, a date (YYYYMMDD), bytes in
+    hexadecimal.
 
-    Raises UsageError when a value is missing, too many, or does not fit its field.
+    Raises UsageError if a value is missing, superfluous, or does not fit its field.
     """
     fields = writable.fields
     names = " ".join(label(name, codec).upper().replace(" ", "_") for name, codec in fields)
@@ -172,7 +172,7 @@ def _value(name: str, codec: Codec, value: object) -> Any:
 
 
 def check_date(text: str) -> str:
-    """A date as the field has it, YYYYMMDD. Raises UsageError when no calendar has it."""
+    """Convert a date to YYYYMMDD. Raises UsageError if the calendar does not have it."""
     match = _DATE.fullmatch(text)
     if match is None:
         raise UsageError(f"date: {text!a} is not a date YYYYMMDD.")

@@ -1,4 +1,4 @@
-"""What a user or a product may set for an upgrade, and the overall deadline that follows."""
+"""Upgrade options of users and products, and the resulting overall deadline."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
 PATIENT_TRIES: Final = 60
-"""How often a packet is sent to a device that has no application to lose before the transfer begins
-anew: for 30 s where nothing answers."""
+"""Maximum number of transmissions of a packet while the device has no application to lose: 30 s
+without an answer."""
 ERASURES_MAX: Final = 20
-"""How often a device may erase in one upgrade that nobody has limited: flash wears. In the campaign
-of tests/campaigns/world no device was saved after more than ten."""
+"""Maximum number of erasures in one upgrade without user limit, because flash wears out. In the
+campaign tests/campaigns/world no device needed more than ten."""
 OTHER_TOOL_QUIET_S: Final = 2.0
-"""Silence of another tool that wrote to an erased device, before the device is upgraded again."""
+"""Required silence of another tool that wrote to an erased device, before the upgrade is
+repeated."""
 DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
-"""Long enough to walk to the bicycle and unplug its battery."""
+"""Enough time to walk to the bicycle and unplug its battery."""
 DEFAULT_ADAPTER_RETURN_S: Final = 5.0
-"""Long enough to plug a USB adapter in again."""
+"""Enough time to plug in a USB adapter again."""
 BRIEF_ADAPTER_RETURN_S: Final = 0.8
-"""As long as nothing was sent there is nothing to be saved. A bus-off recovers within this."""
+"""Before anything was sent there is nothing to save. A bus-off recovers within this time."""
 FRAME_GAP_SHARE: Final = 0.8
-"""The largest gap between two frames, as a share of the time after which their receiver drops the
-message (R12): the rest is for a computer that wakes up late."""
+"""Maximum gap between two frames, as a share of the time after which their receiver drops the
+message (R12); the rest is a margin for late wake-ups."""
 PACKET_GAP_MAX_S: Final = 10.0
-"""A device that waits for longer is as likely to have given up."""
+"""A device that waits longer has probably given up."""
 
 
 @dataclass(frozen=True)
 class UpgradeOptions:
-    """What a user or a product may set for an upgrade; the defaults are the document's readings.
+    """Upgrade options of a user or a product; the defaults are this project's readings.
 
-    Raises UsageError for gaps that no upgrade survives.
+    Raises UsageError for gaps that make an upgrade impossible.
     """
 
     timings: Timings = DEFAULT_TIMINGS
     attempts: int | None = None
-    """How often the upgrade may begin: after a restart of the device, an adapter that was lost and
-    came back, or a packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS` times, and as often
-    as the overall deadline allows once the device has no application."""
+    """Maximum number of attempts, after a restart of the device, a lost and restored adapter, or a
+    packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS`, and until the overall deadline once
+    the device has no application."""
     single_session: bool = False
-    """Never begin again: a device that has restarted may be another one. A lost adapter may come
-    back, up to `attempts` times, as long as the device goes on where it stood."""
+    """Never start over: a device that restarted may be another one. A lost adapter may be restored,
+    up to `attempts` times, while the device continues."""
     waits_for_other_tool: bool = True
-    """Upgrade an erased device again when another tool that wrote to it is silent, as long as an
+    """Repeat the upgrade of an erased device when another tool that wrote to it is silent, while an
     attempt is left. False: end at once."""
     patient_tries: int | None = None
-    """How often a packet is sent in one attempt once the device has no application and `attempts`
-    is None. None: `PATIENT_TRIES` times, or as often as `timings` says where that is not the
-    default."""
+    """Tries per packet and attempt once the device has no application and `attempts` is None. None:
+    `PATIENT_TRIES`, or the value of `timings` if that is not the default."""
     timeout_s: float | None = None
-    """Overall deadline; None computes one from the plan."""
+    """Overall deadline; None computes it from the plan."""
     frame_gap_s: float = 0.0
     """Silence between the frames of one message, for slow receivers."""
     packet_gap_s: float = 0.0
@@ -67,23 +67,22 @@ class UpgradeOptions:
     """Take NAK n+1 for ACK n when n was sent more than once (R10)."""
     reset_command: int = Command.RESET
     reset_data: bytes = b"RESET"
-    """What makes the application restart into the bootloader; a product may have its own (R3)."""
+    """Restarts the application into the bootloader; a product may have its own (R3)."""
     version_request: Request | None = None
-    """How to ask the new application for its version; None is the document's way, where the target
-    has one."""
+    """Version query for the new application; None uses the document's, if any."""
     allow_boot_name: bool = False
-    """Upgrade a device whose bootloader gives another name, or no version, than the target's."""
+    """Accept a bootloader with another name than the target's, or without a version."""
     minimum_boot_version: str | None = None
-    """Oldest bootloader, as `Vx.x.x`, that may be given the image; None is any."""
+    """Oldest accepted bootloader, as `Vx.x.x`; None accepts any."""
     at_power_up: bool = False
-    """Send no reset: wait for the announcement of a device that is switched on."""
+    """Send no reset; wait for the announcement of a device that is switched on."""
     in_session: bool = False
-    """An earlier upgrade may have left the device in its session: when it stays silent, and answers
-    no reset, it gets an update command (R26); only after that is a power cycle asked for."""
+    """An earlier upgrade may have left the device in its session: if it is silent, and does not
+    answer a reset, send an update command (R26) before asking for a power cycle."""
     power_up_timeout_s: float = DEFAULT_POWER_UP_TIMEOUT_S
-    """How long such an announcement is waited for."""
+    """Time limit for such an announcement."""
     adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
-    """How long a lost adapter may take to come back, once anything was sent."""
+    """Time limit for a lost adapter to come back once anything was sent."""
 
     def __post_init__(self) -> None:
         limit_s = FRAME_GAP_SHARE * self.timings.inter_frame_timeout_s
@@ -99,18 +98,18 @@ class UpgradeOptions:
             raise UsageError(
                 f"A gap of {self.packet_gap_s:g} s before each packet is more than "
                 f"{PACKET_GAP_MAX_S:g} s.",
-                cause="the device takes the silence for the end of the transfer",
+                cause="the device would take the silence for the end of the transfer",
                 remedy="Choose a shorter --packet-gap (packet_gap_s in a profile).",
             )
 
     @property
     def planned_attempts(self) -> int:
-        """How often the upgrade may begin while the device may still have its application."""
+        """Maximum number of attempts while the device may still have its application."""
         return DEFAULT_ATTEMPTS if self.attempts is None else self.attempts
 
     @property
     def tries_without_application(self) -> int:
-        """How often a packet is sent in one attempt where nothing is lost by trying on."""
+        """Maximum tries per packet and attempt when nothing can be lost."""
         if self.patient_tries is not None:
             return self.patient_tries
         tries = self.timings.packet_tries
@@ -118,11 +117,11 @@ class UpgradeOptions:
 
     @property
     def boot_timeout_s(self) -> float:
-        """How long a boot version is waited for."""
+        """Time limit for a boot version."""
         return self.power_up_timeout_s if self.at_power_up else self.timings.boot_version_timeout_s
 
     def version_request_for(self, target: Target) -> Request | None:
-        """How to ask this target for its version; None where nobody knows."""
+        """Return the version query of this target; None if unknown."""
         if self.version_request is not None:
             return self.version_request
         item = BY_KEY.get((target.request_id, Command.READ_VERSION))
@@ -130,24 +129,24 @@ class UpgradeOptions:
 
 
 def firmware_version(answer: Content) -> str:
-    """The firmware version that an answer to a version request names, safe to show."""
+    """Firmware version in an answer to a version query, escaped."""
     return str(getattr(answer, "firmware_version", ""))
 
 
 def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
-    """The overall deadline: the one that was chosen, else the default of the plan."""
+    """Overall deadline: the chosen one, else the plan's default."""
     return default_timeout_s(plan, options) if options.timeout_s is None else options.timeout_s
 
 
 def gaps_s(plan: Plan, options: UpgradeOptions) -> float:
-    """The silence that the options ask for in a faultless upgrade, all gaps together."""
+    """Total of all requested gaps in an upgrade without errors."""
     between_frames = plan.host_frames - plan.host_messages
     return options.frame_gap_s * between_frames + options.packet_gap_s * (plan.total_packets + 1)
 
 
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
-    """The overall deadline for a plan: every attempt with every wait at its limit, so that it cuts
-    off no device that answers in time, only one that needs repetition after repetition.
+    """Overall deadline of a plan: every attempt with every wait at its limit. It never cuts off a
+    device that answers in time, only one that keeps requiring repetitions.
     """
     timings = options.timings
     answers_s = timings.ack_timeout_s * plan.total_packets

@@ -1,7 +1,7 @@
-"""How an upgrade ended, what state it left the device in, and the error to raise for it.
+"""Outcome of an upgrade: how it ended, the state of the device, and the error to raise.
 
-Three claims are kept apart: "transferred" (every packet acknowledged), "completed" (the device said
-so), and "running version X" (the new application answered).
+Three claims are distinct: "transferred" (every packet acknowledged), "completed" (confirmed by the
+device), and "running version X" (answered by the new application).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from flasher.wording import wording
 
 
 class DeviceLeft(Enum):
-    """The state in which the device was left, as far as the host can know."""
+    """State in which the device was left, as far as the host can know."""
 
     UNTOUCHED = "untouched"
     PERHAPS_ERASED = "perhaps_erased"
@@ -45,7 +45,7 @@ class DeviceLeft(Enum):
 
     @property
     def needs_rescue(self) -> bool:
-        """True when it has no application, or perhaps none."""
+        """True if it has no application, or perhaps none."""
         return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW)
 
 
@@ -61,11 +61,11 @@ class Statistics:
     duration_s: float = 0.0
     """From the first reset to the end."""
     transfer_s: float | None = None
-    """From request transfer to the ACK of the last packet, in the last attempt that got there."""
+    """From request transfer to the ACK of the last packet, in the last attempt that got so far."""
 
 
 def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
-    """Where an upgrade stands, in words."""
+    """Describe the progress of an upgrade."""
     where = text(wording(phase))
     if packet:
         where = text(
@@ -102,14 +102,14 @@ class Outcome:
     # What was seen, where the ending alone does not say it.
     detail: str = ""
     waiver: str = ""
-    """The check that refused, where a person may waive it and the ending alone does not say it."""
+    """Refusing check, if it can be waived and the ending does not imply it."""
     sent_into_silence: bool = False
     """The device answered nothing, and got an update command: it might sit in a session that an
     earlier upgrade had left open (R26)."""
 
     @property
     def ok(self) -> bool:
-        """True when the device has the new image, by its own word."""
+        """True if the device confirmed the new image."""
         return self.ending in {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
     @property
@@ -119,7 +119,7 @@ class Outcome:
 
     @property
     def is_completed(self) -> bool:
-        """True when the device said that it has the complete image."""
+        """True if the device confirmed the complete image."""
         return self.ending is Ending.COMPLETED
 
     @property
@@ -129,13 +129,11 @@ class Outcome:
 
     @property
     def nothing_to_do(self) -> bool:
-        """True when the device was left alone on request, as it runs the version already."""
+        """True if the device already runs the version and was skipped as requested."""
         return self.ending is Ending.UP_TO_DATE
 
     def error(self) -> FlasherError | None:
-        """The error that stands for this outcome; None when it is a good one, or when there was
-        nothing to do.
-        """
+        """Create the error for this outcome; None for a good one, or if there was nothing to do."""
         if self.ok or self.nothing_to_do:
             return None
         explained = _EXPLANATIONS.get(self.ending)
@@ -183,7 +181,7 @@ def ended_before_start(
     duration_s: float,
     waiver: str = "",
 ) -> Outcome:
-    """The outcome of a session that ends before its upgrade has begun."""
+    """Outcome of a session that ends before its upgrade has begun."""
     return Outcome(
         ending=ending,
         phase=phase,
@@ -200,17 +198,17 @@ def ended_before_start(
 
 
 class _Explanation(NamedTuple):
-    """The error class of a bad ending, its likely cause and what to do."""
+    """Error class of a bad ending, likely cause and remedy."""
 
     kind: type[FlasherError]
     cause: str
     remedy: str
     code: ErrorCode | None = None
-    """None: that of the class."""
+    """None: the code of the class."""
 
 
 AGAIN: Final = "Run the same command again."
-"""What stands for {again} below."""
+"""Replaces {again} below."""
 
 TWO_DEVICES_CAUSE: Final = (
     "two devices of the same kind are on the bus, or one whose bootloader answers twice"
@@ -343,7 +341,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
     "by flasher rescue and a power cycle."
 )
-"""For a device that did not answer the update command into its silence (R26) either."""
+"""For a device that did not answer the update command into its silence either (R26)."""
 
 
 _TWO_TOLD_TO_UPDATE: Final = _Explanation(
@@ -352,7 +350,7 @@ _TWO_TOLD_TO_UPDATE: Final = _Explanation(
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
-    """The explanation of a passed deadline, by what had been reached."""
+    """Explanation of a passed deadline, by the phase reached."""
     remedy = "Allow more time with --timeout, or find what is slow. {again}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:

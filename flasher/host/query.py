@@ -1,12 +1,12 @@
-"""Asking a device for something and waiting for its answer (chapter 3).
+"""Queries and writes of chapter 3: send a request and wait for its answer.
 
-A question is sent every 200 ms until the answer comes or 1 s has passed. A copy follows only when
-the one before has left, for a sleeping device acknowledges nothing and the first frames may do no
-more than wake it.
+A request is sent every 200 ms until the answer arrives or 1 s has passed. A copy is sent only after
+the previous one was on the wire: a sleeping device acknowledges nothing, and the first frames may
+only wake it.
 
-A repeated question may be answered several times. One that has its answer stays a moment longer
-while answers to other copies may still come, so that none of them is taken for the answer to the
-next question: two writes are confirmed by the same words (R10 reads the upgrade the same way).
+A repeated request may be answered several times. After the answer it waits briefly for answers to
+the other copies, so that none is mistaken for the answer to the next request: two writes are
+confirmed by the same message (R10 applies the same rule to the upgrade).
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _EMPTY: Final = Empty()
 
 @dataclass(frozen=True)
 class Request:
-    """A question: which row of the catalogue, with which content.
+    """Request: a row of the catalogue and its content.
 
-    `accepts` may refuse an answer that is another question's; an answer to a memory read must name
-    the addresses that were asked for. `answer` is the row that answers where the catalogue does not
-    know it (a product's own query).
+    `accepts` can reject an answer that belongs to another request; an answer to a memory read must
+    name the requested addresses. `answer` is the answering row if the catalogue does not contain it
+    (a product's own query).
     """
 
     item: Item
@@ -50,14 +50,14 @@ class Request:
 
     @property
     def answer_item(self) -> Item:
-        """The row that answers. Raises ValueError for a message that nothing answers."""
+        """Answering row. Raises ValueError for a message without answer."""
         found = self.answer or catalogue.answer_of(self.item)
         if found is None:
             raise ValueError(f"{self.item.name} ({self.item.title}) has no answer")
         return found
 
     def is_answered_by(self, answer: Content) -> bool:
-        """False when the answer is one to another question."""
+        """Return False if the answer belongs to another request."""
         if self.accepts is not None:
             return self.accepts(answer)
         if isinstance(self.content, ReadMemory) and isinstance(answer, Memory):
@@ -66,36 +66,37 @@ class Request:
 
 
 class Query:
-    """One question and how it went. `ask` asks it, and tells of it unless it is `quiet`.
+    """A request in progress, with its result. `ask` runs it, and reports events unless it is
+    `quiet`.
 
-    Raises ValueError when the content does not fit or nothing answers the message.
+    Raises ValueError if the content does not fit or the message has no answer.
     """
 
     def __init__(self, request: Request, *, quiet: bool = False) -> None:
         self.request = request
         self.quiet = quiet
         self.answer: Content | None = None
-        """The answer's content; None until it came, and for ever if it does not."""
+        """Content of the answer; None until it arrives."""
         self.tries = 0
-        """How often the question was sent, or is being sent."""
+        """How often the request was sent, including the current transmission."""
         self.misfit: Message | None = None
-        """The last message that has the answer's serial number but not its form."""
+        """Last message with the serial number of the answer but another format."""
         self.copies_left = 0
-        """Copies of the question that have left."""
+        """Copies of the request that were sent."""
         self.answers = 0
-        """How often it was answered."""
+        """Number of answers."""
         self.is_settled = False
-        """Every copy that has left is answered."""
+        """Every copy sent was answered."""
         self.repeat_at = inf
         self.ends_at = inf
         self.cancelled = False
-        """It was ended from outside before its answer came."""
+        """It was cancelled before its answer arrived."""
         self.answer_item = request.answer_item
         message = catalogue.encode(request.item, request.content)
         self.frames = split(message.can_id, encode(message))
 
     def is_answer(self, message: Message) -> bool:
-        """Take a message that came after the question had left; True when it is the answer."""
+        """Process a message received after the request was sent; True if it is the answer."""
         expected = self.answer_item
         if (message.can_id, message.mode, message.command) != (
             expected.can_id,
@@ -113,7 +114,7 @@ class Query:
         return True
 
     def note_misfit(self, message: Message) -> None:
-        """Keep a message that has the serial number of the answer, but another form."""
+        """Keep a message with the answer's serial number but another format."""
         expected = self.answer_item
         if message.can_id != expected.can_id:
             return
@@ -125,7 +126,7 @@ class Query:
 
 
 def ask(run: Runner[Any], query: Query) -> Stage[Query]:
-    """Ask one question; the query says how it went. See the module for the times."""
+    """Run one query; see the module for the times."""
     title = query.request.item.title
     run.tx.all_left(run.now)
     run.also_listen_on(query.answer_item.can_id, *_others_ask(query))
@@ -140,7 +141,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
             case Signal.TIME if run.now >= query.ends_at:
                 break
             case Signal.TIME if run.now >= query.repeat_at:
-                query.repeat_at = inf  # it starts when the message has left
+                query.repeat_at = inf  # it starts when the message was sent
                 query.tries += 1
                 run.send(query.frames)
                 if query.tries > 1 and not query.quiet:
@@ -161,7 +162,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
 
 
 def _others_ask(query: Query) -> set[int]:
-    """The ids on which other nodes ask for the same."""
+    """Ids on which other nodes send the same request."""
     return {
         item.can_id
         for item in catalogue.ITEMS
@@ -182,9 +183,9 @@ def _copy_left(run: Runner[Any], query: Query) -> None:
 
 
 def _take(run: Runner[Any], query: Query, message: Message) -> None:
-    """Look at a message; an answer is waited on with those that other copies may still bring."""
+    """Process a message; after an answer, wait for answers to the other copies."""
     query.note_misfit(message)
-    # Before the question has left it is somebody else's answer.
+    # Before the request was sent, it answers another node.
     if not query.copies_left or not query.is_answer(message):
         return
     query.answers += 1
@@ -204,10 +205,10 @@ def ask_all(
     *,
     stop_at_silence: bool = False,
 ) -> Stage[None]:
-    """Ask several questions, one after the other, and put them into `queries` as they begin.
+    """Run several queries one after the other, and append them to `queries` as they begin.
 
-    `requests` is taken from as needed, so it may be a generator. With `stop_at_silence` the first
-    question without an answer is the last one.
+    `requests` may be a generator. With `stop_at_silence` the first query without an answer is the
+    last.
     """
     for request in requests:
         query = Query(request)
@@ -218,8 +219,8 @@ def ask_all(
 
 
 def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
-    """Wait for the answers of a second device to what was asked last, and ask once more what had an
-    answer too many (R27).
+    """Wait for answers of a second device to the last queries, and repeat those with an excess
+    answer (R27).
     """
     if not any(query.answers for query in queries):
         return
@@ -233,13 +234,13 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
 
 
 def report_two_devices(run: Runner[Any]) -> None:
-    """Report a second device, if one has shown itself."""
+    """Report a second device, if detected."""
     if run.duplicates.evidence:
         run.tell(events.TwoDevicesSeen(run.duplicates.evidence))
 
 
 class Queries(Runner[None]):
-    """Several questions as an engine; see `ask_all`, and `count_answers` for `counts`."""
+    """Several queries as an engine; see `ask_all`, and `count_answers` for `counts`."""
 
     def __init__(
         self,
@@ -251,7 +252,7 @@ class Queries(Runner[None]):
         counts: bool = False,
     ) -> None:
         self.queries: list[Query] = []
-        """Those that were begun, in order."""
+        """Queries begun, in order."""
         iterator = iter(requests)
         first = list(islice(iterator, 1))
         self._requests = chain(first, iterator)
@@ -268,7 +269,7 @@ class Queries(Runner[None]):
 
     @property
     def answers(self) -> list[Content | None]:
-        """One for each question begun, in order."""
+        """One per query begun, in order."""
         return [query.answer for query in self.queries]
 
 
@@ -276,22 +277,22 @@ class Queries(Runner[None]):
 
 
 def memory_requests(start: int, end: int) -> Iterator[Request]:
-    """The questions for the bytes from `start` up to `end`, `end` exclusive (R5); each is for 128
-    bytes at the most.
+    """Yield the requests for the bytes from `start` up to `end`, exclusive (R5), each for 128 bytes
+    at most.
     """
     for at in range(start, end, MEMORY_PIECE_SIZE):
         yield Request(READ_MEMORY, ReadMemory(at, min(at + MEMORY_PIECE_SIZE, end)))
 
 
 def memory_bytes(answer: Memory) -> bytes:
-    """The bytes that an answer gives, without the filler behind them (R5)."""
+    """Bytes of an answer without the filler after them (R5)."""
     return answer.content[: answer.end - answer.start]
 
 
 def check_range(start: int, end: int) -> None:
-    """Raises UsageError for a range of addresses that the message cannot say."""
+    """Raise UsageError for an address range that the message cannot encode."""
     if not 0 <= start < end <= ADDRESS_MAX:
         raise UsageError(
-            f"0x{start:08X} to 0x{end:08X} is no range of memory to read.",
-            remedy=f"The end is exclusive, above the start, 0x{ADDRESS_MAX:08X} at the most.",
+            f"0x{start:08X} to 0x{end:08X} is not a valid memory range.",
+            remedy=f"The end is exclusive, above the start, and at most 0x{ADDRESS_MAX:08X}.",
         )

@@ -1,6 +1,7 @@
-"""Runs what the host does with a device: stages that wait for the wire or for a time; pure.
+"""Runs the stages of a dialogue with a device as one engine; pure.
 
-A stage is a generator. It yields until when it waits (None: for ever), and is sent what came:
+A stage is a generator. It yields the time until which it waits (None: indefinitely), and receives
+the next input:
 
     def ask_for_version(run: Runner) -> Stage[Message | None]:
         run.listen(0x720)
@@ -8,8 +9,8 @@ A stage is a generator. It yields until when it waits (None: for ever), and is s
         came = yield run.now + 1.0
         return came if isinstance(came, Message) else None
 
-Stages go together by `yield from`. `Runner` is the engine (`flasher.protocol.engine`) around the
-outermost one: the only place where frames become messages and a deadline is kept.
+Stages are combined by `yield from`. `Runner` is the engine (`flasher.protocol.engine`) around the
+outermost stage: the only place that reassembles messages and keeps the deadline.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from flasher.protocol.wire import Damage, Message, Reassembler
 
 
 class Signal(Enum):
-    """What a stage is sent beside messages and damage."""
+    """Inputs of a stage besides messages and damage."""
 
-    TIME = "the time that it waited for has come"
-    LEFT = "the last frame of a message has left"
-    CANCEL = "it is to end at the next message boundary"
+    TIME = "the time limit of the stage was reached"
+    LEFT = "the last frame of a message was sent"
+    CANCEL = "end at the next message boundary"
 
 
 T = TypeVar("T")
@@ -41,7 +42,7 @@ Stage = Generator[float | None, StageInput, T]
 
 
 class Runner(Generic[T]):
-    """An engine that runs one stage from its first `tick` to its result."""
+    """Engine that runs one stage from its first `tick` to its result."""
 
     def __init__(
         self,
@@ -55,20 +56,20 @@ class Runner(Generic[T]):
         self.bitrate_bps = bitrate_bps
         self.tx = Transmitter(bitrate_bps, frame_gap_s, timings.inter_frame_timeout_s)
         self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
-        """The next frame to send."""
+        """Return the next frame to send."""
         self.frame_sent: Callable[[float], Any] = self.tx.frame_sent
-        """The adapter has accepted it."""
+        """Note that the adapter accepted it."""
         self.tx.on_left = self._message_left
         self.now = 0.0
-        """The time of what happens."""
+        """Time of the current input."""
         self.is_cancelled = False
-        """It was asked to end before its end."""
+        """It was cancelled before its end."""
         self.limit_at = inf
-        """When it is cancelled if it has not ended."""
+        """When to cancel it unless it has ended."""
         self.watch: Callable[[Frame], bool] | None = None
-        """Sees every frame; what it returns True for is not heard by the stage."""
+        """Inspects every frame; a frame for which it returns True is hidden from the stage."""
         self.duplicates = DuplicateDetector(timings)
-        """What speaks for a second device; the stage says what it has asked."""
+        """Detects a second device; stages report their requests to it."""
         self._make_stage = stage
         self._stage: Stage[T] | None = None
         self._wake_at = 0.0  # at once
@@ -80,25 +81,25 @@ class Runner(Generic[T]):
 
     @property
     def result(self) -> T:
-        """What the stage came to. Raises RuntimeError while it goes on."""
+        """Result of the stage. Raises RuntimeError while it is running."""
         if not self.done:
-            raise RuntimeError("it has not ended yet")
+            raise RuntimeError("the stage has not ended yet")
         return self._result  # type: ignore[return-value]  # it is T when it is done
 
     # -- for the stage ---------------------------------------------------------------------------
 
     def listen(self, *can_ids: int) -> None:
-        """Hear messages on these ids from now on, and on no other but those of `listen_always`."""
+        """Receive messages on these ids from now on, besides those of `listen_always`."""
         fresh = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = fresh | self._always
 
     def listen_always(self, *can_ids: int) -> None:
-        """Hear messages on these ids until this is called again."""
+        """Receive messages on these ids until this is called again."""
         self._always = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = dict(self._always)
 
     def also_listen_on(self, *can_ids: int) -> None:
-        """Hear messages on these ids as well."""
+        """Receive messages on these ids as well."""
         for can_id in can_ids:
             if can_id not in self._always:
                 self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
@@ -114,7 +115,7 @@ class Runner(Generic[T]):
         not_before: float = 0.0,
         tag: object = None,
     ) -> None:
-        """Send a message; `Signal.LEFT` tells when it has left (`tx.left_at`, `tx.left_tag`)."""
+        """Send a message; `Signal.LEFT` follows when it was sent (`tx.left_at`, `tx.left_tag`)."""
         self.tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=tag)
 
     def tell(self, event: object) -> None:
@@ -122,11 +123,11 @@ class Runner(Generic[T]):
         self._events.append(event)
 
     def tell_damage(self, damage: Damage) -> None:
-        """Report bytes that made no message."""
+        """Report bytes that are not a message."""
         self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
 
     def listen_on(self) -> Stage[bool]:
-        """Hear what a second device sends later; returns True when that was cancelled."""
+        """Wait for late messages of a second device; return True if cancelled."""
         until = self.now + SECOND_DEVICE_WAIT_S
         came: StageInput = Signal.TIME
         while self.now < until and came is not Signal.CANCEL:
@@ -134,8 +135,8 @@ class Runner(Generic[T]):
         return came is Signal.CANCEL
 
     def finish_message(self) -> Stage[None]:
-        """Let a message that is half sent go to its end. An adapter that takes nothing any more
-        does not hold it up for ever.
+        """Wait until a partly sent message is complete, but not for an adapter that accepts nothing
+        more.
         """
         self.tx.drop_unstarted()
         give_up_at = self.now + self.timings.command_timeout_s
@@ -202,7 +203,7 @@ class Runner(Generic[T]):
         return taken
 
     def interrupt(self, interruption: Exception) -> None:
-        """Raise an exception in the stage, where it waits."""
+        """Raise an exception in the waiting stage."""
         if self._stage is not None and not self.done:
             try:
                 self._wait(self._stage.throw(interruption))
@@ -237,7 +238,9 @@ class Runner(Generic[T]):
 
 
 def filtered(stage: Stage[T], look: Callable[[StageInput], StageInput]) -> Stage[T]:
-    """A stage whose signals are looked at first; what `look` returns is what it is sent."""
+    """Run a stage whose inputs are first processed by `look`, which returns the input to pass
+    on.
+    """
     try:
         until = next(stage)
         while True:

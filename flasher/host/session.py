@@ -1,7 +1,7 @@
-"""A whole session: who is there, does the image belong there, the upgrade, the verification.
+"""Upgrade session: identification, checks, upgrade and verification of one device.
 
-One stage after the other under one runner, so that the simulator, the command line and whoever else
-runs the very same code. Beside the stages a guard watches the bus all the time.
+The stages run one after the other under one runner, so that simulator, command line and station run
+the same code. A guard watches the bus during all stages.
 """
 
 from __future__ import annotations
@@ -53,31 +53,30 @@ from flasher.protocol.spec import Node, can_id
 from flasher.wording import wording
 
 _NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
-"""Errors that a battery which switched off explains, or a computer that paused."""
+"""Errors that a switched-off battery or a paused computer can explain."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a session came to: the upgrade's outcome, and what the verification found."""
+    """Result of a session: the outcome of the upgrade and of the verification."""
 
     outcome: Outcome
     verification: Verification = NOT_ASKED
     shutdown_heard: bool = False
-    """The battery sent SHUTDOWN while the session ran."""
+    """The battery sent SHUTDOWN during the session."""
     previous_version: str | None = None
-    """What the application answered before the upgrade, escaped; None when it was not asked or did
-    not answer."""
+    """Version answered by the application before the upgrade, escaped; None if not asked or not
+    answered."""
     stalled_s: float = 0.0
-    """All pauses of this computer during the session (`events.HostStalled`)."""
+    """Total of all pauses of this computer during the session (`events.HostStalled`)."""
 
     @property
     def ok(self) -> bool:
-        """True when the upgrade is good and nothing speaks against the new image."""
+        """True if the upgrade succeeded and the verification found no problem."""
         return self.outcome.ok and self.verification.ok
 
     @property
     def exit_code(self) -> ExitCode:
-        """The exit code that stands for it."""
         if self.outcome.nothing_to_do:
             return ExitCode.NOTHING_TO_DO
         error = self.error()
@@ -85,11 +84,11 @@ class Result:
 
     @property
     def running_version(self) -> str | None:
-        """What the application answered, wherever it was asked; escaped."""
+        """Version answered by the application, escaped."""
         return self.verification.running_version or self.outcome.running_version
 
     def error(self) -> FlasherError | None:
-        """The error that stands for it; None when it is good, or there was nothing to do."""
+        """Create the error for this result; None if it is good, or there was nothing to do."""
         error = self.outcome.error() or self.verification.error(self.outcome.target)
         if isinstance(error, _NO_CONTACT):
             if self.stalled_s:
@@ -101,11 +100,11 @@ class Result:
 
 
 class UpgradeSession(Runner[Result]):
-    """One session; an engine. Begins with the first `tick`.
+    """One session as an engine; begins with the first `tick`.
 
-    It listens for a second tool before it sends anything. With `identity` the device is then asked
-    who it is, and the image is held against the answer, before anything is written; a device that
-    is waited for at power-up cannot be asked, but where it may sit in a session that was left open.
+    It listens for a second tool before it sends anything. With `identity` it then identifies the
+    device, and checks the image against the answers before anything is written. A device awaited at
+    power-up is not asked, unless it may be in an open session.
     """
 
     def __init__(
@@ -126,26 +125,26 @@ class UpgradeSession(Runner[Result]):
             frame_gap_s=self._options.frame_gap_s,
         )
         self.deadline_at: float | None = None
-        """The overall deadline; None before the beginning."""
+        """Overall deadline; None before the first tick."""
         self._guard = Guard(plan.target, self._options.timings)
         self.watch = self._watch_frame
         self._foreign_queries: set[int] = set()
-        """The commands of those that were reported."""
+        """Commands of the reported foreign queries."""
         self._losses = 0
         self._began_at = 0.0
-        # At power-up no application runs, and nothing is sent before the device's announcement. One
-        # that may sit in an open session is asked first: an application that runs would answer.
+        # At power-up no application runs, and nothing is sent before the device announces itself. A
+        # device that may be in an open session is asked first: a running application would answer.
         waits = self._options.at_power_up and not self._options.in_session
         self._identify = None if waits else self._new_identify()
         receivers = (each for each in (*Node, None) if each not in (plan.target.node, Node.CDL))
         self._application_ids = frozenset(can_id(plan.target.node, each) for each in receivers)
         self._upgrade = UpgradeStage(self, plan, self._options)
         self._checking: Level | None = None
-        """What is being verified, once the upgrade is over."""
+        """Current level of verification; None during the upgrade."""
 
     @property
     def standing(self) -> str:
-        """How far it has come, in words."""
+        """Describe the progress."""
         if self._checking is Level.NONE:
             return "listening for a second device"
         if self._checking is not None:
@@ -156,24 +155,24 @@ class UpgradeSession(Runner[Result]):
 
     @property
     def device_left(self) -> DeviceLeft:
-        """The state that the device would be left in if nothing more were sent."""
+        """State of the device if nothing more were sent."""
         return self._upgrade.device_left if self._checking is None else DeviceLeft.NEW
 
     @property
     def has_begun_to_erase(self) -> bool:
-        """True once an update command is sent, or being sent: to end then leaves the device
-        without an application.
+        """True once an update command is being sent or was sent: ending the session then leaves the
+        device without an application.
         """
         return self._upgrade.has_begun_to_erase
 
     @property
     def goes_on(self) -> bool:
-        """True while only the overall deadline ends the attempts."""
+        """True while only the overall deadline limits the attempts."""
         return self._is_upgrading and self._upgrade.goes_on
 
     @property
     def may_begin_again(self) -> bool:
-        """True when a lost adapter may be opened again: an attempt is left for it."""
+        """True if an attempt is left for opening a lost adapter again."""
         is_last = self._losses + 1 >= self._options.planned_attempts
         if self.done or (is_last and not self.goes_on):
             return False
@@ -184,7 +183,7 @@ class UpgradeSession(Runner[Result]):
         return self._identify is None and self._checking is None
 
     def link_back(self, now: float) -> None:
-        """The adapter was lost and works again."""
+        """Continue after the lost adapter was opened again."""
         self.now = now
         self._losses += 1
         if self._checking is None:
@@ -207,15 +206,15 @@ class UpgradeSession(Runner[Result]):
             self.limit_at = self.deadline_at
             try:
                 asked = yield from self._identified(self._identify)
-            except SecondToolSeen as heard:
-                return self._end_early(Ending.SECOND_TOOL, heard.seen)
+            except SecondToolSeen as tool:
+                return self._end_early(Ending.SECOND_TOOL, tool.seen)
             refused = self._refused(asked)
             if refused is not None:
                 return refused
             previous = asked.seen.firmware_version
             self._upgrade.heard = asked.heard
             self._identify = None
-        self.limit_at = inf  # the upgrade keeps it itself
+        self.limit_at = inf  # the upgrade observes its deadline itself
         outcome = yield from self._upgrade.stage(self.deadline_at)
         verification = NOT_ASKED
         if outcome.ok:
@@ -231,12 +230,12 @@ class UpgradeSession(Runner[Result]):
             try:
                 return (yield from identify.stage(self))
             except LinkRestored:
-                # Queries are short and harmless: they are begun anew.
+                # Queries are short and harmless: repeat them.
                 self.tx.abandon(self.now)
                 self._identify = identify = self._new_identify()
 
     def _refused(self, asked: IdentifyStage) -> Result | None:
-        """The end of the session where what was heard ends it."""
+        """End the session if the identification requires it."""
         if asked.cancelled:
             is_late = self.deadline_at is not None and self.now >= self.deadline_at
             return self._end_early(Ending.OUT_OF_TIME if is_late else Ending.CANCELLED, "")
@@ -257,8 +256,8 @@ class UpgradeSession(Runner[Result]):
         return self._judge(findings)
 
     def _postponed(self, finding: CheckResult) -> CheckResult:
-        """A rule that no answer came for does not end the session before the device has shown
-        whether it has an application at all.
+        """Postpone an uncheckable rule of a silent device until it has shown whether it has an
+        application.
         """
         if finding.ending is None or not finding.is_unchecked:
             return finding
@@ -267,7 +266,7 @@ class UpgradeSession(Runner[Result]):
         return finding._replace(verdict=CheckVerdict.WARNED, text=sentence)
 
     def _judge(self, findings: Iterable[CheckResult]) -> Result | None:
-        """Report what was found; what is refused ends the session."""
+        """Report all findings; a refusing one ends the session."""
         refused = None
         for finding in findings:
             self.tell(finding.event)
@@ -288,7 +287,7 @@ class UpgradeSession(Runner[Result]):
     def _verified(self) -> Stage[Verification]:
         level, self._checking = self._level, Level.NONE
         self.listen_always(self._plan.target.answer_id)
-        with contextlib.suppress(SecondToolSeen):  # the device has the image all the same
+        with contextlib.suppress(SecondToolSeen):  # the device has the image anyway
             yield from self.listen_on()
         if self.duplicates.evidence:
             return Verification(level, Verdict.TWO_DEVICES, None, self.duplicates.evidence)
@@ -307,9 +306,9 @@ class UpgradeSession(Runner[Result]):
                 found = yield from check_version(self, self._plan, self._options)
             else:
                 found = yield from check_memory(self, self._plan, running_version)
-        except SecondToolSeen as heard:
-            # The device has the image; what it answers may be meant for the other tool.
-            return Verification(level, Verdict.SECOND_TOOL, None, heard.seen)
+        except SecondToolSeen as tool:
+            # The device has the image; its answers may be for the other tool.
+            return Verification(level, Verdict.SECOND_TOOL, None, tool.seen)
         if found.verdict is Verdict.INTERRUPTED and self.now >= (self.deadline_at or inf):
             return Verification(level, Verdict.NO_ANSWER, None, "the overall deadline passed")
         return found
@@ -317,11 +316,11 @@ class UpgradeSession(Runner[Result]):
     # -- beside the stages -----------------------------------------------------------------------
 
     def _watch_frame(self, frame: Frame) -> bool:
-        """Look for a second tool, and for the battery's SHUTDOWN."""
+        """Detect a second tool, and SHUTDOWN of the battery."""
         if frame[0] == self._plan.target.answer_id:
             return False
         if frame[0] in self._application_ids and frame.is_payload:
-            self._upgrade.in_session = False  # a bootloader speaks to the tool only
+            self._upgrade.in_session = False  # a bootloader sends only to the tool
         foreign = self._guard.see(frame, self.now)
         for event in self._guard.take_events():
             self.tell(event)
@@ -332,7 +331,7 @@ class UpgradeSession(Runner[Result]):
         if ends or self._upgrade.is_yielding:
             self.interrupt(SecondToolSeen(foreign.seen))
         elif foreign.query is not None and foreign.query not in self._foreign_queries:
-            # It writes nothing, CRC and repetition protect the data: to end here would leave a
+            # It writes nothing, and CRC and repetition protect the data: ending here would leave a
             # device without an application.
             self._foreign_queries.add(foreign.query)
             item = BY_KEY.get((self._plan.target.request_id, foreign.query))

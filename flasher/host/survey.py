@@ -1,8 +1,7 @@
-"""Listening to everything that is on the bus, and asking a little: an engine.
+"""Bus survey: listens to all traffic and sends a few queries; an engine.
 
-It hears for a while without sending, then asks its questions one after the other, and keeps what it
-heard of every sender meanwhile. It says nothing about nodes that it did not hear: a device that is
-on may have nothing to say.
+It listens for a while, then sends its queries one after the other, and records the traffic of every
+node meanwhile. A silent node is not reported as absent: it may have nothing to send.
 """
 
 from __future__ import annotations
@@ -24,34 +23,33 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage, Message
 
 _SENDERS: Final = {can_id(node, to): node for node in Node for to in (None, *Node)}
-"""Who sends under each CAN id of the documents."""
+"""Sender of each documented CAN id."""
 _UPGRADE: Final = {int(command): command.name.lower().replace("_", " ") for command in Command}
 _GIVE_UP_AFTER: Final = 3
-"""Questions without an answer after which a device that was never heard is asked no more."""
+"""Unanswered queries after which a silent device is not asked any more."""
 
 
 @dataclass
 class NodeTraffic:
-    """What was heard of one node."""
+    """Traffic received from one node."""
 
     node: Node
     frames: int = 0
     messages: Counter[str] = field(default_factory=Counter)
-    """How often each message came, by its title with id and command."""
+    """Number of messages, by title with id and command."""
     last: dict[str, Content] = field(default_factory=dict)
-    """The last content of each, where the documents describe it."""
+    """Last content of each documented message."""
     damaged: int = 0
-    """Stretches of bytes that made no message."""
+    """Stretches of bytes that are not a message."""
     boot_version: str = ""
-    """What its bootloader announced, escaped; empty when it did not."""
+    """Announced name and version of its bootloader, escaped; may be empty."""
     not_in_dialect: set[str] = field(default_factory=set)
-    """Titles of messages that the dialect which was asked for does not have."""
+    """Titles of messages that the chosen dialect lacks."""
 
 
 class Survey(Runner[None]):
-    """Hears for `listen_s`, then asks `requests`, unless another tool was heard: a question in the
-    midst of its upgrade would look like a second tool to it. An engine; `heard` is there at any
-    time.
+    """Listens for `listen_s`, then sends `requests`, unless another tool was detected, whose
+    upgrade they would disturb. `heard` is valid at any time.
     """
 
     def __init__(
@@ -65,13 +63,13 @@ class Survey(Runner[None]):
     ) -> None:
         self.heard: dict[Node, NodeTraffic] = {}
         self.queries: list[Query] = []
-        """The questions that were asked, in order."""
+        """Queries sent, in order."""
         self.foreign_frames = 0
-        """Frames under ids that the documents do not give."""
+        """Frames with undocumented ids."""
         self.cancelled = False
-        """It ended before it had listened, or in a question."""
+        """It was cancelled while listening or during a query."""
         self.other_tool_heard = False
-        """Somebody else spoke as CDL while it listened, so that nothing was asked."""
+        """Another tool sent as CDL while listening, so that nothing was queried."""
         self._faults: Faults | None = None
         self._dialect = dialect
         self._ids: set[int] = set()
@@ -84,23 +82,21 @@ class Survey(Runner[None]):
 
     @property
     def faults(self) -> Faults | None:
-        """All faults that the BMS reported, also those that it did not report last; None when it
-        reported none.
-        """
+        """All faults reported by the BMS during the survey; None if none was reported."""
         return self._faults
 
     def guess_dialect(self) -> tuple[Dialect | None, str]:
-        """The dialect that the traffic speaks, and why; None when nothing tells."""
+        """Guess the dialect from the traffic; return it (None if unclear) and the reason."""
         if Node.HMI in self.heard:
-            return MOTINOVA, "a display unit (HMI) sends, which the other dialect does not have"
+            return MOTINOVA, "a display unit (HMI) sends, which the other dialect lacks"
         for heard in self.heard.values():
             if heard.boot_version:
-                return WELLING, "a bootloader announces itself, and the other dialect has none"
+                return WELLING, "a bootloader announces itself, which the other dialect lacks"
         wmc = self.heard.get(Node.WMC)
         for item in catalogue.ITEMS:
             if wmc and item.dialects == (WELLING,) and _title(item) in wmc.messages:
-                return WELLING, f"the WMC sent {item.title!r}, which the other dialect has not"
-        return None, "what was heard is the same in both dialects"
+                return WELLING, f"the WMC sent {item.title!r}, which the other dialect lacks"
+        return None, "the received traffic is the same in both dialects"
 
     # -- listening and asking ---------------------------------------------------------------------
 
@@ -123,7 +119,7 @@ class Survey(Runner[None]):
         report_two_devices(run)
 
     def _while_worth_it(self, requests: Iterable[Request]) -> Iterable[Request]:
-        """The questions, until a device is silent to so many that it seems not to be there."""
+        """Yield the requests until a device is silent to so many that it seems absent."""
         for count, request in enumerate(requests):
             node = request.item.receiver
             if count >= _GIVE_UP_AFTER and node is not None and node not in self.heard:
@@ -131,7 +127,7 @@ class Survey(Runner[None]):
             yield request
 
     def _count(self, frame: Frame) -> bool:
-        """Every frame belongs to its sender; its messages are heard from now on."""
+        """Count a frame for its sender, and receive messages with its id from now on."""
         if frame.is_echo:
             return True
         node = _SENDERS.get(frame.can_id)

@@ -1,10 +1,9 @@
-"""The upgrade as a table: what the host does on every event in every state (appendix 3).
+"""State table of the upgrade, host side: action and next states for every event (appendix 3).
 
-What came over the wire, or which timer fired, is the event; `TABLE[state][event]` names the action,
-a method of `flasher.host.upgrade.UpgradeStage`, and all that it may lead to: states, and endings of
-the upgrade. The guards (is it the packet in work, is a try left) are in the actions, the readings
-R1 to R28 with them. A pair that is not listed cannot happen: it is a bug. The state diagram in the
-documentation is drawn from this table.
+The event is a received message or an expired timer. `TABLE[state][event]` names the action, a
+method of `flasher.host.upgrade.UpgradeStage`, and all states and endings to which it may lead.
+Guards (is it the current packet, is a try left) are in the actions, and so are the readings R1 to
+R28. A missing pair is a bug. The state diagram in the documentation is drawn from this table.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Final, NamedTuple
 
 
 class UpgradeState(Enum):
-    """Where the host stands; the value is how the documentation names it."""
+    """States of the host; the value is the name in the documentation."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
 
@@ -33,7 +32,7 @@ class UpgradeState(Enum):
 
 
 class UpgradeEvent(Enum):
-    """What happened; the value is its name in diagrams."""
+    """Events of the upgrade; the value is the name in diagrams."""
 
     __hash__ = object.__hash__
 
@@ -64,7 +63,7 @@ class UpgradeEvent(Enum):
 
 
 class Ending(Enum):
-    """How an upgrade can end."""
+    """Endings of an upgrade."""
 
     COMPLETED = "completed"
     CONFIRMED_BY_VERSION = "confirmed_by_version"
@@ -99,11 +98,11 @@ ENDED_BEFORE_START: Final = frozenset(
         Ending.UP_TO_DATE,
     }
 )
-"""Endings of a session whose upgrade is never begun: the table does not hold them."""
+"""Endings of a session before its upgrade begins: not in the table."""
 
 
 class Reason(Enum):
-    """Why a message is sent again, or the upgrade begins again."""
+    """Why a message or the whole upgrade is repeated."""
 
     PACKET_REFUSED = "packet_refused"
     PACKET_UNANSWERED = "packet_unanswered"
@@ -112,31 +111,32 @@ class Reason(Enum):
     REQUEST_AGAIN = "request_again"
     """Request transfer before ACK 1."""
     REQUEST_LATE = "request_late"
-    """Request transfer in the middle."""
+    """Request transfer during the transfer."""
     REQUEST_GIVEN_UP = "request_given_up"
     """No request transfer in time, an attempt left."""
     RESTARTED = "restarted"
     """Boot version of a restarted device."""
     BOOT_GIVEN_UP = "boot_given_up"
-    """No boot version of a device that was told to update, an attempt left."""
+    """No boot version from a device that received an update command, an attempt left."""
     BOOT_SILENT = "boot_silent"
-    """No boot version and no answer to the reset for the erase limit: an update command is sent."""
+    """Neither boot version nor answer to the reset for the erase limit: an update command is
+    sent."""
     END_REFUSED = "end_refused"
     """First NAK after end of transfer."""
     END_UNANSWERED = "end_unanswered"
     SECOND_TOOL = "second_tool"
-    """Another tool wrote to the device, and is silent now."""
+    """Another tool wrote to the device and is silent now."""
     LINK_BACK = "link_back"
     """The adapter was lost and is back."""
     QUERY_UNANSWERED = "query_unanswered"
 
 
 class UpgradeTransition(NamedTuple):
-    """What follows an event: the name of the action, and where it may lead."""
+    """Action after an event, and its possible results."""
 
     action: str
     leads_to: tuple[UpgradeState | Ending, ...]
-    """Beside the same state, to which every event may lead."""
+    """Besides the same state, which is always possible."""
 
 
 def _do(action: str, *leads_to: UpgradeState | Ending) -> UpgradeTransition:
@@ -152,7 +152,7 @@ _OF_THE_DEVICE: Final = (
     _E.BOOT_VERSION, _E.REQUEST, _E.ACK, _E.NAK, _E.COMPLETE, _E.UNEXPECTED
 )  # fmt: skip
 _EVERYWHERE: Final[_Row] = {
-    # What the wire brings where nobody waits for it.
+    # Messages that are not expected.
     **dict.fromkeys(_OF_THE_DEVICE, REPORTED),
     _E.FEEDBACK: IGNORED,
     _E.TWO_DEVICES: _do("end_for_two_devices", _X.TWO_DEVICES),
@@ -181,7 +181,7 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
     _S.RESETTING: _EVERYWHERE | {
         _E.FEEDBACK: _do("await_boot", _S.AWAITING_BOOT),
         _E.BOOT_VERSION: _TAKE_BOOT,
-        # A device that sits in its bootloader does not know the reset (R18): go on.
+        # A bootloader does not know the reset (R18): continue.
         _E.RESET_UNANSWERED: _do("repeat_reset", _S.RESETTING, _S.AWAITING_BOOT),
     },
     _S.AWAITING_BOOT: _EVERYWHERE | {
@@ -192,7 +192,7 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
         ),
         _E.LINK_BACK: _do("wait_or_begin_again", _S.AWAITING_BOOT, _S.RESETTING),
     },
-    # The update command erases: before it, a second bootloader has a moment to show itself (R27).
+    # The update command erases: wait briefly for a second bootloader before sending it (R27).
     _S.WATCHING: _EVERYWHERE | {
         _E.BOOT_VERSION: _do("watch_on", _X.WRONG_DEVICE),
         _E.FEEDBACK: _do("watch_on", _S.AWAITING_BOOT),
@@ -221,11 +221,11 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
         _E.REQUEST: _REQUESTED,
         _E.BOOT_VERSION: _ANNOUNCED,
         _E.COMPLETE: _do("end_broken", _X.BROKEN_PROTOCOL),
-        # A device that has stored the packet answers it all the same (R10).
+        # A device that already stored the packet answers it again (R10).
         _E.LINK_BACK: _do("resend_packet", _S.TRANSFERRING),
     },
-    # A packet was sent more than once and not every copy is answered: the next message waits, or
-    # one late answer would double every later packet (R10).
+    # A packet was sent more than once, and not every copy is answered: wait, or one late answer
+    # would double every later packet (R10).
     _S.SETTLING: _EVERYWHERE | {
         _E.ACK: _ANSWERED,
         _E.NAK: _ANSWERED,
@@ -244,7 +244,7 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
         _E.COMPLETE: _COMPLETED,
         _E.END_UNANSWERED: _do("miss_end", _S.ENDING, _S.CONFIRMING, _X.UNCONFIRMED),
         _E.BOOT_VERSION: _do("take_boot_after_end", _S.WATCHING, _X.RESTARTED),
-        # Every packet is acknowledged: whatever was lost, only the end is missing.
+        # Every packet is acknowledged: only the end is missing.
         _E.LINK_BACK: _do("resend_end", _S.ENDING),
     },
     _S.CONFIRMING: _EVERYWHERE | {
@@ -258,13 +258,12 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
         _E.BOOT_VERSION: _do("take_boot_after_end", _S.WATCHING, _X.RESTARTED),
         _E.LINK_BACK: _do("query_version", _S.CONFIRMING),
     },
-    # Nothing is sent, whatever the device answers to the other tool.
+    # Send nothing, whatever the device answers to the other tool.
     _S.YIELDING: _EVERYWHERE | dict.fromkeys(_OF_THE_DEVICE, IGNORED) | {
         _E.TOOL_QUIET: _do("take_turn", _S.RESETTING),
         _E.LINK_BACK: _do("yield_on", _S.YIELDING),
     },
-    # The outcome is known; what was begun to be sent is finished, so that the bus is left at a
-    # message boundary. Nothing that arrives is looked at any more.
+    # The outcome is known; finish a partly sent message, and ignore everything received.
     _S.STOPPING: {},
     _S.DONE: {},
 }  # fmt: skip
@@ -280,4 +279,4 @@ TIMERS: Final[Mapping[UpgradeState, UpgradeEvent]] = {
     _S.CONFIRMING: _E.VERSION_UNANSWERED,
     _S.YIELDING: _E.TOOL_QUIET,
 }
-"""What the timer of each state means when it fires; a state has one."""
+"""Event of the one timer of each state."""

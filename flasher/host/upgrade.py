@@ -1,9 +1,9 @@
-"""The upgrade of appendix 3 as the tool sees it: a stage of `flasher.host.runner`; pure.
+"""The upgrade of appendix 3, host side: a stage of `flasher.host.runner`; pure.
 
-How to read it: a message, an expired timer or the user's word becomes an event, `table.TABLE` names
-the action, and the actions are the methods below, in the order of the states. An action holds the
-guards and the readings that go with its event (R2, R6, R10, R11, R16, R18, R26, R27), goes to a
-state that the table allows it, and sends what follows. A timer starts when a message has left.
+A message, an expired timer or a cancellation becomes an event, `table.TABLE` names the action, and
+the actions are the methods below, in the order of the states. An action checks the guards and
+readings of its event (R2, R6, R10, R11, R16, R18, R26, R27), enters a state that the table allows,
+and sends the next message. A timer starts when a message was sent.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from flasher.protocol.text import boot_version_number, printable
 from flasher.protocol.wire import Damage, Message, encode, split
 
 ReceivedContent = UpgradeMessage | Malformed | Unknown | Content | None
-"""The message behind an event; None for a timer or the user's word."""
+"""Message of an event; None for a timer or a cancellation."""
 
 _EVENTS: Final[dict[type, UpgradeEvent]] = {
     Ack: UpgradeEvent.ACK,
@@ -59,7 +59,7 @@ _EVENTS: Final[dict[type, UpgradeEvent]] = {
     Complete: UpgradeEvent.COMPLETE,
     GeneralFeedbackMessage: UpgradeEvent.FEEDBACK,
 }
-"""The events of messages; all others are unexpected."""
+"""Events of messages; all others are unexpected."""
 _PHASES: Final = {
     UpgradeState.RESETTING: Phase.RESET,
     UpgradeState.AWAITING_BOOT: Phase.BOOT,
@@ -70,9 +70,9 @@ _PHASES: Final = {
     UpgradeState.ENDING: Phase.END,
     UpgradeState.CONFIRMING: Phase.CONFIRM,
 }
-"""Phases that people are told, by state; the other states leave the phase as it is."""
+"""Reported phase of each state; other states keep the phase."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
-"""Reasons for an attempt that begins with the update command: the bootloader is there."""
+"""Reasons for an attempt that begins with the update command, because the bootloader is present."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
 _LEFT_SO: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
@@ -80,15 +80,15 @@ _LEFT_SO: Final = {
     Ending.REFUSED: DeviceLeft.NO_APPLICATION,
     Ending.RESTARTED: DeviceLeft.NO_APPLICATION,
 }
-"""Endings that by themselves say what the device has."""
+"""Endings that determine the state of the device."""
 
 
-class LinkRestored(Exception):  # noqa: N818  it is good news
-    """The adapter was lost and works again."""
+class LinkRestored(Exception):  # noqa: N818  not an error
+    """The lost adapter was opened again."""
 
 
-class SecondToolSeen(Exception):  # noqa: N818  the name says what it is about
-    """Somebody else sends what only the tool may send; `seen` says what was seen."""
+class SecondToolSeen(Exception):  # noqa: N818  not an error
+    """Another tool sent a frame that only the tool may send; `seen` describes it."""
 
     def __init__(self, seen: str) -> None:
         super().__init__(seen)
@@ -97,7 +97,7 @@ class SecondToolSeen(Exception):  # noqa: N818  the name says what it is about
 
 @dataclass
 class _Attempt:
-    """What is known of one attempt; times in seconds on the runner's clock."""
+    """State of one attempt; times in seconds on the runner's clock."""
 
     feedback_came: bool = False
     """The reset was answered: an application runs."""
@@ -110,11 +110,11 @@ class _Attempt:
     request_at: float = 0.0
 
     packet: int = 0
-    """The number of the packet in work, from 1 on."""
+    """Number of the current packet, from 1."""
     tries: int = 0
-    """How often it was begun to be sent."""
+    """Number of transmissions begun."""
     copies_unanswered: int = 0
-    """Copies of it that have left and were not answered."""
+    """Copies sent but not answered."""
     accepted: bool = False
     """One of its copies was acknowledged."""
 
@@ -122,14 +122,14 @@ class _Attempt:
     end_copies_left: int = 0
     end_naks: int = 0
     announced_at: float | None = None
-    """When the first of the boot versions came that follow each other since end of transfer."""
+    """Time of the first of the consecutive boot versions since end of transfer."""
     announced_last_at: float = 0.0
     running_version: str | None = None
 
 
 class UpgradeStage:
-    """One upgrade of one device with one plan. Begins with a reset, or, when the device was `heard`
-    to announce its boot version already, with the answer to that.
+    """One upgrade of one device. Begins with a reset, or, if the device was `heard` announcing its
+    boot version, with the answer to that.
     """
 
     def __init__(self, run: Runner[Any], plan: Plan, options: UpgradeOptions) -> None:
@@ -148,15 +148,15 @@ class UpgradeStage:
             for move in row.values()
         }
         self.heard: Message | None = None
-        """A boot version that was received before the beginning."""
+        """Boot version received before the beginning."""
         self.in_session = options.in_session
         """An earlier upgrade may have left the device in its session (R26): no application was
         detected, and no update command was sent yet."""
         self.unchecked: CheckResult | None = None
-        """A rule that the silent device could not be asked for. It refuses the device unless that
-        turns out to sit in a session, and so to have no application."""
+        """Rule that the silent device could not answer. It refuses the device, unless the device
+        turns out to be in an open session and so to have no application."""
         self.state = UpgradeState.RESETTING
-        """The row of the table that is in force."""
+        """Current row of the table."""
         self._state_since = 0.0
         self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
         self._asks_for_power = options.at_power_up
@@ -167,38 +167,38 @@ class UpgradeStage:
         self._ending: tuple[Ending, str] | None = None
         self._outcome: Outcome | None = None
 
-        # What outlives an attempt.
+        # State that outlives an attempt.
         self._at = _Attempt()
         self._attempt = 1
         self._heard_at = -inf
-        """When the device was heard last, or could not be heard as the adapter was away."""
+        """When the device last sent something, or may have while the adapter was lost."""
         self._update_left_at = -inf
-        """When the last update command left."""
+        """When the last update command was sent."""
         self._silence_was_answered = False
-        """An update command was sent into the silence of a device (R26)."""
+        """An update command was sent to a silent device (R26)."""
         self._attempts = options.planned_attempts
-        """How many there may be. Those that look for a session left open are not among them."""
+        """Maximum number of attempts, without those that look for an open session."""
         self._last_boot: BootVersion | None = None
         self._erasures = self._whole_transfers = 0
-        """How often request transfer came (the old application is gone then), and in how many of
-        the attempts end of transfer left."""
+        """Number of request transfers (the old application is then gone), and of attempts that sent
+        end of transfer."""
         self._failure: tuple[Ending, ReceivedContent] | None = None
-        """How an attempt before would have ended the upgrade, had it been the last."""
+        """How an earlier attempt would have ended the upgrade as the last one."""
         self._failed_packet: int | None = None
-        """The packet that ended an earlier attempt."""
+        """Packet that ended an earlier attempt."""
         self._nak_next_seen = False
-        """A repeated packet n was answered with NAK n+1, and that was not taken for an ACK."""
+        """A repeated packet n was answered with NAK n+1, which was not accepted as ACK."""
         self._second_tool = ""
-        """What somebody else was seen to send."""
+        """Description of a frame of a second tool."""
 
         self._acknowledged = self._repetitions = self._naks = self._timeouts = 0
         self._transfer_s: float | None = None
 
-    # -- how it stands ---------------------------------------------------------------------------
+    # -- progress --------------------------------------------------------------------------------
 
     @property
     def standing(self) -> str:
-        """Phase, packet and attempt in words."""
+        """Describe phase, packet and attempt."""
         return standing(self._phase, self._packet, self._plan.total_packets, self._attempt)
 
     @property
@@ -215,18 +215,18 @@ class UpgradeStage:
 
     @property
     def _was_told_to_update(self) -> bool:
-        """True when an update command has left: the device may have erased its application."""
+        """True if an update command was sent: the device may have erased its application."""
         return self._update_left_at > -inf
 
     @property
     def has_begun_to_erase(self) -> bool:
-        """True once an update command is sent, or being sent."""
+        """True once an update command is being sent or was sent."""
         is_leaving = self.state is UpgradeState.AWAITING_REQUEST and self._tx.begun
         return self._was_told_to_update or is_leaving
 
     @property
     def device_left(self) -> DeviceLeft:
-        """The state that the device would be left in if nothing more were sent."""
+        """State of the device if nothing more were sent."""
         if self._at.end_copies_left:
             return DeviceLeft.UNKNOWN
         if self._erased:
@@ -235,25 +235,25 @@ class UpgradeStage:
 
     @property
     def may_begin_again(self) -> bool:
-        """True when an attempt is left, or none is needed to go on after the adapter was lost."""
+        """True if an attempt is left, or none is needed to continue after the adapter was lost."""
         return not self._is_last_attempt or self._ending is not None or self._is_updating
 
     @property
     def _is_updating(self) -> bool:
-        """True once the update command of this attempt has left: from there on, an adapter that is
-        back goes on where it stood.
+        """True once the update command of this attempt was sent: after that, a restored adapter
+        continues the same attempt.
         """
         return self._at.first_update_left_at is not None
 
     @property
     def goes_on(self) -> bool:
-        """True when only the overall deadline ends the attempts: the device has no application to
-        lose, as far as is known, and nobody has limited them.
+        """True if only the overall deadline limits the attempts: the device has no application to
+        lose, as far as is known, and the user set no limit.
         """
         options = self._options
         if options.attempts is not None or self._erasures >= ERASURES_MAX:
             return False
-        # An image that was taken as a whole and not accepted is as good as refused.
+        # A complete transfer that was not accepted counts as a refusal.
         if self._whole_transfers >= options.planned_attempts:
             return False
         # An application that answers the reset is not erased.
@@ -261,7 +261,7 @@ class UpgradeStage:
 
     @property
     def is_yielding(self) -> bool:
-        """True while another tool is waited for to be silent."""
+        """True while waiting for another tool to become silent."""
         return self.state is UpgradeState.YIELDING
 
     @property
@@ -272,7 +272,7 @@ class UpgradeStage:
 
     @property
     def _has_begun(self) -> bool:
-        """The device was told to update, and not only into its silence."""
+        """True if the device received an update command, and not only into its silence."""
         was_heard = self._last_boot is not None or self._erased
         return was_heard and self._was_told_to_update
 
@@ -292,7 +292,7 @@ class UpgradeStage:
     # -- the stage -------------------------------------------------------------------------------
 
     def stage(self, deadline_at: float | None = None) -> Stage[Outcome]:
-        """Run it to its end. `deadline_at` is the overall deadline; None computes it."""
+        """Run the upgrade; `deadline_at` is the overall deadline, None computes it."""
         self._began_at = self._state_since = self._run.now
         if deadline_at is None:
             deadline_at = self._run.now + overall_timeout_s(self._plan, self._options)
@@ -310,7 +310,7 @@ class UpgradeStage:
         if self.heard is not None:
             self._take(self.heard)
         if self.state is UpgradeState.WATCHING and not self._options.at_power_up:
-            # A bootloader does not know the reset (R18), but another device's application does.
+            # A bootloader ignores the reset (R18), but another device's application answers it.
             self._send_reset()
         while self._outcome is None:
             is_stopping = self._ending is not None
@@ -318,12 +318,12 @@ class UpgradeStage:
                 came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
             except LinkRestored:
                 self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * WELL_BEYOND)
-                self._heard_at = self._run.now  # nobody knows what it said meanwhile
+                self._heard_at = self._run.now  # it may have sent something meanwhile
                 self._dispatch(UpgradeEvent.LINK_BACK)
-            except SecondToolSeen as heard:
-                # Not one frame more is sent, not even the rest of a message.
+            except SecondToolSeen as tool:
+                # Send nothing more, not even the rest of a message.
                 self._tx.abandon(self._run.now)
-                self._second_tool = heard.seen
+                self._second_tool = tool.seen
                 self._dispatch(UpgradeEvent.SECOND_TOOL)
             else:
                 self._take(came)
@@ -385,7 +385,7 @@ class UpgradeStage:
         return self.state if self._ending is None else self._ending[0]
 
     def _go(self, state: UpgradeState) -> None:
-        """Another state begins, perhaps another phase with it."""
+        """Enter another state, and its phase."""
         if state is self.state:
             return
         self.state, self._state_since = state, self._run.now
@@ -404,7 +404,7 @@ class UpgradeStage:
         self._run.send(frames, not_before=not_before, tag=row.COMMAND)
 
     def _send_reset(self) -> None:
-        """What makes the application restart into the bootloader; a product may have its own."""
+        """Send the reset of the document or of the product."""
         options, request_id = self._options, self._plan.target.request_id
         reset = Message(request_id, Mode.WRITE, options.reset_command, options.reset_data)
         self._timer_at = inf
@@ -451,7 +451,7 @@ class UpgradeStage:
             self._timer_at = left_at + wait_s
 
     def _wait_after(self, tag: object) -> float | None:
-        """How long the answer to a message that has left is waited for in this state."""
+        """How long to wait in this state for the answer to a message."""
         timings = self._timings
         match tag, self.state:
             case _, UpgradeState.WATCHING:
@@ -478,7 +478,7 @@ class UpgradeStage:
         pass
 
     def _report(self, row: ReceivedContent, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
-        """Tell of something that came where it has no place."""
+        """Report an unexpected message."""
         match row:
             case Malformed(message, problem):
                 what = f"message {message.command:04X} from {message.can_id:03X} ignored: {problem}"
@@ -491,28 +491,28 @@ class UpgradeStage:
         self._run.tell(events.Reported(what))
 
     def _fail(self, ending: Ending, row: ReceivedContent, reason: Reason) -> None:
-        """Begin another attempt, or end where none is left."""
+        """Begin another attempt, or end if none is left."""
         if self._is_last_attempt:
             self._end(ending, row)
             return
         if self._failure is None or ending not in _SILENT:
-            self._failure = (ending, row)  # that it is silent since then says less
+            self._failure = (ending, row)  # later silence is less informative
         if reason in _FROM_THE_UPDATE:
             self._start_over(row, reason)
         else:
             self._begin_again(row, reason)
 
     def _begin_again(self, row: ReceivedContent, reason: Reason = Reason.LINK_BACK) -> None:
-        """Another attempt, from the reset on."""
+        """Begin another attempt with the reset."""
         if self.state is UpgradeState.RESETTING and self.goes_on:
-            self._send_reset()  # nothing was begun in this attempt
+            self._send_reset()  # this attempt has not begun
             return
         self._next_attempt(reason)
         self._go(UpgradeState.RESETTING)
         self._send_reset()
 
     def _start_over(self, row: ReceivedContent, reason: Reason) -> None:
-        """Another attempt, with a bootloader that is there: from the update command on."""
+        """Begin another attempt with the update command: the bootloader is present."""
         self._next_attempt(reason)
         if isinstance(row, BootVersion):
             self._note_boot(row)
@@ -535,7 +535,7 @@ class UpgradeStage:
         self._run.tell(events.MessageRepeated(what, reason.value, tries))
 
     def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
-        """The device has lost what it had received."""
+        """Handle a device that lost the transfer."""
         self._fail(Ending.RESTARTED, row, reason)
 
     # -- actions: up to the update command --------------------------------------------------------
@@ -561,7 +561,7 @@ class UpgradeStage:
             self._run.tell(events.PowerCycleAwaited(wait_s))
 
     def _wait_or_begin_again(self, row: ReceivedContent) -> None:
-        """Nothing is sent to a device that has not announced itself at power-up."""
+        """Send nothing to a device that has not announced itself at power-up."""
         if self._asks_for_power and not self._has_begun:
             self._wait_for_boot()
         else:
@@ -581,9 +581,9 @@ class UpgradeStage:
             self._watch()
 
     def _watch(self) -> None:
-        """Give a second device the time to show itself: by its announcement, by its answer to what
-        was sent before (`_message_left`), or, where an application beside the bootloader has
-        answered the reset, by the announcements that follow.
+        """Wait for evidence of a second device: its announcement, its answer to an earlier message
+        (`_message_left`), or, if an application next to the bootloader answered the reset, the
+        announcements that follow.
         """
         now, timings, at = self._run.now, self._timings, self._at
         self._go(UpgradeState.WATCHING)
@@ -602,7 +602,7 @@ class UpgradeStage:
             return
         answer_id = self._plan.target.answer_id
         if not self._duplicates.is_beside and not self._duplicates.has_announced(answer_id):
-            # What was heard before the reset has ended: an application is there, and restarts.
+            # Announcements before the reset have ended: an application is present and restarts.
             self._await_boot(row)
             return
         if self._duplicates.is_beside:
@@ -620,11 +620,11 @@ class UpgradeStage:
         return BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
 
     def _answer_boot(self, row: ReceivedContent) -> None:
-        """Nothing speaks for a second device."""
+        """Send the update command: no evidence of a second device."""
         at = self._at
         has_ended = self._run.now < at.watched_until
         if self._duplicates.is_beside and has_ended and not at.was_reset_again:
-            # The announcements have ended, and an application is there: it is reset.
+            # The announcements have ended, and an application is present: reset it.
             at.was_reset_again = True
             self._go(UpgradeState.RESETTING)
             self._send_reset()
@@ -638,7 +638,7 @@ class UpgradeStage:
         return boot.name != self._plan.target.boot_name or not boot.is_version
 
     def _note_boot(self, boot: BootVersion) -> None:
-        """Tell the first boot version of the attempt."""
+        """Report the first boot version of the attempt."""
         if self._at.boot is not None:
             return
         self._at.boot = self._last_boot = boot
@@ -649,7 +649,9 @@ class UpgradeStage:
             self._run.tell(events.CheckMade("boot-version", "passed", text))
 
     def _miss_boot(self, row: ReceivedContent) -> None:
-        """No boot version came; a device that may sit in a session is not left alone (R26)."""
+        """Handle a missing boot version; a device that may be in an open session gets an update
+        command (R26).
+        """
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
@@ -659,8 +661,8 @@ class UpgradeStage:
             elif self._run.now < erased_at:
                 self._timer_at = erased_at
             else:
-                # It may sit in a session that never ends and knows no reset: an update command goes
-                # into the silence, once, or, where nothing can be lost, after each erase limit.
+                # It may be in a session that never ends and knows no reset: send an update command
+                # into the silence, once, or after each erase limit if nothing can be lost.
                 self._silence_was_answered = True
                 self._attempts += self.in_session
                 self._fail(self._silent_ending, row, Reason.BOOT_SILENT)
@@ -672,13 +674,13 @@ class UpgradeStage:
 
     @property
     def _silent_ending(self) -> Ending:
-        """How it ends where the device stays silent."""
+        """Ending for a device that stays silent."""
         if self._failed_packet is not None:
             return Ending.PACKET_FAILED
         return Ending.NO_ANNOUNCEMENT if self._asks_for_power else Ending.NO_BOOT_VERSION
 
     def _answer_boot_again(self, boot: BootVersion) -> None:
-        """After an update command was sent, before request transfer (R2)."""
+        """Handle a boot version between update command and request transfer (R2)."""
         now, timings, at = self._run.now, self._timings, self._at
         first_at = at.first_update_left_at
         if self._is_foreign(boot):
@@ -686,7 +688,7 @@ class UpgradeStage:
         elif self.unchecked is not None:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
         elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
-            pass  # too soon to be an answer to the update command
+            pass  # too early for an answer to the update command
         elif first_at is not None and now - first_at > timings.request_transfer_timeout_s:
             self._miss_hearing(boot)
         else:
@@ -694,7 +696,7 @@ class UpgradeStage:
             self._send_update()
 
     def _miss_hearing(self, boot: BootVersion) -> None:
-        """It announces itself for as long as an erase may take, whatever it is told."""
+        """Handle a device that keeps announcing itself for the whole erase limit."""
         if self._erased:
             self._fail(Ending.UNHEARING, boot, Reason.REQUEST_GIVEN_UP)
         else:
@@ -721,7 +723,7 @@ class UpgradeStage:
 
     def _send_first_packet(self, row: ReceivedContent) -> None:
         if self._at.first_update_left_at is None:
-            self._report(row)  # it answers another update command: a late copy
+            self._report(row)  # late answer to another update command
             return
         self._go(UpgradeState.TRANSFERRING)
         self._tx.drop_unstarted()
@@ -743,10 +745,10 @@ class UpgradeStage:
         self._send_packet()
 
     def _take_answer(self, answer: Ack | Nak) -> None:
-        """Find out which copy it answers (R10)."""
+        """Find out which copy was answered (R10)."""
         at, accepts = self._at, isinstance(answer, Ack)
         if answer.number > at.packet:
-            # "I want n+1": some bootloaders answer a repeated n so.
+            # Some bootloaders answer a repeated n with NAK n+1: "I want n+1".
             is_next = answer.number == at.packet + 1 and not accepts and at.tries > 1
             if not (is_next and self._options.nak_next_is_ack):
                 self._nak_next_seen = self._nak_next_seen or is_next
@@ -756,7 +758,7 @@ class UpgradeStage:
         is_sending = self._tx.due_at < inf
         first_copy_is_out = at.tries > 1 or not is_sending
         is_stale = answer.number < at.packet or (
-            # It answers a copy that is answered already, or none at all.
+            # It answers a copy that was already answered, or none.
             not at.copies_unanswered and not (accepts and first_copy_is_out)
         )
         if is_stale:
@@ -771,7 +773,7 @@ class UpgradeStage:
             self._settle(answer)
 
     def _settle(self, row: ReceivedContent) -> None:
-        """Every copy of the packet is answered, or will not be any more."""
+        """Continue after every copy of the packet was answered, or the wait for answers ended."""
         at, total = self._at, self._plan.total_packets
         if not at.accepted:
             self._repeat_packet(row, Reason.PACKET_REFUSED)
@@ -793,7 +795,7 @@ class UpgradeStage:
         self._repeat_packet(row, Reason.PACKET_UNANSWERED)
 
     def _repeat_packet(self, row: ReceivedContent, reason: Reason) -> None:
-        """Send it once more, as long as it has a try left."""
+        """Send the packet again while a try is left."""
         if self._is_last_try:
             self._packet_lost(row)
             return
@@ -810,13 +812,13 @@ class UpgradeStage:
 
     def _await_quiet(self, row: ReceivedContent) -> None:
         self._go(UpgradeState.SETTLING)
-        # While a copy is still leaving, the time starts when it has (see _message_left).
+        # While a copy is being sent, the time starts at its end (see _message_left).
         if self._tx.idle:
             quiet_s = self._timings.quiet_after_repeat_s
             self._timer_at = max(self._run.now, self._tx.left_at) + quiet_s
 
     def _take_late_request(self, row: RequestTransfer) -> None:
-        """Request transfer during the transfer (R16)."""
+        """Handle request transfer during the transfer (R16)."""
         if self._at.packet > 1 or self._at.accepted:
             self._restarted(row, Reason.REQUEST_LATE)
         elif not self._tx.idle:
@@ -829,7 +831,7 @@ class UpgradeStage:
             self._repeat_packet(row, Reason.REQUEST_AGAIN)
 
     def _take_boot_in_transfer(self, boot: BootVersion) -> None:
-        """A leftover of the announcements, or the device has restarted (R11)."""
+        """Handle a leftover of the announcements, or a restart of the device (R11)."""
         if self._run.now - self._at.request_at <= self._timings.leftover_boot_version_s:
             self._report(boot, "leftover boot version")
         elif self._is_foreign(boot):
@@ -840,10 +842,10 @@ class UpgradeStage:
     # -- actions: after the last packet -----------------------------------------------------------
 
     def _take_end_nak(self, nak: Nak) -> None:
-        """Once more at the first one; its number does not matter (R6)."""
+        """Repeat end of transfer after the first NAK; its number does not matter (R6)."""
         at = self._at
         if at.end_copies_left <= at.end_naks:
-            return  # it answers a packet
+            return  # answers a packet
         at.end_naks += 1
         if at.end_naks > 1:
             self._end(Ending.REFUSED, nak)
@@ -877,13 +879,14 @@ class UpgradeStage:
         self._end(Ending.COMPLETED if was_told else Ending.BROKEN_PROTOCOL, row)
 
     def _take_boot_after_end(self, boot: BootVersion) -> None:
-        """A burst is the new application starting; a device that announces on did not accept.
+        """Handle announcements after the end: a burst comes from the new application's start; a
+        device that continues to announce itself did not accept.
 
         Judged by time, not by count: a doubled frame must not erase a good image.
         """
         at, now = self._at, self._run.now
         if not at.end_copies_left and not self._tx.begun:
-            # It announces itself before it can have heard of the end.
+            # It announces itself before it can have received the end.
             self._restarted(boot, Reason.RESTARTED)
             return
         if at.announced_at is None or now - at.announced_last_at > self._burst_s:
@@ -900,7 +903,7 @@ class UpgradeStage:
     def _query_version(self, row: ReceivedContent) -> None:
         request = self._options.version_request_for(self._plan.target)
         if request is None:
-            raise RuntimeError("the table asks for a version that nobody can be asked for")
+            raise RuntimeError("the table asks for a version without a version query")
         query = catalogue.encode(request.item, request.content)
         self._timer_at = inf
         self._run.send(split(query.can_id, encode(query)), tag=Command.READ_VERSION)
@@ -925,8 +928,8 @@ class UpgradeStage:
     # -- actions: beside another tool -------------------------------------------------------------
 
     def _yield_or_end(self, row: ReceivedContent) -> None:
-        """Another tool writes. A device that has no application is upgraded again when that tool is
-        silent; one that may be complete, or untouched, is left to who looks at it.
+        """Handle another tool that writes. A device without application is upgraded again when that
+        tool is silent; one that may be complete, or untouched, is left to the user.
         """
         is_complete_perhaps = self._at.end_copies_left > 0
         is_erased_perhaps = self._was_told_to_update and not is_complete_perhaps
@@ -943,7 +946,9 @@ class UpgradeStage:
         self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
 
     def _take_turn(self, row: ReceivedContent) -> None:
-        self._run.duplicates = DuplicateDetector(self._timings)  # what came answered the other tool
+        self._run.duplicates = DuplicateDetector(
+            self._timings
+        )  # earlier answers were for the other tool
         self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
 
     # -- the end ---------------------------------------------------------------------------------
@@ -955,7 +960,9 @@ class UpgradeStage:
         self._end(Ending.TWO_DEVICES, row, self._duplicates.evidence)
 
     def _end_out_of_time(self, row: ReceivedContent) -> None:
-        """End as an attempt before would have, where it went on only for nothing to lose."""
+        """End like an earlier attempt, if the upgrade continued only because nothing could be
+        lost.
+        """
         ending = Ending.OUT_OF_TIME
         if self.is_yielding:
             ending = Ending.SECOND_TOOL
@@ -970,7 +977,7 @@ class UpgradeStage:
         self._end(Ending.CANCELLED, row)
 
     def _end(self, ending: Ending, row: ReceivedContent, detail: str = "") -> None:
-        """End as soon as a message that is half sent has left; device text is escaped."""
+        """End as soon as a partly sent message is complete; device text is escaped."""
         if isinstance(row, BootVersion):
             detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
         elif ending is Ending.PACKET_FAILED and self._nak_next_seen:
@@ -991,7 +998,7 @@ class UpgradeStage:
         self.state = UpgradeState.DONE
         phase, packet, boot = self._phase, self._packet, self._last_boot
         if ending is Ending.PACKET_FAILED and packet is None:
-            # It failed in an earlier attempt, and the device did not come back for this one.
+            # It failed in an earlier attempt, and the device was silent in this one.
             phase, packet = Phase.TRANSFER, self._failed_packet
         self._outcome = Outcome(
             ending=ending,
@@ -1018,7 +1025,7 @@ class UpgradeStage:
 
 
 class Upgrade(Runner[Outcome]):
-    """One upgrade alone as an engine: nobody is asked before, nothing is verified after."""
+    """One upgrade as an engine, without identification and verification."""
 
     def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
         chosen = options or UpgradeOptions()
@@ -1032,20 +1039,20 @@ class Upgrade(Runner[Outcome]):
 
     @property
     def outcome(self) -> Outcome:
-        """How it ended. Raises RuntimeError while it has not."""
+        """Raises RuntimeError before the end."""
         return self.result
 
     @property
     def state(self) -> UpgradeState:
-        """The row of the table that is in force."""
+        """Current row of the table."""
         return self._upgrade.state
 
     def link_back(self, now: float) -> None:
-        """The adapter was lost and works again."""
+        """Continue after the lost adapter was opened again."""
         self.now = now
         self.interrupt(LinkRestored())
 
     def second_tool(self, seen: str, now: float) -> None:
-        """Somebody else sends what only the tool may send; `seen` says what was seen."""
+        """Handle a frame of a second tool; `seen` describes it."""
         self.now = now
         self.interrupt(SecondToolSeen(seen))

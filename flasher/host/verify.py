@@ -1,7 +1,7 @@
-"""What "verified" means after an upgrade, and the stages that find it out.
+"""Verification after an upgrade, as stages and engines.
 
-`version`: the new application answers, and names the version that the image names. `memory`: every
-byte of the image is read back.
+`version`: the new application answers with the version named in the image. `memory`: every byte of
+the image is read back.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Level(Enum):
 
 
 class Verdict(Enum):
-    """What the verification found."""
+    """Result of the verification."""
 
     NOT_ASKED = "not_asked"
     VERSION_RIGHT = "version_right"
@@ -61,7 +61,7 @@ GOOD: Final = frozenset(
 
 @dataclass(frozen=True)
 class Verification:
-    """The result: level asked for, verdict, version that the application answers (escaped)."""
+    """Requested level, verdict, and the version answered by the application (escaped)."""
 
     level: Level
     verdict: Verdict
@@ -70,11 +70,11 @@ class Verification:
 
     @property
     def ok(self) -> bool:
-        """True when nothing speaks against the new image."""
+        """True unless something contradicts the new image."""
         return self.verdict in GOOD
 
     def error(self, target: Target) -> FlasherError | None:
-        """The error that stands for it; None when there is none."""
+        """Create the error for the verdict; None for a good one."""
         if self.ok:
             return None
         what = f"{target.node.name}: completed, but {wording(self.verdict)}"
@@ -117,8 +117,8 @@ NOT_ASKED: Final = Verification(Level.NONE, Verdict.NOT_ASKED)
 
 
 def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tuple[Level, ...]:
-    """What can be verified on a target: the document gives queries for the BMS only, a product may
-    have a version query of its own.
+    """Return the possible levels for a target: the document has queries for the BMS only; a product
+    may have its own version query.
     """
     levels = [Level.NONE]
     if (options or UpgradeOptions()).version_request_for(target) is not None:
@@ -129,23 +129,23 @@ def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tu
 
 
 def as_level(level: Level | str) -> Level:
-    """A level of verification by its name. Raises UsageError."""
+    """Return the level of this name. Raises UsageError."""
     try:
         return Level(level)
     except ValueError:
         names = ", ".join(each.value for each in Level)
-        raise UsageError(f"There is no verification {level!r}; there are {names}.") from None
+        raise UsageError(
+            f"There is no verification level {level!r}; the levels are {names}."
+        ) from None
 
 
 def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
-    """How far an upgrade of a target is verified unless somebody says otherwise: by its version
-    where there is a query for it.
-    """
+    """Default level of a target: by version if it has a version query."""
     return Level.VERSION if Level.VERSION in possible_levels(target, options) else Level.NONE
 
 
 def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None) -> None:
-    """Raise UsageError when an upgrade cannot be verified so."""
+    """Raise UsageError if this level is impossible for the upgrade."""
     if level not in possible_levels(plan.target, options):
         raise UsageError(
             f"A {plan.target.node.name} cannot be verified by {level.value}.",
@@ -156,12 +156,12 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
         raise UsageError(
             "The memory cannot be read back without addresses.",
             cause=f"{plan.image.source} is a raw binary",
-            remedy="Say with --base where its first byte lies.",
+            remedy="Give the address of its first byte with --base.",
         )
 
 
 def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
-    """An engine that waits for the new application and asks for its version."""
+    """Create an engine that waits for the new application and asks for its version."""
     return Runner(
         lambda run: check_version(run, plan, options),
         bitrate_bps=plan.bitrate_bps,
@@ -172,7 +172,9 @@ def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
 def memory_check(
     plan: Plan, options: UpgradeOptions, running_version: str | None
 ) -> Runner[Verification]:
-    """An engine that reads the whole image back. Raises ValueError for one without a base."""
+    """Create an engine that reads the whole image back. Raises ValueError for an image without
+    base.
+    """
     if plan.image.base is None:
         raise ValueError("an image without a base cannot be read back")
     return Runner(
@@ -183,12 +185,12 @@ def memory_check(
 
 
 def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stage[Verification]:
-    """Wait for the new application and ask for its version. Raises ValueError when nobody knows how
-    to ask this target.
+    """Wait for the new application and ask for its version. Raises ValueError if the target has no
+    version query.
     """
     request = options.version_request_for(plan.target)
     if request is None:
-        raise ValueError("nobody knows how to ask this target for its version")
+        raise ValueError("this target has no version query")
     give_up_at = run.now + run.timings.application_start_timeout_s
     while True:
         query = yield from ask(run, Query(request, quiet=True))
@@ -213,7 +215,7 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
 
 
 def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:
-    """Read the whole image back and compare it. The image has a base."""
+    """Read the whole image back and compare it; the image must have a base."""
     data, base = plan.image.data, plan.image.base or 0
 
     def found(verdict: Verdict, detail: str = "") -> Verification:

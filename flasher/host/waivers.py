@@ -1,4 +1,4 @@
-"""The checks before an upgrade that a person may waive, each by its name."""
+"""Checks before an upgrade that the user can waive, by name."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from flasher.i18n import text
 
 
 class Waiver(NamedTuple):
-    """A check that may be waived."""
+    """A check that can be waived."""
 
     lets_through: str
     risk: str
-    """What may happen when the check was right."""
+    """Possible consequence if the check was right."""
 
 
 IMPLAUSIBLE: Final = "implausible"
@@ -66,5 +66,5 @@ OF_IMAGE: Final[Mapping[str, Waiver]] = {
         text("The device may jump to where no program is, and does not start any more then."),
     ),
 }
-"""How the file is read."""
+"""Checks while the file is read."""
 WAIVERS: Final[Mapping[str, Waiver]] = {**OF_DEVICE, **OF_IMAGE}

@@ -1,6 +1,6 @@
-"""Writing an item: what is to be written, and how it ended.
+"""Write plan and result for one item.
 
-A write counts when general feedback confirms it and the item reads back as it was written.
+A write succeeds if general feedback confirms it and the item reads back as written.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class FieldChange:
 
     @property
     def differs(self) -> bool:
-        """True when something else was read back than was written."""
+        """True if the value read back differs from the one written."""
         return self.read_back is not None and self.read_back != self.new
 
 
 @dataclass(frozen=True)
 class WritePlan:
-    """What is to be written to whom; made without a bus."""
+    """Item and content to write; made without a bus."""
 
     target: Target
     dialect: Dialect
@@ -45,7 +45,7 @@ class WritePlan:
 
 @dataclass(frozen=True)
 class WriteResult:
-    """How a write ended. Contents are None where nothing was answered."""
+    """Result of a write. Contents are None if not answered."""
 
     plan: WritePlan
     old: Content | None
@@ -54,16 +54,16 @@ class WriteResult:
 
     @property
     def changes(self) -> tuple[FieldChange, ...]:
-        """Old value, new value and what was read back, for each field."""
+        """Old, new and read-back value of each field."""
         return field_changes(self.plan, self.old, self.read_back)
 
     @property
     def differences(self) -> tuple[FieldChange, ...]:
-        """The fields that read back differently."""
+        """Fields that read back differently."""
         return tuple(change for change in self.changes if change.differs)
 
     def error(self) -> FlasherError | None:
-        """The error that stands for it; None when it was confirmed and reads back right."""
+        """Create the error for the result; None if it was confirmed and reads back correctly."""
         name, node = self.plan.writable.name, self.plan.target.node.name
         different = self.differences
         if different:
@@ -96,10 +96,10 @@ def plan_write(
     dialect: Dialect = WELLING,
     manufacturer: bool = False,
 ) -> WritePlan:
-    """What `write` would send: one value a field, or one finished content.
+    """Plan a write from one value per field, or from one complete content.
 
-    Raises UsageError for an unknown name, values that do not fit, and items that the document
-    reserves for the manufacturer when `manufacturer` is not given.
+    Raises UsageError for an unknown name, for values that do not fit, and for items reserved for
+    the manufacturer unless `manufacturer` is set.
     """
     chosen = find_item(name, writable(target, dialect), target, "write")
     if chosen.item.manufacturer_only and not manufacturer:
@@ -117,7 +117,7 @@ def plan_write(
 def field_changes(
     plan: WritePlan, old: Content | None, read_back: Content | None = None
 ) -> tuple[FieldChange, ...]:
-    """The fields of a write beside what the device held and holds."""
+    """Return the fields of a write with their values before and after it."""
     return tuple(
         FieldChange(
             name=label(name, codec),

@@ -1,1 +1,1 @@
-"""Firmware files to the very bytes that are sent, and those bytes to packets and a plan."""
+"""Firmware images: file formats, checks, releases, and the plan of packets to send."""

@@ -1,10 +1,10 @@
-"""Whether an image looks like a program for a Cortex-M, and whether it starts inside itself.
+"""Cortex-M vector tables: check that an image looks like a program and starts inside itself.
 
 The first word of such a program is its initial stack pointer, the second its reset vector: an
-address with bit 0 set, for Thumb. Nothing in the protocol says that a device has such a processor:
-`flasher.image.plausible` refuses what does not look like one, and can be told otherwise. What does
-look like one and starts somewhere else is refused here (R8): a part of a program, or the wrong part
-of a merged file.
+address with bit 0 set, for Thumb. The protocol does not require a Cortex-M:
+`flasher.image.plausible` refuses an image without a plausible vector table unless waived. This
+module refuses one that starts outside itself (R8): part of a program, or the wrong part of a merged
+file.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ _RAM_END: Final = 0x4000_0000
 starts at the end of a RAM and grows down: the start of the area is outside, its end inside."""
 _THUMB: Final = 1
 _MEMORY_SIZE: Final = 1 << 24
-"""More than the program memory of any device; the handlers of one program lie closer together."""
+"""Larger than the program memory of any device; the handlers of one program are closer together."""
 _ERASED: Final = 0xFFFF_FFFF
 _EMPTY: Final = (0, _ERASED)
 _BASE_ALIGNMENT: Final = 128
-"""The least alignment of a vector table."""
+"""Minimum alignment of a vector table."""
 _INNER_ALIGNMENT: Final = 512
-"""Alignment at which a second vector table is looked for: applications start at a flash page."""
+"""Alignment at which a second vector table is searched: applications start at a flash page."""
 _INNER_NAMED_MAX: Final = 4
 
 
 @dataclass(frozen=True)
 class VectorTable:
-    """The first two words of an image and what speaks against them, in sentences."""
+    """First two words of an image, and the problems found with them."""
 
     stack_pointer: int
     reset_vector: int
     plausible: bool
-    """It looks like a Cortex-M's, and fits its place. Only whether it starts inside the image is a
-    rule of its own (`check_starts_inside`)."""
+    """It looks like a Cortex-M vector table and suits its address. `check_starts_inside` checks
+    where it starts."""
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    """What could not be judged, and why."""
+    """Checks that were not possible, and why."""
 
     @property
     def stack_pointer_plausible(self) -> bool:
@@ -54,19 +54,21 @@ class VectorTable:
 
     @property
     def entry(self) -> int:
-        """The address that the processor starts at: the reset vector without its Thumb bit."""
+        """Address at which the processor starts: the reset vector without its Thumb bit."""
         return self.reset_vector & ~_THUMB
 
 
 def vector_table(image: Image) -> VectorTable | None:
-    """The vector table at the start of an image; None when it is too short to have one."""
+    """Return the vector table at the start of an image; None if the image is too short."""
     if image.size_bytes < _FIRST_TWO_SIZE:
         return None
     head = image.data[: _VECTORS.size]
     stack_pointer, reset, *others = _VECTORS.unpack(head.ljust(_VECTORS.size, b"\0"))
     problems = []
     if not _is_stack_pointer(stack_pointer):
-        problems.append(f"the first word, 0x{stack_pointer:08X}, is no stack pointer of a Cortex-M")
+        problems.append(
+            f"the first word, 0x{stack_pointer:08X}, is not a stack pointer of a Cortex-M"
+        )
     if not reset & _THUMB:
         problems.append(f"the reset vector, 0x{reset:08X}, has no Thumb bit")
     elif reset in (_THUMB, _ERASED):
@@ -80,43 +82,43 @@ def vector_table(image: Image) -> VectorTable | None:
     inner = _inner_tables(image)
     if looks_right and inner:
         notes.append(
-            f"another vector table stands at {', '.join(f'0x{address:08X}' for address in inner)}: "
-            "if that is the application, the file holds more than it (--range START:END)"
+            f"another vector table is at {', '.join(f'0x{address:08X}' for address in inner)}: "
+            "if that is the application, the file contains more (choose it with --range START:END)"
         )
     entry = reset & ~_THUMB
     outside = []
     if image.base is not None:
         if not image.base <= entry < image.base + image.size_bytes:
             outside.append(
-                f"the reset vector, 0x{reset:08X}, points outside of the image, "
+                f"the reset vector, 0x{reset:08X}, points outside the image, "
                 f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}"
             )
         if looks_right and image.base % _BASE_ALIGNMENT:
-            problems.append(f"a vector table cannot stand at 0x{image.base:08X}")
+            problems.append(f"a vector table cannot be at 0x{image.base:08X}")
     elif looks_right:
         notes.append(
-            "a raw binary has no address: whether its reset vector points into it "
-            "can be judged with --base only"
+            "a raw binary has no address: checking that its reset vector points into it "
+            "needs --base"
         )
     return VectorTable(stack_pointer, reset, not problems, (*problems, *outside), tuple(notes))
 
 
 def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
-    """What is wrong with the places that vectors point to, as one list or none."""
+    """Return the problem with vectors that point too far apart, as a list of one or none."""
     reach = image.size_bytes if image.base is None else _MEMORY_SIZE
     if max(vectors) - min(vectors) < reach:
         return []
     return [
         "its reset, NMI and hard fault vectors lie further apart than the "
-        + ("image is long: it is a part of a program" if image.base is None else "memory reaches")
+        + ("image is long: it is part of a program" if image.base is None else "memory reaches")
     ]
 
 
 def check_starts_inside(image: Image) -> None:
-    """The rule of R8 for a merged file.
+    """Check the rule for merged files (R8).
 
-    Raises ImageError when the image has a Cortex-M's stack pointer and a known base, but its reset
-    vector points outside of it. Without a base nothing can be said, and nothing is.
+    Raises ImageError if the image has a Cortex-M stack pointer and a known base, but its reset
+    vector points outside the image. Does nothing without a base.
     """
     table = vector_table(image)
     if table is None or image.base is None or not table.stack_pointer_plausible:
@@ -127,9 +129,9 @@ def check_starts_inside(image: Image) -> None:
     error = ImageError(
         f"{image.source} does not start inside itself: its reset vector is "
         f"0x{table.reset_vector:08X}",
-        where=f"what would be sent lies at 0x{image.base:08X}..0x{end - 1:08X}",
-        cause="a part of a program, or a file merged of bootloader and application, of which the "
-        "wrong part would be sent",
+        where=f"the bytes to send are at 0x{image.base:08X}..0x{end - 1:08X}",
+        cause="part of a program, or the wrong part of a file that merges bootloader and "
+        "application",
         remedy="choose the application with --range START:END, or waive this check with "
         "--allow-outside-vector",
         code=ErrorCode.IMAGE_OUTSIDE,
@@ -139,7 +141,9 @@ def check_starts_inside(image: Image) -> None:
 
 
 def _inner_tables(image: Image) -> list[int]:
-    """Where in an image of known base a second program seems to start, as in a merged file."""
+    """Addresses in an image of known base at which a second program seems to start, as in a merged
+    file.
+    """
     if image.base is None:
         return []
     found = []

@@ -1,7 +1,7 @@
-"""ELF: the sections inside the loadable segments, at their physical addresses, as objcopy has it.
+"""ELF files: sections inside loadable segments, at their physical addresses, as in objcopy.
 
-What a segment holds beside its sections (the file's own headers, padding) is no part of the
-program. A segment with bytes and no section is refused: what of it belongs to the program?
+Other bytes of a segment (the file's own headers, padding) are not part of the program. A segment
+with bytes but no section is refused as ambiguous.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _NO_BITS: Final = 8
 _ALLOCATED: Final = 2
 _PROGRAM_HEADERS_MAX: Final = 64
 _SECTIONS_MAX: Final = 4096
-"""An image has a few dozen. The time that it takes grows with the product of the two."""
+"""An image has a few dozen. Processing time grows with the product of the two limits."""
 
 
 @dataclass(frozen=True)
 class _Load:
-    """A loadable segment that has bytes in the file."""
+    """Loadable segment with bytes in the file."""
 
     number: int
     offset: int
@@ -69,7 +69,7 @@ class _Load:
 
 
 def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """The bytes of all sections that are loaded. Raises ImageError when the file is damaged."""
+    """Read the bytes of all loaded sections. Raises ImageError for a damaged file."""
     data = file.read()
     order, fields = _header(data, source)
     sections_at, section_size, section_count = fields[6], fields[11], fields[12]
@@ -92,38 +92,38 @@ def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
         done = load.offset
         for start, end in inside:
             if end > load.end:
-                raise _refuse(source, "a section lies outside of its program header")
-            fresh = max(start, done)  # sections may overlap: they are the same bytes
+                raise _refuse(source, "a section is outside its program header")
+            fresh = max(start, done)  # overlapping sections share the same bytes
             into.add(load.address + fresh - load.offset, data[fresh:end], load.place)
             done = max(done, end)
 
 
 def machine_of(head: bytes) -> int | None:
-    """The kind of processor that an ELF file which starts with `head` is for (e_machine); None for
-    a header that is cut off.
+    """Return the processor of an ELF file that starts with `head` (e_machine); None for a truncated
+    header.
     """
     order = _BYTE_ORDERS.get(head[_BYTE_ORDER_AT]) if len(head) >= _MACHINE_END else None
     return None if order is None else int(Struct(f"{order}H").unpack_from(head, _MACHINE_AT)[0])
 
 
 def machine_name(machine: int | None) -> str:
-    """A kind of processor in words."""
+    """Name of a processor, for messages."""
     return _MACHINES.get(machine or 0, f"ELF machine {machine}")
 
 
 def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
-    """The byte order, as struct has it, and the fields of the header."""
+    """Return the byte order (as in struct) and the header fields."""
     if not data.startswith(MAGIC):
         raise _refuse(source, "it does not start with 7F 45 4C 46")
     order = _BYTE_ORDERS.get(data[_BYTE_ORDER_AT]) if len(data) > _BYTE_ORDER_AT else None
     header = Struct(f"{order or '<'}{_HEADER}")
     if order is None or len(data) < header.size:
-        raise _refuse(source, "its header is not whole")
+        raise _refuse(source, "its header is truncated")
     if data[_CLASS_AT] != _CLASS_32:
         raise ImageError(
             f"{source} is an ELF file for a 64-bit processor",
-            cause="a program for the computer, not for the device",
-            remedy="name the firmware's file",
+            cause="it is a program for a computer, not for the device",
+            remedy="name the firmware file",
         )
     fields = header.unpack_from(data)
     if fields[10] > _PROGRAM_HEADERS_MAX or fields[12] > _SECTIONS_MAX:
@@ -134,15 +134,17 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
 def _table(
     data: bytes, source: str, what: str, entry: Struct, place: tuple[int, int, int]
 ) -> Iterator[tuple[int, ...]]:
-    """The entries of a table; `place` is its offset, and the size and number of its entries."""
+    """Yield the entries of a table; `place` is its offset, and the size and number of its
+    entries.
+    """
     at, size, count = place
     if count and (size != entry.size or at + count * size > len(data)):
-        raise _refuse(source, f"{what} not whole")
+        raise _refuse(source, f"{what} truncated")
     return (entry.unpack_from(data, at + number * size) for number in range(count))
 
 
 def _loads(data: bytes, source: str, order: str, fields: tuple[int, ...]) -> list[_Load]:
-    """The loadable segments that have bytes in the file."""
+    """Return the loadable segments that have bytes in the file."""
     place = fields[5], fields[9], fields[10]
     table = _table(data, source, "its program headers are", Struct(order + _PROGRAM_HEADER), place)
     loads = []
@@ -150,14 +152,14 @@ def _loads(data: bytes, source: str, order: str, fields: tuple[int, ...]) -> lis
         if kind != _LOADABLE or not size:
             continue
         if offset + size > len(data):
-            raise _refuse(source, f"program header {number} points behind the end of the file")
+            raise _refuse(source, f"program header {number} points past the end of the file")
         if address + size > ADDRESS_SPACE:
             raise _refuse(source, f"program header {number} runs past address 0xFFFFFFFF")
         loads.append(_Load(number, offset, address, size))
     if not loads:
         raise ImageError(
-            f"{source} holds no loadable segment",
-            cause="an object file or a file of debug information alone",
+            f"{source} has no loadable segment",
+            cause="it is an object file, or contains only debug information",
             remedy="name the linked program",
             code=ErrorCode.IMAGE_EMPTY,
         )

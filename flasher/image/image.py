@@ -1,4 +1,4 @@
-"""What a firmware file comes down to: the bytes to be sent, and where they came from."""
+"""Firmware image: the bytes to send, and where they came from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flasher.protocol.spec import TARGETS, Target
 from flasher.protocol.text import find_firmware_version, firmware_version_spans
 
 ADDRESS_SPACE: Final = 1 << 32
-"""One past the highest address that a file can name."""
+"""One past the highest address of any format."""
 
 
 @dataclass(frozen=True)
@@ -34,28 +34,28 @@ class AddressSpan:
 
 @dataclass(frozen=True)
 class Image:
-    """The bytes to be sent, from the first to the last (R8), and what is known about them."""
+    """Bytes to send, from first to last (R8), with their origin."""
 
     data: bytes = field(repr=False)
-    """The very bytes to be sent; gaps are filled."""
+    """The exact bytes to send, with gaps filled."""
     base: int | None
-    """Address of `data[0]`; None for a raw binary whose base is not known."""
+    """Address of `data[0]`; None for a raw binary with unknown base."""
     format: str
-    """The format that the file was read as, in words: "Intel HEX", "raw binary", ..."""
+    """Name of the file format: "Intel HEX", "raw binary", ..."""
     source: str
     """File name as given, for messages."""
     segments: tuple[AddressSpan, ...]
-    """Where the file has bytes; offsets instead of addresses when `base` is None."""
+    """Ranges with bytes in the file; offsets if `base` is None."""
     filled_bytes: int
-    """How many bytes of `data` are filler and not from the file."""
+    """Number of filler bytes in `data`."""
     version: str | None = None
-    """The firmware version `Vxrxrx_YYYYMMDD` inside; None when there is none, or several."""
+    """Firmware version `Vxrxrx_YYYYMMDD` found in `data`; None for none or several."""
     elf_machine: int | None = field(default=None, compare=False)
-    """The kind of processor that an ELF file names; None for the other formats."""
+    """Processor of an ELF file; None for other formats."""
 
     @classmethod
     def from_bytes(cls, data: bytes, *, base: int | None = None, source: str = "(memory)") -> Self:
-        """An image of bytes that are at hand, as a raw binary of them would load."""
+        """Create an image from bytes in memory, like a loaded raw binary."""
         return cls(
             data=data,
             base=base,
@@ -72,26 +72,26 @@ class Image:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 of `data`, in hex digits."""
+        """SHA-256 of `data` in hexadecimal."""
         return hashlib.sha256(self.data).hexdigest()
 
     @cached_property
     def named_targets(self) -> frozenset[Target]:
-        """The targets that `data` names by itself; empty when it names none."""
+        """Targets named inside `data`; may be empty."""
         return named_targets(self.data)
 
 
-# -- which targets an image names -----------------------------------------------------------------
+# -- targets named inside an image ----------------------------------------------------------------
 
 # Only strong evidence counts, since a wrong guess would refuse a good image: the name of a device
 # right beside a firmware version, or the whole text of an update command.
 
 NEIGHBOURHOOD_SIZE: Final = 64
-"""In bytes, before and behind a firmware version: a name in there belongs to it."""
+"""Bytes before and after a firmware version in which a name belongs to it."""
 
 
 def _whole_words(texts: dict[str, Target]) -> re.Pattern[bytes]:
-    """Finds each of these texts where no letter, digit or underscore touches it."""
+    """Compile a pattern that matches these texts as whole words."""
     choice = "|".join(map(re.escape, texts)).encode("ascii")
     return re.compile(rb"(?<![A-Za-z0-9_])(?:" + choice + rb")(?![A-Za-z0-9_])")
 
@@ -105,16 +105,14 @@ _UPDATE_TEXT: Final = _whole_words(_UPDATE_TEXTS)
 
 
 def named_targets(data: bytes) -> frozenset[Target]:
-    """The targets that an image names; empty when it names none, several for mixed texts."""
+    """Return the targets that an image names; several for contradicting texts."""
     found = {_UPDATE_TEXTS[match[0].decode("ascii")] for match in _UPDATE_TEXT.finditer(data)}
     for start, end in firmware_version_spans(data):
-        # The version itself ends a word: in a packed structure nothing else separates them.
+        # The version itself ends a word: packed structures have no separators.
         before = _NAME.finditer(data, max(0, start - NEIGHBOURHOOD_SIZE), start)
-        behind = _NAME.finditer(data[end : end + NEIGHBOURHOOD_SIZE + 1])
+        after = _NAME.finditer(data[end : end + NEIGHBOURHOOD_SIZE + 1])
         found |= {_NAMES[match[0].decode("ascii")] for match in before}
         found |= {
-            _NAMES[match[0].decode("ascii")]
-            for match in behind
-            if match.end() <= NEIGHBOURHOOD_SIZE
+            _NAMES[match[0].decode("ascii")] for match in after if match.end() <= NEIGHBOURHOOD_SIZE
         }
     return frozenset(found)

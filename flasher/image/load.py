@@ -1,8 +1,8 @@
-"""A file to an `Image`: choose the format, read it sparse, check it, join it.
+"""Load a firmware file as an `Image`: detect the format, read, check and join its bytes.
 
-The format is found by the content first and the suffix second. A damaged text file of records is
-still one, and is refused as such by its reader. What is none of the formats is taken for a raw
-binary; whether it can be a program is judged by `flasher.image.plausible`.
+The format is detected by content first and by suffix second. A damaged record file still counts as
+one, so that its reader reports the damage. Anything else is a raw binary; `flasher.image.plausible`
+checks whether it can be a program.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version, printable
 
 HEAD_SIZE: Final = 65_536
-"""How much of a file is looked at to find its format, in bytes."""
+"""Bytes examined to detect the format."""
 _LINES_JUDGED: Final = 100
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
-"""In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
+"""In bytes. Covers the gap between vector table and code; a larger gap separates another part."""
 FILE_MAX_SIZE: Final = 128 * 1024 * 1024
-"""In bytes, of any format but a raw binary: beyond, a file is not read at all."""
+"""Maximum size in bytes of a file that is not a raw binary; a larger one is not read."""
 
 
 class Format(Enum):
-    """The formats; the value is the option's word, `title` what it is called in messages."""
+    """File formats; the value is the option's word, `title` the name in messages."""
 
     HEX = "hex"
     BIN = "bin"
@@ -68,7 +68,7 @@ _RECORDS: Final = {
 _STARTS: Final = {Format.HEX: re.compile(rb":"), Format.SREC: re.compile(rb"S[0-9]")}
 _TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\n\v\f\r"
 FORMATS: Final = tuple(form.value for form in Format)
-"""The words that `format` takes."""
+"""Accepted values of `format`."""
 _READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf.read}
 
 
@@ -81,15 +81,15 @@ def load(
     fill_gaps_up_to: int = DEFAULT_FILL_GAPS_UP_TO,
     allow_outside_vector: bool = False,
 ) -> Image:
-    """The image in a firmware file, checked (R8, R9).
+    """Load and check the image in a firmware file (R8, R9).
 
-    `format` is one of `FORMATS`, None finds out. `base` is the address of the first byte of a raw
-    binary. `range_` is the address of the first byte to send, and one past the last that may be
-    sent; other bytes of the file are left out. Gaps up to `fill_gaps_up_to` bytes are filled with
-    FF, from the range's start on. `allow_outside_vector` waives the merged-file rule of R8.
+    `format` is one of `FORMATS`; None detects it. `base` is the address of the first byte of a raw
+    binary. `range_` is (start, end), end exclusive: other bytes of the file are ignored. Gaps up to
+    `fill_gaps_up_to` bytes are filled with FF, starting at the range's start.
+    `allow_outside_vector` waives the merged-file rule of R8.
 
-    Raises ImageError when the file cannot be used, UsageError when there is no such file, it is no
-    regular one, or the options make no sense.
+    Raises ImageError if the file cannot be used; UsageError if it does not exist, is not a regular
+    file, or the options contradict each other.
     """
     _check_options(format, base, range_, fill_gaps_up_to)
     source = printable(os.fspath(path))
@@ -104,13 +104,13 @@ def load(
             if base is not None:
                 raise UsageError(
                     f"--base is for a raw binary, and {source} is an {form.title} file",
-                    where="the file says itself where its bytes lie",
-                    remedy="leave --base out; choose a part of the file with --range START:END",
+                    where="the file itself contains the addresses",
+                    remedy="omit --base; choose a part of the file with --range START:END",
                 )
             if size_bytes > FILE_MAX_SIZE:
                 raise ImageError(
                     f"{source} is too large for an {form.title} file: {size_bytes} bytes",
-                    cause="an ELF file full of debug information, or no firmware",
+                    cause="it contains debug information, or is not firmware",
                     remedy="strip it, or convert it to a raw binary: objcopy -O binary",
                     code=ErrorCode.IMAGE_TOO_LARGE,
                 )
@@ -129,7 +129,7 @@ def _check_options(
     if form is not None and form not in FORMATS:
         raise UsageError(f"there is no image format {form!r}", remedy=f"one of {FORMATS}")
     if base is not None and not 0 <= base < ADDRESS_SPACE:
-        raise UsageError(f"the base {base:#x} is no 32-bit address")
+        raise UsageError(f"the base {base:#x} is not a 32-bit address")
     if range_ is not None and not 0 <= range_[0] < range_[1] <= ADDRESS_SPACE:
         raise UsageError(
             f"the range {range_[0]:#x}:{range_[1]:#x} is empty or not inside 32-bit addresses",
@@ -140,7 +140,7 @@ def _check_options(
 
 
 def _detect(head: bytes, source: str) -> Format:
-    """The format of a file that starts with `head` (its first `HEAD_SIZE` bytes)."""
+    """Detect the format from the first `HEAD_SIZE` bytes."""
     if head.startswith(elf.MAGIC):
         return Format.ELF
     body = head.removeprefix(codecs.BOM_UTF8).lstrip()
@@ -160,7 +160,7 @@ def _detect(head: bytes, source: str) -> Format:
 
 
 def _is_mostly_text(head: bytes) -> bool:
-    """A damaged text file still is; a program that happens to begin like a record is not."""
+    """Distinguish a damaged text file from a program that happens to begin like a record."""
     return 2 * len(head.translate(None, _TEXT)) <= len(head)
 
 
@@ -171,12 +171,12 @@ def _binary(
     base: int | None,
     fill_gaps_up_to: int,
 ) -> Image:
-    """A raw binary, or the part of it in the range; not more is ever read."""
+    """Load a raw binary, or only its part in the range."""
     source, window = sparse.source, sparse.window
     if window and base is None:
         raise UsageError(
             f"--range chooses addresses, and {source} is a raw binary, which has none",
-            remedy="say with --base which address its first byte has",
+            remedy="give the address of its first byte with --base",
         )
     start = base or 0
     end = start + size_bytes

@@ -1,7 +1,7 @@
-"""What an upgrade with an image comes to, before anything is sent: packets, frames, seconds.
+"""Plan of an upgrade: packets, frames and time on the wire, before anything is sent.
 
-Seconds are those on the wire: the exact bits of the very frames, stuff bits included, one right
-after the other. What a device takes to restart, to erase and to answer comes on top.
+Times are exact bit times of the actual frames, including stuff bits, without idle time. The
+device's time to restart, erase and answer is not included.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ from flasher.protocol.wire import Message, encode, split
 
 _FILLER: Final = bytes((PACKET_FILLER,))
 _NOMINAL_BOOT_VERSION: Final = "V1.0.0"
-"""Another version differs by a few stuff bits at the most."""
+"""Another version differs by a few stuff bits at most."""
 _CHUNK_PACKETS: Final = 1024
-"""Packets encoded at once: enough for the C library to have work, little enough to hold."""
+"""Packets encoded at once: a compromise between speed and memory."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """An upgrade without faults: every message of both directions once."""
+    """Upgrade without errors: every message of both directions once."""
 
     image: Image
     target: Target
@@ -62,27 +62,27 @@ class Plan:
     """CAN frames of the device: general feedback, one boot version, request transfer, an ACK for
     each packet, complete."""
     host_messages: int
-    """The messages that the tool's frames make."""
+    """Messages of the tool."""
     bytes_on_wire: int
-    """Data bytes in all those frames."""
+    """Data bytes of all frames."""
     wire_s: float
-    """All those frames on the bus one right after the other."""
+    """Time of all frames on the bus without idle time."""
     transfer_wire_s: float
-    """The packets and their ACKs alone."""
+    """Time of the packets and their ACKs."""
     packet_bits: array[int] = field(repr=False, compare=False)
-    """Bit times of each packet's frames, packet 1 first."""
+    """Bit times of the frames of each packet, packet 1 first."""
 
     @property
     def frames(self) -> int:
-        """All CAN frames, the tool's and the device's."""
+        """CAN frames of both directions."""
         return self.host_frames + self.device_frames
 
     def packet_frames(self, number: int) -> list[Frame]:
-        """The CAN frames of packet `number`, from 1; raises IndexError for any other."""
+        """Return the CAN frames of packet `number`, from 1; raises IndexError for any other."""
         return split(self.target.request_id, self._packet_wire(number))
 
     def packet_wire_s(self, number: int) -> float:
-        """Seconds of packet `number`, from 1, on the wire; raises IndexError for any other."""
+        """Return the wire time of packet `number`, from 1; raises IndexError for any other."""
         self._check(number)
         return self.packet_bits[number - 1] / self.bitrate_bps
 
@@ -103,10 +103,10 @@ def make_plan(
     bitrate_bps: int | None = None,
     has_upgrade: bool | None = None,
 ) -> Plan:
-    """What an upgrade would send; at the dialect's bit rate unless another one is given.
+    """Plan an upgrade, at the dialect's bit rate unless another one is given.
 
-    Raises UsageError for a dialect that has no upgrade, unless `has_upgrade` says that a product
-    has it all the same; else as `plan`.
+    Raises UsageError for a dialect without upgrade, unless `has_upgrade` enables it for a product;
+    else as `plan`.
     """
     chosen = as_dialect(dialect)
     if not (chosen.has_upgrade if has_upgrade is None else has_upgrade):
@@ -119,13 +119,13 @@ def make_plan(
 
 
 def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
-    """The upgrade of `target` with `image` at `bitrate_bps`.
+    """Plan the upgrade of `target` with `image` at `bitrate_bps`.
 
-    Raises ImageError when the image is empty or takes more than 65535 packets (R9), UsageError
-    when the bit rate is none.
+    Raises ImageError if the image is empty or needs more than 65535 packets (R9), UsageError for an
+    invalid bit rate.
     """
     if bitrate_bps <= 0:
-        raise UsageError(f"{bitrate_bps} bit/s is no bit rate")
+        raise UsageError(f"{bitrate_bps} bit/s is not a bit rate")
     if not image.size_bytes:
         raise empty_error(image.source)
     if image.size_bytes > IMAGE_MAX_SIZE:
@@ -172,7 +172,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
 
 
 class _Traffic:
-    """Sums over messages."""
+    """Totals of messages."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -191,14 +191,16 @@ class _Traffic:
 
 
 def _packet_wire(data: bytes, number: int, total: int, can_id: int) -> bytes:
-    """The encoded message of a packet; the last one is filled up with FF (R9)."""
+    """Encode a packet; the last one is padded with FF (R9)."""
     end = number * PACKET_DATA_SIZE
     payload = data[end - PACKET_DATA_SIZE : end].ljust(PACKET_DATA_SIZE, _FILLER)
     return encode(Packet(number, total, payload).to_message(can_id))
 
 
 def _packet_bits(data: bytes, total: int, can_id: int) -> array[int]:
-    """Bit times of each packet; packets are whole frames, so they run on as one stream."""
+    """Return the bit times of each packet. Packets are whole frames, so that they form one
+    stream.
+    """
     bits = array("H")
     for first in range(1, total + 1, _CHUNK_PACKETS):
         numbers = range(first, min(first + _CHUNK_PACKETS, total + 1))

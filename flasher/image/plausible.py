@@ -1,8 +1,8 @@
-"""Whether the bytes of an image can be a program for the device, before anybody sends them.
+"""Plausibility check: whether the bytes of an image can be a program for the device.
 
-Two degrees of doubt: what is certainly something else (another kind of file, a text, one byte again
-and again, a program for another processor), and what has no plausible Cortex-M vector table. The
-second may still be right: the documents name no processor, and an image may be encrypted.
+There are two degrees of doubt: certainly something else (another file type, a text, one repeated
+byte, a program for another processor), or no plausible Cortex-M vector table. The second may still
+be correct: the documents name no processor, and an image may be encrypted.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ _UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF_16_JUDGED: Final = 64
 _CONTROLS: Final = bytes(byte for byte in range(0x20) if byte not in b"\t\n\v\f\r\x1b") + b"\x7f"
 _OTHER_ENCODING_SIZE: Final = 256
-"""So many bytes without one control character are a text in some encoding; of random bytes one in
-10^13 such runs has none."""
+"""So many bytes without a control character are text in some encoding; random bytes pass this once
+in 10^13."""
 UNLIKELY: Final = "the wrong file, an encrypted image, a header in front, or another processor"
-"""What an image without a vector table may be."""
+"""Possible reasons for an image without a vector table."""
 _OTHER_WAYS: Final = (
     ", as does a manifest of these very bytes (flasher manifest create --allow-implausible), or "
     'cpu = "other" in the target\'s profile'
@@ -61,17 +61,17 @@ _OTHER_WAYS: Final = (
 
 
 class Cpu(Enum):
-    """The kinds of processor that a profile can name; the value is its word there."""
+    """Processor types of a profile; the value is the word used there."""
 
     CORTEX_M = "cortex-m"
     OTHER = "other"
 
 
 class Doubt(NamedTuple):
-    """Why an image is hardly a program for the device: `text` completes "the image ...".
+    """Why an image is probably not a program for the device; `text` completes "the image ...".
 
-    `is_certain`: it is something else by its own marks, and no profile or manifest makes it a
-    program; `ways` are what lets it through beside the option --allow-implausible.
+    `is_certain`: its content identifies it as something else, and no profile or manifest can waive
+    that. `ways` names what waives the check besides the option --allow-implausible.
     """
 
     text: str
@@ -83,7 +83,7 @@ class Doubt(NamedTuple):
 
 
 def find_doubt(image: Image) -> Doubt | None:
-    """What speaks against an image being a program for the device; None when nothing does."""
+    """Return the reason why an image is implausible; None if it looks like a program."""
     foreign = _foreign(image)
     if foreign is not None:
         return Doubt(f"is {foreign}", is_certain=True)
@@ -97,25 +97,25 @@ def find_doubt(image: Image) -> Doubt | None:
 
 
 def check_plausible(image: Image) -> None:
-    """Raise ImageError when there is a doubt, for commands that know no manifest or profile."""
+    """Raise ImageError for an implausible image; for commands without manifest or profile."""
     found = find_doubt(image)
     if found is not None:
         raise ImageError(
             f"{image.source} {found.text}: not plausible as firmware.",
             cause="the wrong file" if found.is_certain else UNLIKELY,
-            remedy="Name the firmware file itself; if these really are the bytes to send, say so "
-            "with --allow-implausible.",
+            remedy="Name the firmware file itself; if these really are the bytes to send, add "
+            "--allow-implausible.",
             code=ErrorCode.IMAGE_IMPLAUSIBLE,
         )
 
 
 def _foreign(image: Image) -> str | None:
-    """What an image certainly is instead of a program for the device."""
+    """Name what an image certainly is instead of a program."""
     data = image.data
     if image.elf_machine not in (None, EM_ARM):
         return f"a program for another processor ({machine_name(image.elf_machine)})"
     if len(data) > 1 and data.count(data[:1]) == len(data):
-        return f"one byte again and again (0x{data[0]:02X})"
+        return f"one repeated byte (0x{data[0]:02X})"
     for magic, name in _MAGICS.items():
         if data.startswith(magic):
             return name
@@ -141,7 +141,7 @@ def _text(data: bytes) -> str | None:
         if data[:_UTF_16_JUDGED].decode("utf-16", "ignore").isascii():
             return "a text in UTF-16"
         return None
-    # Texts are found in flash memories too, and a flash memory is filled up with FF or 00.
+    # A dump of a flash memory that contains a text is padded with FF or 00.
     body = data.rstrip(b"\0\xff")
     if not body or body.translate(None, _CONTROLS) != body:
         return None

@@ -1,10 +1,10 @@
-"""Intel HEX and Motorola S-record files: checked here, loaded by intelhex and bincopy.
+"""Intel HEX and Motorola S-record files: strictly checked here, loaded by intelhex and bincopy.
 
-The libraries accept a missing end record, addresses that wrap around and lost records, refuse
-records that repeat each other, and take a hundred bytes of memory for each byte of an image. So a
-strict pass comes first: it refuses what is wrong with a file, and keeps nothing. The libraries get
-the records that passed, some hundred at a time. Before their bytes are used, the addresses, count
-and CRC-32 of them have to be those that the strict pass computed: two independent readings.
+The libraries accept a missing end record, wrapping addresses and lost records, reject repeated
+records, and need a hundred bytes of memory per byte of image. So a strict pass first rejects
+damaged files and stores nothing. The records that pass go to the library in batches. Addresses,
+count and CRC-32 of the library's bytes must equal those of the strict pass: two independent
+readings.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from flasher.image.image import ADDRESS_SPACE
 from flasher.image.segments import PIECES_MAX, SparseBytes, scattered_error
 
 LINES_MAX: Final = 1_100_000
-"""The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
-time that a file takes which is none: its lines may be blank."""
+"""The largest image has 1,048,560 records of eight bytes; usual programs write 16 or 32 bytes each.
+Limits the time for a file of blank lines."""
 _LINE_MAX: Final = 1024
 """Longer than any record of either format."""
 _SHOWN_MAX: Final = 40
@@ -33,45 +33,45 @@ _SHOWN_MAX: Final = 40
 
 @dataclass
 class _Scanner:
-    """The lines of one file, and the refusals that both formats share."""
+    """Reads the lines of a file; common checks of both formats."""
 
     file: BinaryIO
     source: str
     format: str
     line: int = 0
-    """Number of the line read last, from 1."""
+    """Number of the current line, from 1."""
     ended: bool = False
-    """The end record has been read."""
+    """The end record was read."""
     counted: bool = False
-    """The last record was a right count of all records: as good as an end, if nothing follows."""
+    """The last record was a correct count of all records, which ends a file like an end record."""
 
     def lines(self) -> Iterator[str]:
-        """The lines that are not blank, without line ends and blanks around.
+        """Yield the stripped lines that are not blank.
 
-        Raises ImageError on a line longer than a record, on other characters than ASCII, on
-        anything after the end record, and at the end of a file that has none.
+        Raises ImageError for a line longer than a record, for non-ASCII characters, for anything
+        after the end record, and for a missing end record.
         """
         while raw := self.file.readline(_LINE_MAX):
             self.line += 1
             if len(raw) == _LINE_MAX:
                 raise self.refuse(
-                    "the line is longer than any record", "not such a file, or lost line ends"
+                    "the line is longer than any record", "another type of file, or lost line ends"
                 )
             if self.line > LINES_MAX:
                 raise self.refuse(
                     f"it has more than {LINES_MAX:,} lines",
-                    "not such a file, or one with records of very few bytes",
+                    "another type of file, or one with very short records",
                 )
             text = raw.strip()
             if not text:
                 continue
             if self.ended:
                 raise self.refuse(
-                    "there is more after the end record",
+                    "there is data after the end record",
                     "two files joined into one, or a file written over a longer one",
                 )
             if not text.isascii():
-                raise self.refuse("the line holds bytes that are no ASCII text")
+                raise self.refuse("the line holds bytes that are not ASCII")
             yield text.decode("ascii")
         if not (self.ended or self.counted):
             raise self.refuse(
@@ -82,24 +82,24 @@ class _Scanner:
     def record(
         self, text: str, digits_at: int, *, least_size: int, uncounted_size: int, total: int
     ) -> bytes:
-        """The bytes of the record `text`, whose hex digits begin at `digits_at`: first a count of
-        all but `uncounted_size` bytes, last a check sum, by which they add up to `total`.
+        """Decode the record `text`, whose hex digits begin at `digits_at`. The first byte counts
+        all but `uncounted_size` bytes; the last is a checksum, so that all bytes add up to `total`.
 
-        Raises ImageError when anything of this is wrong.
+        Raises ImageError if any of this is wrong.
         """
         try:
             record = unhexlify(text[digits_at:])
         except (HexError, ValueError):
-            raise self.refuse(f"{_shown(text)} is not made of pairs of hex digits") from None
+            raise self.refuse(f"{_shown(text)} does not consist of pairs of hex digits") from None
         if len(record) < least_size or len(record) != uncounted_size + record[0]:
-            raise self.refuse(f"{_shown(text)} does not have the length that it states")
+            raise self.refuse(f"{_shown(text)} does not have the length in its count")
         if sum(record) & 0xFF != total:
             computed = (total - sum(record[:-1])) & 0xFF
-            raise self.refuse(f"the check sum is {record[-1]:02X}, computed {computed:02X}")
+            raise self.refuse(f"the checksum is {record[-1]:02X}, computed {computed:02X}")
         return record
 
     def refuse(self, what: str, cause: str = "") -> ImageError:
-        """The error for the line read last."""
+        """Create the error for the current line."""
         return ImageError(
             f"{self.source} is a damaged {self.format} file: {what}",
             where=_place(self.line),
@@ -114,7 +114,7 @@ def _place(line: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """A line for a message: escaped, and not too long."""
+    """Escape and shorten a line for a message."""
     cut = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
     return ascii(cut)
 
@@ -123,31 +123,31 @@ def _shown(text: str) -> str:
 
 
 _Piece = tuple[int, bytes]
-"""An address, and the bytes from there on."""
+"""Address and the bytes from there on."""
 _Source = tuple[int, str, str]
-"""Where a piece was read: the number of the line, the record that says what the address in it is
-relative to (empty where the format has none), and the line itself."""
+"""Origin of a piece: line number, the record that its address is relative to (may be empty), and
+the line itself."""
 _Load = Callable[[str], list[_Piece]]
-"""A library: from lines to pieces, ascending."""
+"""Loads lines with a library; returns pieces in ascending order."""
 _BATCH_MAX: Final = 1024
-"""Records that a library gets at once. Bounds its memory, and the time of bincopy, which grows with
-the square of the pieces that it holds."""
+"""Records per call of a library. Limits its memory, and the time of bincopy, which grows with the
+square of its pieces."""
 
 
 class _Reading:
-    """Collects the records that passed, has a library load them, and compares the two readings."""
+    """Collects checked records, loads them with a library, and compares both readings."""
 
     def __init__(self, scanner: _Scanner, load: _Load, into: SparseBytes) -> None:
         self._scanner = scanner
         self._load = load
         self._into = into
         self._batch: dict[_Piece, _Source] = {}
-        """In the order of the file, without repetitions: intelhex refuses them."""
+        """In the order of the file, without repetitions: intelhex rejects them."""
         self._loads_left = PIECES_MAX
 
     def add(self, address: int, data: bytes, text: str, prefix: str = "") -> None:
-        """Take a record. Raises ImageError beyond the 32-bit address space, and what
-        `SparseBytes.add` raises.
+        """Add a record. Raises ImageError outside the 32-bit address space, and as
+        `SparseBytes.add`.
         """
         end = address + len(data)
         if end > ADDRESS_SPACE:
@@ -158,14 +158,14 @@ class _Reading:
                 self.finish()
 
     def finish(self) -> None:
-        """Load what was collected."""
+        """Load the collected records."""
         batch, self._batch = list(self._batch.items()), {}
         if batch:
             self._load_apart(batch)
 
     def _load_apart(self, batch: Sequence[tuple[_Piece, _Source]]) -> None:
-        """Load a batch: in halves where its records overlap, since a library refuses that or lets
-        one of two contradicting bytes win.
+        """Load a batch. One whose records overlap is halved: a library rejects overlaps or lets one
+        of two contradicting bytes win.
         """
         ascending = sorted(batch)
         checked = [piece for piece, _ in ascending]
@@ -194,16 +194,16 @@ class _Reading:
             lines.append(text)
         try:
             return self._load("\n".join(lines))
-        except Exception as error:  # whatever it is, the records had passed
+        except Exception as error:  # any error: the records had passed the strict check
             raise self._differs(sources) from error
 
     def _differs(self, sources: Sequence[_Source]) -> ImageError:
         return ImageError(
-            f"{self._into.source} was read twice, and the two readings differ: nothing of it is "
-            "used.",
+            f"{self._into.source} was read twice, and the two readings differ; nothing of it "
+            "was used.",
             where=f"records between {_place(min(sources)[0])} and {_place(max(sources)[0])}",
-            cause="a fault of this program, of the library that reads the format, or of this "
-            "computer's memory",
+            cause="a bug of this program or of the library for this format, or faulty memory of "
+            "this computer",
             remedy="Convert the file to a raw binary (objcopy -O binary), name its address with "
             "--base, and report it with the file.",
             code=ErrorCode.IMAGE_READINGS,
@@ -211,7 +211,7 @@ class _Reading:
 
 
 def _digest(pieces: Sequence[_Piece]) -> tuple[list[list[int]], int]:
-    """Where there are bytes, as start and end, neighbours joined; and the CRC-32 of all of them."""
+    """Return the joined ranges with bytes as [start, end], and the CRC-32 of all bytes."""
     spans: list[list[int]] = []
     end = -1
     for start, data in pieces:
@@ -223,9 +223,9 @@ def _digest(pieces: Sequence[_Piece]) -> tuple[list[list[int]], int]:
 
 # -- Intel HEX ------------------------------------------------------------------------------------
 
-# Record: colon, then size, 16-bit address, type, data and check sum; all bytes together add up to
-# 0. Types: 00 data, 01 end, 02 extended segment address (times 16), 03 and 05 start address (of no
-# use here), 04 extended linear address (upper 16 bits).
+# Record: colon, then size, 16-bit address, type, data and checksum; all bytes together add up to
+# 0. Types: 00 data, 01 end, 02 extended segment address (times 16), 03 and 05 start address
+# (unused here), 04 extended linear address (upper 16 bits).
 _DATA, _END, _SEGMENT, _START_SEGMENT, _LINEAR, _START_LINEAR = range(6)
 _SIZES: Final = {_END: 0, _SEGMENT: 2, _START_SEGMENT: 4, _LINEAR: 2, _START_LINEAR: 4}
 _HEAD_SIZE: Final = 4
@@ -234,11 +234,11 @@ _SEGMENT_SIZE: Final = 0x1_0000
 
 
 _FROM_ZERO: Final = ":020000040000FA"
-"""What holds at the start of a file, as a record."""
+"""Record with the state at the start of a file."""
 
 
 def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """All data of an Intel HEX file. Raises ImageError with the line number on any damage."""
+    """Read an Intel HEX file. Raises ImageError with the line number for any damage."""
     scanner = _Scanner(file, source, "Intel HEX")
     reading = _Reading(scanner, _by_intelhex, into)
     offset, prefix = 0, _FROM_ZERO
@@ -254,10 +254,10 @@ def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
         if kind > _START_LINEAR:
             raise scanner.refuse(f"there is no record type {kind:02X}")
         if _SIZES.get(kind, len(data)) != len(data):
-            raise scanner.refuse(f"a record of type {kind:02X} holds {len(data)} bytes")
+            raise scanner.refuse(f"a record of type {kind:02X} contains {len(data)} bytes")
         if kind == _DATA and data:
-            # Only under an extended linear address may a record go on beyond 64 KiB: elsewhere the
-            # format has it wrap around and programs do not agree on it.
+            # Only under an extended linear address may a record cross 64 KiB: elsewhere it wraps
+            # around by the format, but programs disagree.
             if not is_linear and address + len(data) > _SEGMENT_SIZE:
                 raise scanner.refuse("the record runs past the end of its 64 KiB segment")
             reading.add(offset + address, data, text, prefix)
@@ -282,10 +282,10 @@ def _by_intelhex(lines: str) -> list[_Piece]:
 
 # -- Motorola S-record ----------------------------------------------------------------------------
 
-# Record: S and type digit, then the count of what follows, an address, data and check sum; count to
-# check sum add up to FF. Types: 0 header, 1 2 3 data with 16, 24, 32-bit address, 5 6 count of data
-# records, 7 8 9 end. Some programs (bincopy is one) write the count and no end: a right count shows
-# as well that nothing was lost, so it is taken for an end.
+# Record: S and type digit, then the count of what follows, an address, data and checksum; count to
+# checksum add up to FF. Types: 0 header, 1 2 3 data with 16, 24, 32-bit address, 5 6 count of data
+# records, 7 8 9 end. Some programs (such as bincopy) write the count and no end: a correct count
+# also proves that nothing was lost, so it ends a file.
 _ADDRESS_SIZES: Final = {
     "0": 2, "1": 2, "2": 3, "3": 4, "5": 2, "6": 3, "7": 4, "8": 3, "9": 2,
 }  # fmt: skip
@@ -296,7 +296,7 @@ _ENDS: Final = "789"
 
 
 def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """All data of an S-record file. Raises ImageError with the line number on any damage."""
+    """Read an S-record file. Raises ImageError with the line number for any damage."""
     scanner = _Scanner(file, source, "Motorola S-record")
     reading = _Reading(scanner, _by_bincopy, into)
     data_records = 0
@@ -309,12 +309,12 @@ def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
         record = scanner.record(text, 2, least_size=data_at + 1, uncounted_size=1, total=0xFF)
         address, data = int.from_bytes(record[1:data_at], "big"), record[data_at:-1]
         if data and kind in _COUNTS + _ENDS:
-            raise scanner.refuse(f"a record of type S{kind} holds {len(data)} bytes of data")
+            raise scanner.refuse(f"a record of type S{kind} contains {len(data)} bytes of data")
         first_line = first_line or scanner.line
         if kind == _HEADER and scanner.line != first_line:
             raise scanner.refuse(
-                "a header stands behind another record",
-                "a damaged type: no check sum covers it, and this would lose a data record",
+                "a header follows another record",
+                "a damaged record type, which no checksum covers: a data record would be lost",
             )
         if kind in _DATA_KINDS:
             data_records += 1
@@ -323,7 +323,7 @@ def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
         scanner.counted = kind in _COUNTS
         if scanner.counted and address != data_records:
             raise scanner.refuse(
-                f"{data_records} data records stand before the count of {address}",
+                f"{data_records} data records precede the count of {address}",
                 "lines were lost or doubled",
             )
         scanner.ended = kind in _ENDS

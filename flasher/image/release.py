@@ -1,6 +1,6 @@
-"""A release: what its maker states of it, and whether an image, a target and a device fit it.
+"""Release: statements of a manifest, compared with an image, a target and a device.
 
-Size and SHA-256 are of `Image.data`, the very bytes to be sent: a range, a base or filled gaps
+Size and SHA-256 are those of `Image.data`, the exact bytes to send: a range, a base or filled gaps
 change them.
 """
 
@@ -25,7 +25,7 @@ from flasher.validation import NumberRange, Parsed
 
 
 def _text(value: object) -> str:
-    """A text as a device sends them: printable ASCII, not empty."""
+    """Check a text as devices send it: printable ASCII, not empty."""
     if not isinstance(value, str):
         raise TypeError
     if not (value and value.isascii() and value.isprintable()):
@@ -70,21 +70,21 @@ BootText = Annotated[str, Parsed(f"a text of the form {BOOT_VERSION_FORM}", _boo
 
 @dataclass(frozen=True)
 class Comparison:
-    """One statement of a manifest held against an image."""
+    """One statement of a manifest compared with an image."""
 
     key: str
     stated: str | None
-    """None where the manifest does not state it."""
+    """None if the manifest does not state it."""
     found: str | None
-    """What the image has; None where it does not say it."""
+    """Value of the image; None if unknown."""
     agrees: bool | None
-    """None where one of the two is missing: nothing to check, or nothing to check against."""
+    """None if one of the two values is missing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Release:
-    """What a manifest states. The rules for a device hold where they are stated: a text that they
-    cannot be applied to does not fit, since nobody knows that it would.
+    """Statements of a manifest. A stated rule also fails for a value to which it cannot be
+    applied.
     """
 
     target: TargetName
@@ -92,35 +92,35 @@ class Release:
     firmware_version: FirmwareText | None = None
     """The version inside the image."""
     size_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)]
-    """Bytes to be sent."""
+    """Number of bytes to send."""
     sha256: Annotated[str, Parsed("64 hex digits", _sha256)]
-    """Of the bytes to be sent, lower-case hex digits."""
+    """Of the bytes to send, in lower-case hexadecimal."""
     hardware_versions: tuple[DeviceText, ...] = ()
-    """Hardware that it fits; `*` stands for any text, and none means any."""
+    """Compatible hardware versions; `*` matches any text. Empty: any hardware."""
     minimum_boot_version: BootText | None = None
-    """The oldest bootloader that may receive it."""
+    """Oldest compatible bootloader."""
     previous_from: FirmwareText | None = None
-    """The oldest running version that it may replace."""
+    """Oldest running version that it may replace."""
     previous_except: tuple[DeviceText, ...] = ()
     """Running versions that it must not replace."""
     notes: str = ""
-    """What a person should know."""
+    """Remarks for people."""
     source: str
     """File name of the manifest, for messages."""
 
     @property
     def rules_previous(self) -> bool:
-        """True when it states which running versions it may replace."""
+        """True if a rule restricts which versions may be replaced."""
         return self.previous_from is not None or bool(self.previous_except)
 
     def fits_hardware(self, text: str) -> bool:
-        """True when a device with this hardware version is listed, or none are stated."""
+        """True if this hardware version is listed, or no rule is stated."""
         return not self.hardware_versions or any(
             fnmatchcase(text, _only_stars(pattern)) for pattern in self.hardware_versions
         )
 
     def fits_previous(self, text: str) -> bool:
-        """True when this may be installed over the running version, or no rule is stated."""
+        """True if this running version may be replaced, or no rule is stated."""
         if text in self.previous_except:
             return False
         if self.previous_from is None:
@@ -129,7 +129,7 @@ class Release:
         return running is not None and oldest is not None and running >= oldest
 
     def findings(self, image: Image) -> tuple[Comparison, ...]:
-        """Every statement about the image, held against `image.data`."""
+        """Compare every statement about the image with `image.data`."""
         names = image.named_targets
         return (
             _compared("size_bytes", str(self.size_bytes), str(image.size_bytes)),
@@ -144,19 +144,19 @@ class Release:
         )
 
     def check_bytes(self, image: Image) -> None:
-        """Raises ImageError when the bytes to be sent are not those of this release: size, SHA-256
-        or the firmware version inside differ.
+        """Raise ImageError if size, SHA-256 or firmware version of the bytes to send differ from
+        this release.
         """
         for finding in self.findings(image):
             if finding.agrees is False and finding.key != "target":
                 raise ImageError(
                     f"{printable(image.source)} is not the image of its manifest: {finding.key} "
                     f"is {finding.stated} there.",
-                    where=f"{printable(self.source)}; the bytes to be sent have {finding.found}",
-                    cause="another build beside this manifest, a damaged copy, or another --range, "
-                    "--base or --fill-gaps-up-to than the release was made with",
-                    remedy="Take image and manifest from the same release. For a build of your "
-                    "own: `flasher manifest create --force`.",
+                    where=f"{printable(self.source)}; the bytes to send have {finding.found}",
+                    cause="another build next to this manifest, a damaged copy, or another "
+                    "--range, --base or --fill-gaps-up-to than that of the release",
+                    remedy="Take image and manifest from the same release. For your own "
+                    "build: `flasher manifest create --force`.",
                     code=ErrorCode.MANIFEST,
                 )
 
@@ -167,8 +167,8 @@ def _compared(key: str, stated: str | None, found: str | None) -> Comparison:
 
 
 def target_problem(image: Image, release: Release | None, target: Target) -> str | None:
-    """Why an image is not meant for `target`, by its manifest or by the names inside; None when
-    nothing says so.
+    """Why an image is not meant for `target`, by its manifest or the names inside it; None if
+    nothing contradicts.
     """
     asked = target.node.name
     if release is not None and release.target != target:
@@ -182,7 +182,7 @@ def target_problem(image: Image, release: Release | None, target: Target) -> str
 
 
 def check_target(image: Image, release: Release | None, target: Target) -> None:
-    """Raises WrongDeviceError when an image is not meant for `target`."""
+    """Raise WrongDeviceError if an image is not meant for `target`."""
     problem = target_problem(image, release, target)
     if problem is not None:
         raise WrongDeviceError(
@@ -195,10 +195,10 @@ def check_target(image: Image, release: Release | None, target: Target) -> None:
 
 
 def names_of(targets: frozenset[Target]) -> str:
-    """Targets as a person reads them; empty when there are none."""
+    """Names of targets for people; may be empty."""
     return " and ".join(sorted(target.node.name for target in targets))
 
 
 def _only_stars(pattern: str) -> str:
-    """A pattern of fnmatch in which `*` alone has a meaning."""
+    """Escape a pattern of fnmatch so that only `*` is special."""
     return pattern.replace("[", "[[]").replace("?", "[?]")

@@ -1,8 +1,7 @@
-"""The mark of the firmware samples, which are no firmware and must not reach a real device.
+"""Mark of the firmware samples, which are not firmware and must not reach a real device.
 
-`firmware_samples/make_samples.py` writes it into every sample, often enough that any part of one
-that could pass for a program has it. A conversion to another format keeps the bytes, so it keeps
-the mark.
+`firmware_samples/make_samples.py` writes it into every sample, so often that any plausible part of
+one contains it. Converting the file to another format keeps the mark.
 """
 
 from __future__ import annotations
@@ -14,19 +13,20 @@ from flasher.i18n import text
 from flasher.image.image import Image
 
 MARK: Final = b"#flasher:sample#"
-"""Sixteen bytes at a multiple of sixteen: a line of a hex or S-record file has them whole."""
+"""Sixteen bytes at a multiple of sixteen, so that one line of a hex or S-record file contains all
+of it."""
 _MARK_IN_RECORDS: Final = MARK.hex().encode("ascii")
 
 
 def is_sample(image: Image) -> bool:
-    """True when the bytes to be sent are, or hold, a firmware sample, also one whose file was read
-    as a raw binary.
+    """True if the image is, or contains, a firmware sample, even if a record file was read as a raw
+    binary.
     """
     return MARK in image.data or _MARK_IN_RECORDS in image.data.lower()
 
 
 def sample_error(image: Image, adapter: str) -> ImageError:
-    """The error for a sample that was to be sent through a physical adapter. Nothing waives it."""
+    """Create the error for sending a sample through a physical adapter. It cannot be waived."""
     return ImageError(
         text("{image} is a firmware sample: no device can run it.", image=image.source),
         where=text("{adapter}, a physical CAN controller or one of unknown kind", adapter=adapter),

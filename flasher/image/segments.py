@@ -1,7 +1,7 @@
-"""Bytes at addresses, kept sparse until it is certain that they make an image.
+"""Sparse bytes at addresses, until they are known to form an image.
 
-Nothing here is ever as large as the span of the addresses: two bytes four gigabytes apart take two
-bytes. Pieces may arrive in any order and may repeat each other, but not contradict each other.
+Memory use does not depend on the address range: two bytes four gigabytes apart take two bytes.
+Pieces may arrive in any order and may repeat, but not contradict each other.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from flasher.image.image import AddressSpan
 from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_COUNT_MAX, PACKET_FILLER
 
 PIECES_MAX: Final = 32_768
-"""Far more than any linker makes; bounds time and memory for a file of scattered bytes."""
+"""More than any linker produces; limits time and memory for a file of scattered bytes."""
 _NAMED_SPANS_MAX: Final = 8
 
 
 class SparseBytes:
-    """Sorted pieces of bytes, none overlapping; only those inside `window` are kept."""
+    """Sorted pieces of bytes without overlaps; only those inside `window` are kept."""
 
     def __init__(self, source: str, window: tuple[int, int] | None = None) -> None:
         self.source = source
@@ -31,9 +31,9 @@ class SparseBytes:
         self.size_bytes = 0
 
     def add(self, start: int, data: bytes, place: Callable[[int], str]) -> None:
-        """Take `data` at address `start`; `place` tells where in the file an address stands.
+        """Add `data` at address `start`; `place` maps an address to its place in the file.
 
-        Raises ImageError where other bytes are there already, or when it gets too much.
+        Raises ImageError for bytes that contradict earlier ones, and when a limit is exceeded.
         """
         if not data:
             return
@@ -42,7 +42,7 @@ class SparseBytes:
             data = data[max(0, self.window[0] - start) : max(0, self.window[1] - start)]
             start = max(start, self.window[0])
         end = start + len(data)
-        if self._starts and self._end(-1) == start:  # what follows on the last piece, as most does
+        if self._starts and self._end(-1) == start:  # usual case: data follows the last piece
             self._insert(len(self._starts), start, data)
             return
         index = max(0, bisect_right(self._starts, start) - 1)
@@ -65,19 +65,19 @@ class SparseBytes:
                 start += common
 
     def leaves_out(self, start: int, end: int) -> bool:
-        """True when none of these addresses is inside the window; they are noted then."""
+        """Return True, and note the range, if none of these addresses is inside the window."""
         if self.window is None or (start < self.window[1] and self.window[0] < end):
             return False
         self.note(start, end)
         return True
 
     def note(self, start: int, end: int) -> None:
-        """The file has bytes from `start` to before `end`, whether they are wanted or not."""
+        """Note that the file has bytes from `start` up to `end`, inside the window or not."""
         low, high = self._seen or (start, end)
         self._seen = min(low, start), max(high, end)
 
     def spans(self) -> tuple[AddressSpan, ...]:
-        """Where there are bytes, ascending, neighbours joined."""
+        """Return the ranges with bytes, ascending, neighbours joined."""
         spans: list[AddressSpan] = []
         for start, piece in zip(self._starts, self._pieces, strict=True):
             if spans and spans[-1].end == start:
@@ -87,11 +87,11 @@ class SparseBytes:
         return tuple(spans)
 
     def join(self, fill_gaps_up_to: int) -> tuple[bytes, int]:
-        """All bytes from the first address (the window's, if there is one) to the last, gaps
-        filled with FF (R8), and that first address.
+        """Join all bytes from the first address (that of the window, if any) to the last, with gaps
+        filled with FF (R8). Return them with the first address.
 
-        Raises ImageError when there are no bytes, when a gap is larger than `fill_gaps_up_to`
-        bytes, or when the whole is larger than the largest image.
+        Raises ImageError if there are no bytes, if a gap is larger than `fill_gaps_up_to` bytes, or
+        if the result exceeds the largest image.
         """
         spans = self.spans()
         if not spans:
@@ -115,7 +115,9 @@ class SparseBytes:
         return self._starts[index] + len(self._pieces[index])
 
     def _insert(self, index: int, start: int, data: bytes) -> int:
-        """Put `data` before piece `index`, or on the end of the one before; where to go on."""
+        """Insert `data` before piece `index`, or append it to the previous one; return the next
+        index.
+        """
         self.size_bytes += len(data)
         if self.size_bytes > IMAGE_MAX_SIZE:
             raise too_large_error(self.source, self.size_bytes, more=True)
@@ -124,8 +126,7 @@ class SparseBytes:
             return index
         if len(self._pieces) == PIECES_MAX:
             raise scattered_error(self.source)
-        # A piece that ends where the next one starts is left apart: joining it would copy the next
-        # one, again and again for a file in descending order.
+        # Not joined to the next piece: that would copy it each time for a file in descending order.
         self._starts.insert(index, start)
         self._pieces.insert(index, bytearray(data))
         return index + 1
@@ -141,7 +142,7 @@ class SparseBytes:
             f"{self.source} has different bytes for the same address 0x{address:08X}: "
             f"first {there[at]:02X}, then {data[at]:02X}",
             where=place(address),
-            cause="two builds or two parts merged into one file that overlap",
+            cause="two overlapping builds or parts were merged into one file",
             remedy="make the file again from one build",
             code=ErrorCode.IMAGE_CONFLICT,
         )
@@ -152,8 +153,8 @@ class SparseBytes:
         start, end = self.window
         low, high = self._seen
         return ImageError(
-            f"{self.source} holds no bytes in the range 0x{start:08X}:0x{end:08X}",
-            where=f"its bytes lie between 0x{low:08X} and 0x{high:08X}",
+            f"{self.source} contains no bytes in the range 0x{start:08X}:0x{end:08X}",
+            where=f"its bytes are between 0x{low:08X} and 0x{high:08X}",
             remedy="correct --range START:END",
             code=ErrorCode.IMAGE_EMPTY,
         )
@@ -168,16 +169,16 @@ class SparseBytes:
         return ImageError(
             f"{self.source} has a gap of {end - start} bytes between 0x{start:08X} and 0x{end:08X}",
             where=f"segments {named}",
-            cause="option bytes, external flash or a bootloader beside the application",
+            cause="option bytes, external flash or a bootloader besides the application",
             remedy=remedy,
             code=ErrorCode.IMAGE_GAP,
         )
 
 
 def empty_error(source: str) -> ImageError:
-    """The refusal of an image without bytes (R9)."""
+    """Create the error for an image without bytes (R9)."""
     return ImageError(
-        f"{source} is empty: it holds no bytes to send",
+        f"{source} is empty: it contains no bytes to send",
         cause="the build or the conversion that made it failed",
         remedy="make the file again",
         code=ErrorCode.IMAGE_EMPTY,
@@ -185,21 +186,21 @@ def empty_error(source: str) -> ImageError:
 
 
 def scattered_error(source: str) -> ImageError:
-    """The refusal of more pieces than any linker makes."""
+    """Create the error for more pieces than any linker produces."""
     return ImageError(
-        f"{source} holds more than {PIECES_MAX} separate pieces of data",
-        cause="a damaged file, or none that a linker made",
-        remedy="make the file again, or choose a part of it with --range START:END",
+        f"{source} contains more than {PIECES_MAX} separate pieces of data",
+        cause="the file is damaged, or was not made by a linker",
+        remedy="make the file again, or choose part of it with --range START:END",
         code=ErrorCode.IMAGE_GAP,
     )
 
 
 def too_large_error(source: str, size_bytes: int, *, more: bool = False) -> ImageError:
-    """The refusal of more than 65535 packets (R9); `more`: the size is a lower bound."""
+    """Create the error for more than 65535 packets (R9); `more`: the size is a lower bound."""
     return ImageError(
         f"{source} is too large: {'at least ' if more else ''}{size_bytes} bytes to send, "
         f"and {PACKET_COUNT_MAX} packets hold {IMAGE_MAX_SIZE}",
-        cause="not a firmware image, or more than the application in one file",
+        cause="it is not a firmware image, or contains more than the application",
         remedy="choose the application with --range START:END (a raw binary needs --base too)",
         code=ErrorCode.IMAGE_TOO_LARGE,
     )

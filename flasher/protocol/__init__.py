@@ -1,1 +1,1 @@
-"""The protocol documents as data and pure functions: no clock, no bus, no state beyond a buffer."""
+"""Protocol documents as data and pure functions: no clock, no bus, no state but receive buffers."""

@@ -1,13 +1,13 @@
 """Exact length of classic CAN frames on the wire, in bit times.
 
 A frame (ISO 11898-1, base format) is: SOF, 11 id bits, RTR, IDE, r0, 4 DLC bits, the data, 15 CRC
-bits; these are stuffed: after five equal bits the complement is inserted, and counts for the next
-run. Then follow, unstuffed, CRC delimiter, ACK slot, ACK delimiter, 7 bits of EOF and 3 bits of
-interframe space.
+bits. These are stuffed: after five equal bits the complement is inserted, and counts for the next
+run. CRC delimiter, ACK slot, ACK delimiter, 7 bits of EOF and 3 bits of interframe space follow
+unstuffed.
 
-Everything is done a nibble at a time by tables, on one frame in a loop, or on very many frames at
-once: a column of bytes (one byte a frame) goes through the same tables by `bytes.translate`, and
-columns are combined as big integers, so that the C library does the work for a whole image.
+Tables process a nibble at a time: one frame in a loop, or many frames at once. For many frames, a
+column of bytes (one byte per frame) goes through the same tables by `bytes.translate`, and columns
+are combined as big integers, so that the C library does the work for a whole image.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _UNSTUFFED_TAIL_BITS: Final = 1 + 1 + 1 + 7 + 3
 _HEAD_BITS: Final = 1 + 11 + 1 + 1 + 1 + 4
 _RUN_BEFORE_STUFFING: Final = 5
 
-# The state of the stuffing is the value of the last bit and how often it stands in a row (1 to 5);
-# it fits a nibble, so that state and next nibble together index a table of 256 bytes.
+# The stuffing state is the last bit and the length of its run (1 to 5). It fits a nibble, so state
+# and next nibble together index a table of 256 bytes.
 
 
 def _stuff(state: int, bits: int, width: int) -> tuple[int, int]:
@@ -73,11 +73,12 @@ def _head(can_id: int, size: int) -> tuple[int, int, int]:
 
 
 _TOP_CRC: Final = [_stuff(index >> 3, index & 7, 3) for index in range(128)]
-"""The CRC is three bits and three nibbles: the three bits first."""
+"""The 15-bit CRC is processed as three bits, then three nibbles."""
 _TOP_NEXT_STATE: Final = bytes(state & 15 for state, _ in _TOP_CRC).ljust(256, b"\0")
 _TOP_INSERTED: Final = bytes(inserted for _, inserted in _TOP_CRC).ljust(256, b"\0")
 _FULL_RUN: Final = bytes(state & 7 == _RUN_BEFORE_STUFFING for state in range(256))
-"""A run of five that ends with the CRC is followed by a stuff bit too."""
+"""Stuffing states in which the CRC ends with five equal bits, so that one more stuff bit
+follows."""
 
 
 def fixed_bits(size: int) -> int:
@@ -108,7 +109,9 @@ def frame_bits(frame: Frame) -> int:
 
 
 def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
-    """What `frame_bits` works with, for these ids, so that another language can do the same."""
+    """Return the tables of `frame_bits` for these ids, for generators of code in another
+    language.
+    """
     return {
         "fixed": [fixed_bits(size) for size in range(FRAME_DATA_SIZE + 1)],
         "heads": {
@@ -125,12 +128,14 @@ def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
 
 
 def message_bits(frames: Iterable[Frame]) -> int:
-    """Bit times of a message's frames one right after the other."""
+    """Bit times of consecutive frames without idle time between them."""
     return sum(map(frame_bits, frames))
 
 
 class _Columns:
-    """The same state machine for `count` frames of one id and size, fed a byte column at a time."""
+    """Run the same state machine on `count` frames of one id and size, one byte column at a
+    time.
+    """
 
     def __init__(self, can_id: int, size: int, count: int) -> None:
         state, inserted, crc = _head(can_id, size)
@@ -182,7 +187,7 @@ def stream_bits(can_id: int, stream: bytes) -> bytes:
     Raises ValueError when the stream is not a whole number of frames.
     """
     if len(stream) % FRAME_DATA_SIZE:
-        raise ValueError(f"{len(stream)} bytes are no whole number of full frames")
+        raise ValueError(f"{len(stream)} bytes are not a whole number of full frames")
     columns = _Columns(can_id, FRAME_DATA_SIZE, len(stream) // FRAME_DATA_SIZE)
     for position in range(FRAME_DATA_SIZE):
         columns.feed(stream[position::FRAME_DATA_SIZE])

@@ -1,7 +1,7 @@
-"""Every message of chapter 3 of both dialects: who sends what to whom, and what answers it.
+"""Catalogue of all messages of chapter 3, in both dialects: sender, receiver, command, answer.
 
-One row each; the id, the answer's id and the content's size follow. The upgrade of appendix 3 is in
-`messages`.
+The id, the answer's id and the size of the content follow from each row. The upgrade of appendix 3
+is in `messages`.
 """
 
 from __future__ import annotations
@@ -28,29 +28,28 @@ from flasher.protocol.wire import Message
 
 @dataclass(frozen=True)
 class Item:
-    """One row of the document's tables."""
+    """One row of the document's message tables."""
 
     sender: Node
     receiver: Node | None
-    """None is broadcast."""
+    """None means broadcast."""
     mode: Mode
     command: int
     content: type[Content]
     title: str
     answer_command: int | None = None
-    """The command of the BMS's answer, where there is one."""
+    """Command of the BMS's answer, if there is one."""
     dialects: tuple[Dialect, ...] = tuple(DIALECTS.values())
     manufacturer_only: bool = False
-    """Marked as optional and for the manufacturer in the document."""
+    """The document marks it as optional and for the manufacturer."""
 
     @cached_property
     def can_id(self) -> int:
-        """The CAN id that sender and receiver make."""
         return can_id(self.sender, self.receiver)
 
     @property
     def key(self) -> tuple[int, int]:
-        """What tells a message from the others: its CAN id and its command."""
+        """CAN id and command, which identify a message."""
         return self.can_id, self.command
 
     @property
@@ -133,32 +132,32 @@ ITEMS: Final = (
 )  # fmt: skip
 
 UPGRADE_COMMANDS: Final = frozenset(Command) - {item.command for item in ITEMS}
-"""Those that only the upgrade has."""
+"""Commands that only the upgrade uses."""
 BY_KEY: Final = {item.key: item for item in ITEMS}
 
 
 def answer_of(item: Item) -> Item | None:
-    """The row that answers a query or write; None for reports."""
+    """Return the row that answers a query or write; None for reports."""
     if item.answer_command is None:
         return None
     for receiver in (None, item.sender):
         answer = BY_KEY.get((can_id(_BMS, receiver), item.answer_command))
         if answer is not None:
             return answer
-    raise LookupError(f"{item.name} is answered by no row")
+    raise LookupError(f"{item.name} has no answering row")
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """A message with its row and its typed content."""
+    """A decoded message: its row and its content."""
 
     item: Item
     content: Content
 
 
 def decode(message: Message, dialect: Dialect | None = None) -> Decoded | None:
-    """The typed form of a message of chapter 3; None when no row of the dialect (of any, without
-    one) has its id, mode and command. Never raises.
+    """Decode a message of chapter 3. Return None if no row of the dialect (of either dialect if
+    None) has its id, mode and command. Never raises.
     """
     item = BY_KEY.get((message.can_id, message.command))
     if item is None or item.mode != message.mode:
@@ -171,8 +170,8 @@ def decode(message: Message, dialect: Dialect | None = None) -> Decoded | None:
 
 
 def has_message(dialect: Dialect, message: Message) -> bool:
-    """False for a message of the documents that is not in this dialect's: another dialect's row, or
-    the upgrade where it was cancelled.
+    """Return False for a documented message that this dialect lacks: a row of the other dialect, or
+    an upgrade message where the upgrade was cancelled.
     """
     item = BY_KEY.get((message.can_id, message.command))
     if item is not None:
@@ -181,8 +180,8 @@ def has_message(dialect: Dialect, message: Message) -> bool:
 
 
 def encode(item: Item, content: Content) -> Message:
-    """A message of chapter 3. Raises ValueError when the content is not the item's, or when a value
-    does not fit its field.
+    """Encode a message of chapter 3. Raises ValueError for the content of another item or for a
+    value that does not fit its field.
     """
     if type(content) is not item.content:
         wrong = type(content).__name__

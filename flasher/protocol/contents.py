@@ -1,5 +1,5 @@
-"""What the messages of chapter 3 carry, one class each (5.1, 5.2). Who sends them to whom under
-which command stands in `catalogue`.
+"""Contents of the messages of chapter 3, one class each (5.1, 5.2). `catalogue` lists who sends
+them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flasher.protocol.fields import (
 TEMPERATURE_OFFSET_C: Final = 40
 CELLS: Final = 16
 MEMORY_PIECE_SIZE: Final = 128
-"""Bytes that one memory read gives at the most (0x4308)."""
+"""Maximum number of bytes that one memory read returns (0x4308)."""
 
 
 def _temperature() -> Any:
@@ -41,8 +41,8 @@ class BatteryStatus(Bits):
 
 
 class BatteryFault(Bits):
-    """Faults: warnings in the upper half, protections and defects in the lower (5.1). The document
-    has nothing on the other bits, and does not reserve them (R24).
+    """Fault flags of the BMS: warnings in the upper half, protections and defects in the lower
+    (5.1). The document neither names nor reserves the other bits (R24).
     """
 
     SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION = 1 << 0
@@ -83,42 +83,44 @@ class Empty(Content):
 
 @dataclass(frozen=True)
 class Handshake(Content):
-    """A question: is the BMS there."""
+    """Asks whether the BMS is present."""
 
     text: bytes = constant(b"HANDSHAKE")
 
 
 @dataclass(frozen=True)
 class Ready(Content):
-    """Ready: for shutdown, or the answer to a handshake."""
+    """Confirms a shutdown, or answers a handshake."""
 
     text: bytes = constant(b"READY")
 
 
 @dataclass(frozen=True)
 class Shutdown(Content):
-    """The sender is about to switch off."""
+    """Announces that the sender switches off."""
 
     text: bytes = constant(b"SHUTDOWN")
 
 
 @dataclass(frozen=True)
 class Reset(Content):
-    """Restart."""
+    """Requests a restart."""
 
     text: bytes = constant(b"RESET")
 
 
 @dataclass(frozen=True)
 class GeneralFeedback(Content):
-    """A write was received."""
+    """Confirms that a write was received."""
 
     text: bytes = constant(b"ACK")
 
 
 @dataclass(frozen=True)
 class RunningInformation(Content):
-    """The battery now; current is negative while it discharges. Four bytes are reserved (R1)."""
+    """Present state of the battery; current is negative while it discharges. Four bytes are
+    reserved (R1).
+    """
 
     voltage_mv: int = number(2, "mV")
     mean_current_ma: int = number(2, "mA", signed=True)
@@ -129,7 +131,7 @@ class RunningInformation(Content):
     state_of_charge_percent: int = number(1, "%")
     status: BatteryStatus = field(FlagsField(1, BatteryStatus, none="no flag (00)"))
     state_of_health_percent: int = number(1, "%")
-    """0 may be an older device's, which does not know it (R22)."""
+    """0 may come from an older device that does not measure it (R22)."""
     reserved: bytes = reserved(4)
 
 
@@ -142,14 +144,14 @@ class CellVoltages(Content):
 
 @dataclass(frozen=True)
 class Faults(Content):
-    """Faults, sent every 200 ms while there are any."""
+    """Fault flags, sent every 200 ms while any is set."""
 
     faults: BatteryFault = field(FlagsField(4, BatteryFault))
 
 
 @dataclass(frozen=True)
 class DesignInformation(Content):
-    """The battery as it was designed."""
+    """Design data of the battery."""
 
     design_capacity_mah: int = number(2, "mAh")
     design_voltage_v: int = number(1, "V")
@@ -159,7 +161,7 @@ class DesignInformation(Content):
 
 @dataclass(frozen=True)
 class VersionInformation(Content):
-    """Who the battery is and what it runs."""
+    """Model, serial number and versions of the battery."""
 
     model: WireText = field(TextField(16))
     serial_number: WireText = field(TextField(16))
@@ -169,21 +171,21 @@ class VersionInformation(Content):
 
 @dataclass(frozen=True)
 class PhysicalId(Content):
-    """Physical ID; a short one is filled up with 01 (R13)."""
+    """Physical ID; a short one is padded with 01 (R13)."""
 
     physical_id: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
 class CheckCode(Content):
-    """Check code; what it is made of is not documented."""
+    """Check code; its structure is not documented."""
 
     check_code: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
 class History(Content):
-    """What the battery has lived through; both currents are without sign."""
+    """Extreme values and counters since production; both currents are unsigned."""
 
     highest_cell_temperature_c: int = _temperature()
     lowest_cell_temperature_c: int = _temperature()
@@ -208,7 +210,7 @@ class History(Content):
 
 @dataclass(frozen=True)
 class ProductionInformation(Content):
-    """Who made the battery, where and when."""
+    """Manufacturer, place and date of production."""
 
     manufacturer: WireText = field(TextField(8))
     place: WireText = field(TextField(8))
@@ -218,28 +220,28 @@ class ProductionInformation(Content):
 
 @dataclass(frozen=True)
 class UserString(Content):
-    """A text for free use."""
+    """Free text of the user."""
 
     text: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class Model(Content):
-    """The model of version information, to be written."""
+    """Writes the model of the version information."""
 
     model: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class SerialNumber(Content):
-    """The serial number of version information, to be written."""
+    """Writes the serial number of the version information."""
 
     serial_number: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class ReadMemory(Content):
-    """Which memory to read; `end` is exclusive (R5)."""
+    """Requests memory; `end` is exclusive (R5)."""
 
     start: int = field(AddressField(4))
     end: int = field(AddressField(4))
@@ -247,7 +249,7 @@ class ReadMemory(Content):
 
 @dataclass(frozen=True)
 class Memory(Content):
-    """What the memory holds; FF beyond the end."""
+    """Memory contents; FF after the end."""
 
     start: int = field(AddressField(4))
     end: int = field(AddressField(4))

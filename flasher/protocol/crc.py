@@ -1,9 +1,9 @@
-"""The CRC of appendix 1, at the speed of the C library.
+"""CRC-32 of appendix 1, computed with zlib for speed.
 
-The appendix XORs each byte into the *low* end of a 32-bit register and then steps four times: that
-is CRC-32/MPEG-2 over every byte widened to a big-endian 32-bit word (00 00 00 b). zlib computes
-the mirrored CRC-32, so both ends are mirrored here: the bits of every input byte and of the result
-are reversed, and zlib's final XOR is taken back.
+The appendix XORs each byte into the *low* end of a 32-bit register and then steps four times. That
+is CRC-32/MPEG-2 over every byte widened to a big-endian 32-bit word (00 00 00 b). zlib computes the
+mirrored CRC-32, so both ends are mirrored: the bits of every input byte and of the result are
+reversed, and zlib's final XOR is undone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What every engine is, host or device: a pure machine that is told frames and the time.
+"""Interface of all engines (host and device), and the message transmitter that they share.
 
-`now` is seconds on a monotonic clock, given from outside; an engine never sleeps and never reads a
-clock. `Transmitter` is the part that all engines share: messages out, one frame at a time.
+An engine is pure: it receives frames and the time as arguments. `now` is seconds on a monotonic
+clock; an engine never sleeps and never reads a clock. `Transmitter` sends messages frame by frame.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from flasher.protocol.bittime import frame_bits, message_bits
 from flasher.protocol.frame import Frame
 
 WELL_BEYOND: Final = 1.5
-"""Silence after a message that was cut short, as a multiple of the time after which its receiver
-drops it (R12)."""
+"""Silence after a truncated message, as a multiple of the time after which its receiver drops it
+(R12)."""
 
 
 class Engine(Protocol):
-    """The interface between a machine and the one loop that connects it to the world."""
+    """The interface between an engine and the driver loop."""
 
     @property
     def done(self) -> bool:
@@ -28,23 +28,23 @@ class Engine(Protocol):
         ...
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
+        """Process a received frame."""
         ...
 
     def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
+        """Process the time that `deadline` asked for."""
         ...
 
     def deadline(self) -> float | None:
-        """When the engine next wants `tick`, or a frame of its own to be asked for."""
+        """When to call `tick` or `next_frame` next; None for never."""
         ...
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send; the same one until `frame_sent` is called."""
+        """Return the next frame to send; the same one until `frame_sent` is called."""
         ...
 
     def frame_sent(self, now: float) -> None:
-        """The adapter has accepted the frame that `next_frame` gave."""
+        """Note that the adapter accepted the frame of `next_frame`."""
         ...
 
     def cancel(self, now: float) -> None:
@@ -52,7 +52,7 @@ class Engine(Protocol):
         ...
 
     def take_events(self) -> Sequence[object]:
-        """What happened since the last call: frozen dataclasses of `flasher.events`."""
+        """Return the events since the last call: frozen dataclasses of `flasher.events`."""
         ...
 
 
@@ -64,12 +64,12 @@ class _Outgoing(NamedTuple):
 
 
 class Transmitter:
-    """Messages waiting to be sent, whole and in order: a message is finished before the next one
-    starts, so it is never interleaved with its own repetition.
+    """Sends queued messages whole and in order, so that no message is interleaved with its own
+    repetition.
 
-    `frame_gap_s` keeps frames of one message apart for receivers that cannot take them at once.
-    Where a computer paused for longer than `dropped_after_s` between two frames, their receiver has
-    dropped the message (R12): it is sent anew after a silence that is longer than that.
+    `frame_gap_s` separates the frames of a message for slow receivers. If the computer pauses
+    between two frames for longer than `dropped_after_s`, the receiver has dropped the message
+    (R12): it is sent again after a longer silence.
     """
 
     def __init__(
@@ -85,23 +85,23 @@ class Transmitter:
         self._asked_at = 0.0
         self._frame_sent_at = 0.0
         self.due_at = inf
-        """When `next_frame` has something to give; infinite while nothing waits."""
+        """When `next_frame` has a frame to send; infinite while the queue is empty."""
         self.left_at = -inf
-        """When the last frame of the last message has left: accepted by the adapter plus its time
-        on the wire (R12)."""
+        """When the last frame of the last message was on the wire: accepted by the adapter plus its
+        time on the wire (R12)."""
         self.left_tag: object = None
-        """The tag of that message."""
+        """Tag of that message."""
         self.on_left: Callable[[float], None] | None = None
-        """Called when the last frame of a message is accepted, with the time."""
+        """Called with the time when the adapter accepts the last frame of a message."""
 
     @property
     def idle(self) -> bool:
-        """True when nothing waits to be sent."""
+        """True when the queue is empty."""
         return not self._queue
 
     @property
     def begun(self) -> bool:
-        """True while a message is half sent."""
+        """True while a message is partly sent."""
         return self._sent_frames > 0
 
     def queue(
@@ -112,10 +112,10 @@ class Transmitter:
         not_before: float = 0.0,
         tag: object = None,
     ) -> None:
-        """Send a message after those before it, its first frame not sooner than `not_before`.
+        """Queue a message; its first frame is not sent before `not_before`.
 
-        `wire_s` is its time on the wire where the caller knows it, else it is computed; `tag` is
-        for the caller to know it again when it has left.
+        `wire_s` is its time on the wire, computed if None. `tag` identifies the message when it has
+        been sent (`left_tag`).
         """
         if wire_s is None:
             wire_s = message_bits(frames) / self._bitrate_bps
@@ -125,7 +125,7 @@ class Transmitter:
         self._queue.append(_Outgoing(frames, wire_s, not_before, tag))
 
     def drop_unstarted(self) -> None:
-        """Forget the messages of which no frame was accepted yet."""
+        """Drop the messages of which no frame was accepted yet."""
         if self._sent_frames:
             started = self._queue[0]
             self._queue.clear()
@@ -135,20 +135,20 @@ class Transmitter:
             self.due_at = inf
 
     def hurry(self) -> None:
-        """Send the rest of a message that is half sent without gaps: nothing comes after it."""
+        """Send the rest of a partly sent message without gaps: nothing follows it."""
         self._frame_gap_s = 0.0
         if self._sent_frames:
             self.due_at = 0.0
 
     def all_left(self, now: float) -> None:
-        """What was sent has left by `now`, since it was answered: a bus in one computer is faster
-        than the bit rate says.
+        """Assume that everything was on the wire by `now`, because it was answered: an in-process
+        bus is faster than its bit rate.
         """
         self.left_at = min(self.left_at, now)
 
     def abandon(self, quiet_until: float) -> None:
-        """Forget everything, a message that is half sent included; what is queued from now on waits
-        until `quiet_until`, so that the receiver drops the half (R12).
+        """Drop all messages, a partly sent one included. New messages wait until `quiet_until`, so
+        that the receiver drops the partial one (R12).
         """
         self._queue.clear()
         self._sent_frames = 0
@@ -156,11 +156,11 @@ class Transmitter:
         self.due_at = inf
 
     def deadline(self) -> float | None:
-        """When `next_frame` has something to give; None when nothing waits."""
+        """When `next_frame` has a frame to send; None while the queue is empty."""
         return None if self.due_at == inf else self.due_at
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send, or None while a gap lasts or nothing waits."""
+        """Return the next frame to send; None during a gap or while the queue is empty."""
         if now < self.due_at:
             return None
         if self._sent_frames and now - self._frame_sent_at > self._dropped_after_s:
@@ -171,7 +171,7 @@ class Transmitter:
         return self._queue[0].frames[self._sent_frames]
 
     def frame_sent(self, now: float) -> bool:
-        """The adapter has accepted the frame; True when it was the last one of its message."""
+        """Note that the adapter accepted the frame; True for the last one of its message."""
         if not self._queue:
             return False
         frames = self._queue[0].frames
@@ -179,7 +179,7 @@ class Transmitter:
             self._message_began_at = max(now, self.left_at)
         self._sent_frames += 1
         if self._sent_frames < len(frames):
-            # A pause while it was handed over came before it or after it, which is not known.
+            # Whether a pause came before or after the hand-over is unknown.
             was_paused = now - self._asked_at > self._dropped_after_s
             self._frame_sent_at = -inf if was_paused else now
             if self._frame_gap_s:
@@ -187,8 +187,8 @@ class Transmitter:
             return False
         message = self._queue.popleft()
         self._sent_frames = 0
-        # An adapter may take a message at once and send it at the bus's pace, or take each frame
-        # when it sends it: the later of the two tells when the last frame is gone.
+        # An adapter may buffer a whole message or take each frame only when it sends it: the later
+        # estimate applies.
         last_frame_s = frame_bits(frames[-1]) / self._bitrate_bps
         self.left_tag = message.tag
         self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)

@@ -1,9 +1,8 @@
-"""Fields of a message's data, declared once: from the declaration come encoder and decoder, the
-label and unit that people see, and the documentation.
+"""Field codecs of message data: one declaration gives encoder, decoder, label and unit.
 
-A content is a frozen dataclass whose fields carry a codec each, in wire order. Decoding accepts any
-bytes of the right size, and encoding what was decoded gives the very same bytes: numbers out of
-range of their meaning, broken texts and reserved bytes are kept as they came.
+A content is a frozen dataclass whose fields each have a codec, in wire order. Decoding accepts any
+bytes of the right size, and encoding the result gives the same bytes: out-of-range numbers,
+malformed texts and reserved bytes are kept.
 """
 
 from __future__ import annotations
@@ -21,34 +20,32 @@ _CODEC: Final = "codec"
 
 
 class Codec(Protocol):
-    """How one field stands in the data."""
+    """Encoding of one field."""
 
     @property
-    def size_bytes(self) -> int:
-        """Bytes of the field."""
-        ...
+    def size_bytes(self) -> int: ...
 
     @property
     def unit(self) -> str:
-        """Unit of the value; empty when it has none."""
+        """Unit of the value; may be empty."""
         ...
 
     def encode(self, value: Any) -> bytes:
-        """The field's bytes; raises ValueError for a value that does not fit."""
+        """Raises ValueError for a value that does not fit."""
         ...
 
     def decode(self, raw: bytes) -> Any:
-        """The value; never raises."""
+        """Never raises."""
         ...
 
     def show(self, value: Any) -> str:
-        """The value for people, without its unit, harmless on any screen."""
+        """Format the value for people: without its unit, escaped."""
         ...
 
 
 @dataclass(frozen=True)
 class NumberField:
-    """An integer, little-endian; the value is what is on the wire minus `offset`."""
+    """Little-endian integer; the value is the wire value minus `offset`."""
 
     size_bytes: int
     unit: str = ""
@@ -67,7 +64,7 @@ class NumberField:
 
 @dataclass(frozen=True)
 class AddressField(NumberField):
-    """A place in memory, shown in hexadecimal."""
+    """Memory address, shown in hexadecimal."""
 
     def show(self, value: int) -> str:
         return f"0x{value:0{2 * self.size_bytes}X}"
@@ -75,7 +72,7 @@ class AddressField(NumberField):
 
 @dataclass(frozen=True)
 class NumberListField:
-    """A row of integers of the same kind."""
+    """Several integers of the same kind."""
 
     count: int
     each: NumberField
@@ -109,7 +106,7 @@ class Bits(IntFlag):
 
     @classmethod
     def unnamed(cls, bit: int) -> str:
-        """What a bit without a name is called."""
+        """Name of a bit that has none."""
         return f"reserved bit {bit}"
 
 
@@ -137,9 +134,7 @@ class FlagsField:
 
 
 def flag_names(names: type[Bits], value: int) -> list[str]:
-    """The names of the bits that are set, in order, as JSON has them; an unnamed bit as its
-    number.
-    """
+    """Names of the bits that are set, in order, as used in JSON; an unnamed bit by its number."""
     named = {int(flag): (flag.name or "").lower().replace("_", " ") for flag in names}
     bits = (1 << bit for bit in range(int(value).bit_length()) if value >> bit & 1)
     return [named.get(bit) or names.unnamed(bit.bit_length() - 1) for bit in bits]
@@ -147,7 +142,7 @@ def flag_names(names: type[Bits], value: int) -> list[str]:
 
 @dataclass(frozen=True)
 class WireText:
-    """An ASCII field as it stands on the wire; `str()` is its text, escaped (R20)."""
+    """ASCII field as received; `str()` gives its text, escaped (R20)."""
 
     raw: bytes
 
@@ -157,7 +152,7 @@ class WireText:
 
 @dataclass(frozen=True)
 class TextField:
-    """Text, terminator, spaces (5.1). Takes a str or a `WireText`."""
+    """Text, terminator, spaces (5.1). Encodes a str or a `WireText`."""
 
     size_bytes: int
     unit: str = ""
@@ -176,8 +171,8 @@ class TextField:
 
 @dataclass(frozen=True)
 class DateField:
-    """Eight digits YYYYMMDD, without terminator. Takes a str of eight digits (whether the calendar
-    has the day is for the caller to ask) or a `WireText`.
+    """Eight digits YYYYMMDD without terminator. Encodes a `WireText` or a str of eight digits; the
+    caller checks the calendar.
     """
 
     size_bytes: int = 8
@@ -194,7 +189,7 @@ class DateField:
         return WireText(raw)
 
     def show(self, value: WireText | str) -> str:
-        # Not the text of `WireText`: a dot in a date is no terminator.
+        # Not `str(value)`: a dot in a date is not a terminator.
         text = printable(value if isinstance(value, str) else value.raw.decode("latin-1")).rstrip()
         is_date = len(text) == self.size_bytes and text.isdigit()
         return f"{text[:4]}-{text[4:6]}-{text[6:]}" if is_date else text
@@ -202,7 +197,7 @@ class DateField:
 
 @dataclass(frozen=True)
 class LatinField:
-    """Text that fills its field, one character a byte, whatever the bytes are."""
+    """Text that fills its field, one Latin-1 character per byte."""
 
     size_bytes: int
     unit: str = ""
@@ -219,7 +214,7 @@ class LatinField:
 
 @dataclass(frozen=True)
 class BytesField:
-    """Bytes without a meaning of their own, shown in hexadecimal."""
+    """Opaque bytes, shown in hexadecimal."""
 
     size_bytes: int
     unit: str = ""
@@ -236,7 +231,7 @@ class BytesField:
 
 @dataclass(frozen=True)
 class ConstantField:
-    """Text that is always the same; another one is kept and shown."""
+    """Constant text; any other text is kept and shown."""
 
     expected: bytes
     unit: str = ""
@@ -258,7 +253,7 @@ class ConstantField:
 
 @dataclass(frozen=True)
 class ReservedField(BytesField):
-    """Reserved bytes: zero when we send, kept when we receive."""
+    """Reserved bytes: sent as zero, kept as received."""
 
 
 def _integer(value: int, on_the_wire: int, size_bytes: int, *, signed: bool = False) -> bytes:
@@ -278,28 +273,25 @@ def _sized(raw: bytes, size_bytes: int) -> bytes:
 
 
 def field(codec: Codec, **options: Any) -> Any:
-    """A dataclass field with its codec."""
+    """Declare a dataclass field with its codec."""
     return dataclasses.field(metadata={_CODEC: codec}, **options)
 
 
 def number(size_bytes: int, unit: str = "", *, offset: int = 0, signed: bool = False) -> Any:
-    """An integer field."""
     return field(NumberField(size_bytes, unit, offset, signed))
 
 
 def constant(text: bytes) -> Any:
-    """A text that is always the same."""
     return field(ConstantField(text), default=text)
 
 
 def reserved(size_bytes: int) -> Any:
-    """Reserved bytes, zero by default."""
     return field(ReservedField(size_bytes), default=bytes(size_bytes))
 
 
 @dataclass(frozen=True)
 class Content:
-    """The data of a message as typed values; subclasses declare their fields in wire order."""
+    """Message data as typed values; subclasses declare their fields in wire order."""
 
     SIZE_BYTES: ClassVar[int] = 0
     LAYOUT: ClassVar[tuple[tuple[str, Codec], ...]] = ()
@@ -312,7 +304,7 @@ class Content:
         cls.SIZE_BYTES = sum(codec.size_bytes for _, codec in cls.LAYOUT)
 
     def data(self) -> bytes:
-        """The data field. Raises ValueError naming the field that does not fit."""
+        """Encode the data. Raises ValueError with the name of the field that does not fit."""
         parts = []
         for name, codec in self.LAYOUT:
             try:
@@ -323,7 +315,7 @@ class Content:
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        """The way back from any `SIZE_BYTES` bytes; raises ValueError for another size."""
+        """Decode `SIZE_BYTES` bytes; raises ValueError for another size."""
         if len(data) != cls.SIZE_BYTES:
             raise ValueError(f"{len(data)} bytes of data, not {cls.SIZE_BYTES}")
         values, at = [], 0
@@ -333,7 +325,9 @@ class Content:
         return cls(*values)
 
     def shown(self) -> Iterator[tuple[str, str, str]]:
-        """Label, value and unit of every field, for people; reserved bytes only if not zero."""
+        """Yield label, value and unit of every field for people; reserved bytes only if not
+        zero.
+        """
         for name, codec in self.LAYOUT:
             value = getattr(self, name)
             if not isinstance(codec, ReservedField) or any(value):
@@ -355,7 +349,7 @@ _OWN_LABELS: Final = {
 
 
 def label(name: str, codec: Codec) -> str:
-    """A field's name for people: without the unit that follows the value."""
+    """Name of a field for people, without its unit."""
     bare = name.removesuffix(_UNIT_SUFFIXES.get(codec.unit, ""))
     if bare.endswith("_count"):  # of the history; warnings have the same names (chapter 3)
         bare = f"{bare.removesuffix('count')}protection_count"

@@ -1,8 +1,8 @@
-"""Typed messages: the upgrade of appendix 3.
+"""Typed messages of the upgrade (appendix 3).
 
-Each class is one row of the document. `to_message` gives the wire form on a CAN id, `decode` the
-way back. Decoding is strict: mode, size and every constant byte must be the document's; what does
-not fit comes back as `Malformed`, what is not in the table as `Unknown`, both as values.
+Each class is one row of the document; `to_message` encodes it for a CAN id, `decode` is the
+inverse. Decoding is strict: mode, size and every constant byte must match the document. Mismatches
+are returned as `Malformed`, unlisted commands as `Unknown`.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from flasher.protocol.wire import Message
 
 @dataclass(frozen=True)
 class PacketNumber(NumberField):
-    """The number of a packet, or of all of them: 1 or more."""
+    """Number of a packet, or total of packets: 1 or more."""
 
     size_bytes: int = 2
 
 
 @dataclass(frozen=True)
 class UpdateText(LatinField):
-    """A text that names a target."""
+    """Text that names a target."""
 
     KNOWN: ClassVar[frozenset[str]] = frozenset(each.update_text for each in TARGETS.values())
 
 
 @dataclass(frozen=True)
 class Malformed:
-    """A message with a known command whose mode or data break the document's row."""
+    """Message with a known command whose mode or data break the document."""
 
     message: Message
     problem: str
@@ -49,14 +49,14 @@ class Malformed:
 
 @dataclass(frozen=True)
 class Unknown:
-    """An intact message with a command that this table does not hold."""
+    """Intact message with a command outside the upgrade."""
 
     message: Message
 
 
 @dataclass(frozen=True)
 class _UpgradeMessage:
-    """What all rows share: their mode and command, and the way to a message."""
+    """Base of the upgrade messages."""
 
     MODE: ClassVar[Mode]
     COMMAND: ClassVar[Command]
@@ -73,16 +73,14 @@ class _UpgradeMessage:
             assert cls._STRUCT.size == data_size(cls.COMMAND)
 
     def data(self) -> bytes:
-        """The data field."""
         raise NotImplementedError
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        """The way back; `data` has the command's size. Raises ValueError naming the problem."""
+        """Decode `data` of the command's size. Raises ValueError with the problem."""
         raise NotImplementedError
 
     def to_message(self, can_id: int) -> Message:
-        """This message as it goes out on `can_id`."""
         return Message(can_id, self.MODE, self.COMMAND, self.data())
 
 
@@ -94,7 +92,7 @@ def _struct_format(codec: Codec) -> str:
 
 @dataclass(frozen=True)
 class _Constant(_UpgradeMessage):
-    """A row whose data never change."""
+    """Message with constant data."""
 
     DATA: ClassVar[bytes]
 
@@ -114,7 +112,7 @@ class _Constant(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class _Numbered(_UpgradeMessage):
-    """A row that holds one packet number (little-endian, R4)."""
+    """Message with one packet number (little-endian, R4)."""
 
     LAYOUT = (("number", NumberField(2)),)
 
@@ -148,7 +146,7 @@ class GeneralFeedbackMessage(_Constant):
 
 @dataclass(frozen=True)
 class BootVersion(_UpgradeMessage):
-    """Bootloader to tool: who it is. Texts are kept as received, well formed or not (SE-02)."""
+    """Bootloader to tool: its name and version, kept as received, well formed or not (SE-02)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.BOOT_VERSION
@@ -159,7 +157,7 @@ class BootVersion(_UpgradeMessage):
 
     @property
     def is_version(self) -> bool:
-        """True when the version text has the document's form Vx.x.x."""
+        """True when the version has the form Vx.x.x."""
         return boot_version_number(self.version) is not None
 
     def data(self) -> bytes:
@@ -190,7 +188,7 @@ class UpdateCommand(_UpgradeMessage):
         raw, size_bytes = cls._STRUCT.unpack(data)
         text = raw.decode("latin-1")
         if text not in UpdateText.KNOWN:
-            raise ValueError(f"no target is updated by the text {text!a}")
+            raise ValueError(f"no target has the update text {text!a}")
         return cls(text, size_bytes)
 
 
@@ -243,7 +241,9 @@ class Ack(_Numbered):
 
 @dataclass(frozen=True)
 class Nak(_Numbered):
-    """Bootloader to tool: packet not received rightly; after the end of transfer: refused (R6)."""
+    """Bootloader to tool: packet not received correctly; after the end of transfer: image refused
+    (R6).
+    """
 
     MODE = Mode.REPORT
     COMMAND = Command.NAK
@@ -295,11 +295,11 @@ UPGRADE_MESSAGES: Final[dict[int, type[UpgradeMessage]]] = {
         Complete,
     )
 }
-"""Every row, by its command."""
+"""All upgrade messages by command."""
 
 
 def decode(message: Message) -> UpgradeMessage | Malformed | Unknown:
-    """The typed form of an intact message. Never raises."""
+    """Decode an intact message. Never raises."""
     row = UPGRADE_MESSAGES.get(message.command)
     if row is None:
         return Unknown(message)

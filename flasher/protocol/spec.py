@@ -1,6 +1,6 @@
-"""Facts of the protocol documents, each stated once: nodes, ids, dialects, framing, commands.
+"""Constants of the protocol documents: nodes, ids, dialects, framing, commands.
 
-Source: Welling protocol (BMS) V1.0.0 and MOTINOVA protocol (BMS) V2.7.1, chapters 1 to 3 and
+Sources: Welling protocol (BMS) V1.0.0 and MOTINOVA protocol (BMS) V2.7.1, chapters 1 to 3 and
 appendix 3. Timings are in `timing`, layouts of messages in `messages`.
 """
 
@@ -24,7 +24,7 @@ CRC_SIZE: Final = 4
 LENGTH_MIN: Final = COMMAND_SIZE
 LENGTH_MAX: Final = 0xFF
 PREFIX_SIZE: Final = len(HEADER) + MODE_SIZE + LENGTH_SIZE
-"""Bytes before the part that the length field counts."""
+"""Bytes before those that the length field counts."""
 OVERHEAD_SIZE: Final = PREFIX_SIZE + CRC_SIZE + len(TAIL)
 """Bytes of a message that the length field does not count."""
 MESSAGE_MIN_SIZE: Final = OVERHEAD_SIZE + LENGTH_MIN
@@ -45,7 +45,7 @@ class Mode(IntEnum):
 
 
 class Node(Enum):
-    """A participant on the bus; the value is its digit in CAN ids."""
+    """Node on the bus; the value is its digit in CAN ids."""
 
     WMC = 1
     BMS = 2
@@ -59,7 +59,7 @@ _ID_BASE: Final = 0x700
 
 
 def can_id(sender: Node, receiver: Node | None) -> int:
-    """The 11-bit CAN id of messages from `sender` to `receiver`; None is broadcast."""
+    """CAN id of messages from `sender` to `receiver`; None is broadcast."""
     receiver_digit = BROADCAST_DIGIT if receiver is None else receiver.value
     return _ID_BASE | sender.value << 4 | receiver_digit
 
@@ -68,7 +68,9 @@ def can_id(sender: Node, receiver: Node | None) -> int:
 
 
 class Command(IntEnum):
-    """Commands in wire order: first byte the serial number, second byte the size of the data."""
+    """Commands in wire order: the first byte is the serial number, the second the size of the
+    data.
+    """
 
     RESET = 0x4205
     GENERAL_FEEDBACK = 0x5503
@@ -101,14 +103,14 @@ PACKET_COUNT_MAX: Final = 0xFFFF
 IMAGE_MAX_SIZE: Final = PACKET_COUNT_MAX * PACKET_DATA_SIZE
 """Largest image in bytes (R9)."""
 BOOT_VERSION_BURST: Final = 4
-"""How often a bootloader announces its version (figure 2)."""
+"""Number of announcements of a bootloader (figure 2)."""
 FRAMES_PER_PACKET: Final = (
     OVERHEAD_SIZE + COMMAND_SIZE + data_size(Command.PACKET)
 ) // FRAME_DATA_SIZE
 
 
 def packet_count(size_bytes: int) -> int:
-    """Packets that an image of `size_bytes` takes; the last one is padded (R9)."""
+    """Number of packets for an image of `size_bytes`; the last one is padded (R9)."""
     return -(-size_bytes // PACKET_DATA_SIZE)
 
 
@@ -124,13 +126,13 @@ VERSION_FIELD_SIZE: Final = 16
 
 @dataclass(frozen=True)
 class Target:
-    """A device that the upgrade of appendix 3 knows, with its names on the wire (tables 8, 9)."""
+    """Upgradable device with its names on the wire (tables 8, 9)."""
 
     node: Node
     update_text: str
     boot_name: str
     has_version_query: bool
-    """True where the document gives a query for version information (chapter 3: the BMS only)."""
+    """True if the document has a version query for it (chapter 3: the BMS only)."""
 
     @property
     def name(self) -> str:
@@ -158,17 +160,17 @@ OBC: Final = Target(Node.OBC, "OBC_UPD", "PBU", has_version_query=False)
 
 TARGETS: Final = {target.name: target for target in (WMC, BMS, OBC)}
 TARGET_ALIASES: Final = {"mc": WMC, "pbu": OBC}
-"""The documents' other names for the same devices."""
+"""Other names of the documents for the same devices."""
 
 
 def find_target(name: str) -> Target | None:
-    """The target with this name or alias, in either case; None when there is none."""
+    """Find a target by name or alias, ignoring case."""
     lower = name.lower()
     return TARGETS.get(lower) or TARGET_ALIASES.get(lower)
 
 
 def as_target(target: str | Target) -> Target:
-    """A target by its name or one of the documents' other names. Raises UsageError."""
+    """Return the target of this name or alias. Raises UsageError."""
     found = target if isinstance(target, Target) else find_target(target)
     if found is None:
         raise UsageError(f"There is no target {target!r}; targets are {', '.join(TARGETS)}.")
@@ -177,7 +179,7 @@ def as_target(target: str | Target) -> Target:
 
 @dataclass(frozen=True)
 class Dialect:
-    """One of the two protocol documents, with what it decides differently from the other."""
+    """One of the two protocol documents, with its differences."""
 
     name: str
     version: str
@@ -204,7 +206,7 @@ DIALECTS: Final = {dialect.name: dialect for dialect in (WELLING, MOTINOVA)}
 
 
 def as_dialect(dialect: str | Dialect) -> Dialect:
-    """A dialect by its name. Raises UsageError."""
+    """Return the dialect of this name. Raises UsageError."""
     found = dialect if isinstance(dialect, Dialect) else DIALECTS.get(dialect.lower())
     if found is None:
         raise UsageError(f"There is no dialect {dialect!r}; dialects are {', '.join(DIALECTS)}.")

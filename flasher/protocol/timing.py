@@ -1,7 +1,6 @@
-"""Timings in seconds and tries, each stated once: the documents' own, and the defaults of R12.
+"""Timings in seconds and numbers of tries: the documents' own, and the defaults of R12.
 
-`Timings` is what a host or a device model is given; a product that needs other values replaces
-fields, nothing else holds a copy of them.
+Hosts and device models take a `Timings`; a product with other values replaces fields.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ class Timings:
     command_repeat_s: Timeout = 0.2
     """The tool repeats an application command at this interval (chapter 3)."""
     command_timeout_s: Timeout = 1.0
-    """The tool gives an application command up after this time (chapter 3)."""
+    """The tool stops repeating an application command after this time (chapter 3)."""
     boot_version_spacing_s: Pause = 0.05
     """Time between two announcements of a bootloader (figure 2)."""
 
@@ -41,25 +40,25 @@ class Timings:
     complete_timeout_s: Timeout = 10.0
     """From end of transfer to complete (R12)."""
     packet_tries: Tries = 5
-    """How often a packet is sent at the most (R12)."""
+    """Maximum number of transmissions of a packet (R12)."""
     end_tries: Tries = 3
-    """How often end of transfer is sent at the most while nothing answers it (R12)."""
+    """Maximum number of transmissions of end of transfer without an answer (R12)."""
     boot_watch_s: Pause = 0.025
-    """So long after a boot version a second bootloader may show itself before the update command is
-    sent (R27): half of the time to the next announcement, which one that goes on needs."""
+    """Time between boot version and update command in which a second bootloader can be detected
+    (R27): half of the time to the next announcement."""
     update_spacing_s: Pause = 0.03
-    """An update command follows the one before not sooner than this (R2)."""
+    """Minimum time between two update commands (R2)."""
     leftover_boot_version_s: Pause = 0.06
-    """A boot version up to this long after request transfer is a leftover of the burst (R11)."""
+    """A boot version within this time after request transfer is a leftover of the burst (R11)."""
     announcing_on_s: Timeout = 1.0
-    """Announcements that still come this long after the first one since end of transfer are those
-    of a device that did not accept (R11): five times as long as a burst takes, so that a doubled
+    """A device that still announces itself this long after its first announcement since end of
+    transfer did not accept the image (R11). Five times as long as a burst, so that a doubled
     announcement, or a second pass through the bootloader, erases no good image."""
     quiet_after_repeat_s: Pause = 0.05
-    """After a repetition the next message waits for this much silence (R10)."""
+    """Silence required after a repetition before the next message (R10)."""
     application_start_timeout_s: Timeout = 5.0
-    """From a lost final answer to the version answer of the new application (not in R12: as long
-    as a restart may take in the other direction)."""
+    """From a lost final answer to the version answer of the new application (not in R12: as long as
+    a restart may take in the other direction)."""
 
 
 DEFAULT_TIMINGS = Timings()

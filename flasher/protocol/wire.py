@@ -1,12 +1,12 @@
-"""Messages to CAN payloads and back (2.2.1, 2.2.3).
+"""Encoding and reassembly of messages on CAN (2.2.1, 2.2.3).
 
-Sending is a pure function. Receiving is a `Reassembler` for each CAN id: a byte stream in, intact
-messages and named damage out. It never raises on what it is fed and never holds more than one
-message and one frame. After damage it skips the header that misled it and scans what it holds
-again, so the next intact message is found wherever it starts.
+Encoding is a pure function. A `Reassembler` per CAN id turns a byte stream into intact messages and
+classified damage. It never raises and buffers at most one message and one frame. After damage it
+skips the misleading header and scans its buffer again, so that it finds the next intact message
+wherever it starts.
 
-What tells a header from the same two bytes inside data is the redundancy of 2.2.1: the length must
-be at least 2 and the command's second byte must be the length minus 2. CRC and tail decide then.
+Redundancy distinguishes a header from the same two bytes inside data (2.2.1): the length must be at
+least 2, and the command's second byte must be the length minus 2. CRC and tail decide then.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from flasher.protocol.spec import (
 
 
 class Message(NamedTuple):
-    """An intact message: who to whom (`can_id`), mode byte, 16-bit command, data."""
+    """Intact message: `can_id` (sender and receiver), mode byte, 16-bit command, data."""
 
     can_id: int
     mode: int
@@ -43,7 +43,7 @@ class Message(NamedTuple):
 
 
 class DamageReason(Enum):
-    """Why received bytes were not taken for a message."""
+    """Why received bytes are not a message."""
 
     JUNK = "junk"
     BAD_LENGTH = "bad_length"
@@ -54,7 +54,7 @@ class DamageReason(Enum):
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes on one CAN id that were no message; `data` is what was judged, from its header on."""
+    """Bytes on one CAN id that are not a message; `data` starts at the header."""
 
     can_id: int
     reason: DamageReason
@@ -65,9 +65,9 @@ class Damage:
 
 
 def encode(message: Message) -> bytes:
-    """The complete message, header to tail.
+    """Encode a complete message, header to tail.
 
-    Raises ValueError when the size of the data is not the one that the command names.
+    Raises ValueError if the size of the data differs from the one in the command.
     """
     can_id, mode, command, data = message
     if len(data) != data_size(command):
@@ -76,14 +76,14 @@ def encode(message: Message) -> bytes:
         )
     length = COMMAND_SIZE + len(data)
     if length > LENGTH_MAX:
-        raise ValueError(f"command {command:04X} is longer than the length field can say")
+        raise ValueError(f"command {command:04X} exceeds the length field")
     body = bytes((mode, length)) + command.to_bytes(2, "big") + data
     crc = crc32(HEADER + can_id.to_bytes(2, "big") + body)
     return HEADER + body + crc.to_bytes(CRC_SIZE, "big") + TAIL
 
 
 def split(can_id: int, wire: bytes) -> list[Frame]:
-    """The CAN frames of an encoded message: 8 bytes each, the last one shorter (2.2.3)."""
+    """Split an encoded message into CAN frames of 8 bytes; the last one may be shorter (2.2.3)."""
     return [
         Frame(can_id, wire[start : start + FRAME_DATA_SIZE])
         for start in range(0, len(wire), FRAME_DATA_SIZE)
@@ -93,16 +93,16 @@ def split(can_id: int, wire: bytes) -> list[Frame]:
 # -- receiving ----------------------------------------------------------------------------------
 
 _HEAD_SIZE: Final = PREFIX_SIZE + COMMAND_SIZE
-"""Bytes needed to judge a header."""
+"""Bytes needed to check a header."""
 _NOTHING: Final[tuple[Message | Damage, ...]] = ()
 
 
 class Reassembler:
-    """Messages of one CAN id out of its frames' payloads.
+    """Reassembles the messages of one CAN id from frame payloads.
 
-    Feed payloads as they arrive, call `tick` at `deadline` or later. Bytes of an unfinished message
-    are dropped `inter_frame_timeout_s` after the last payload (R12), and only by `tick`: payloads
-    that waited in a queue while the computer was busy do not count as late.
+    Feed payloads as they arrive and call `tick` at `deadline` or later. An unfinished message is
+    dropped `inter_frame_timeout_s` after its last payload (R12), but only by `tick`: payloads that
+    were queued while the computer was busy are not late.
     """
 
     def __init__(self, can_id: int, inter_frame_timeout_s: float) -> None:
@@ -112,15 +112,15 @@ class Reassembler:
         self._junk = bytearray()
         self._needed = len(HEADER)
         self.due_at = inf
-        """When `tick` has to be called next; infinite while nothing is held."""
+        """When to call `tick` next; infinite while the buffer is empty."""
 
     @property
     def held_size(self) -> int:
-        """Bytes held, for those who watch memory."""
+        """Buffered bytes."""
         return len(self._buffer) + len(self._junk)
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
-        """Take the payload of one frame; returns what it completed, usually nothing."""
+        """Add the payload of a frame; return what it completes, usually nothing."""
         if not payload:
             return _NOTHING
         self._buffer += payload
@@ -133,11 +133,11 @@ class Reassembler:
         return found
 
     def deadline(self) -> float | None:
-        """When `tick` has to be called next; None while nothing is held."""
+        """When to call `tick` next; None while the buffer is empty."""
         return None if self.due_at == inf else self.due_at
 
     def tick(self, now: float) -> Sequence[Message | Damage]:
-        """Drop what has waited too long; returns what was found in it."""
+        """Drop bytes that waited too long; return what was found in them."""
         if now < self.due_at:
             return _NOTHING
         self.due_at = inf
@@ -154,7 +154,7 @@ class Reassembler:
         return found
 
     def reset(self) -> None:
-        """Forget everything held."""
+        """Clear the buffer."""
         self._buffer.clear()
         self._junk.clear()
         self._needed = len(HEADER)
@@ -175,7 +175,7 @@ class Reassembler:
         return found
 
     def _align(self) -> bool:
-        """Move everything before the next header to the junk; False when no header may be left."""
+        """Move everything before the next header to the junk; False if no header can follow."""
         buffer = self._buffer
         if not buffer.startswith(HEADER):
             start = buffer.find(HEADER)
@@ -214,10 +214,9 @@ class Reassembler:
         return crc == int.from_bytes(wire[-CRC_SIZE - len(TAIL) : -len(TAIL)], "big")
 
     def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
-        """Report the candidate of `size` bytes at the front and give up its header only, so that
-        the rest is scanned.
+        """Report the first `size` bytes and skip only their header, so that the rest is scanned.
 
-        What lies between that header and the next one belongs to this report.
+        Bytes between that header and the next one belong to this report.
         """
         self._flush_junk(found)
         found.append(Damage(self.can_id, reason, bytes(self._buffer[:size])))

@@ -157,7 +157,7 @@ def test_a_write_is_seen_through_once_it_has_begun() -> None:
         ("production-information", ("ACME", "SUZHOU", "2026W101"), "not a date"),
         ("production-information", ("ACME", "SUZHOU"), "takes 3 values; 2 were given"),
         ("production-information", ("LONGNAME", "X", "20260517"), "longer than 7"),
-        ("serial-number", ("W26.5001",), "ends a field"),
+        ("serial-number", ("W26.5001",), "terminator of a field"),
         ("serial-number", ("W" * 16,), "longer than 15"),
         ("serial-number", ("\x1b[2J",), "not printable ASCII"),
         ("serial-number", (), "takes 1 value; no value was given"),
@@ -206,7 +206,7 @@ def test_all_but_the_last_byte_of_the_memory_can_be_named() -> None:
 
 @each("start, end", [(8, 8), (9, 8), (-1, 8), (0, 0x1_0000_0000)])
 def test_an_impossible_range_is_refused(start: int, end: int) -> None:
-    with pytest.raises(UsageError, match="no range of memory"):
+    with pytest.raises(UsageError, match="not a valid memory range"):
         wire_to().device().read_memory(start, end)
 
 

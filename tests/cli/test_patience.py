@@ -99,6 +99,6 @@ def test_a_device_without_power_on_a_bus_of_two_is_asked_for(
     stage.at_packet[3] = alone
     run = flasher("flash", image, *BUS, "--timeout", "30")
     assert run.code == ExitCode.BUS
-    assert "Trying on for 27 s: has the device power and contact?" in run.err
+    assert "Trying on for 27 s: check power and contacts of the device." in run.err
     assert run.err.count("Trying on") == 1
     assert "flasher rescue" in run.err

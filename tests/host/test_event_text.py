@@ -87,7 +87,7 @@ def test_an_event_that_other_means_show_has_no_line(event: object) -> None:
         ),
         (
             events.BusBlocked("Nobody acknowledges.", 240.0),
-            "Nobody acknowledges. Trying on for 4 min: has the device power and contact?",
+            "Nobody acknowledges. Trying on for 4 min: check power and contacts of the device.",
         ),
         (
             events.SecondToolAwaited("a reset", 2.0),

@@ -240,7 +240,7 @@ IMAGES = (
         content(elf([(0, 0, MEGA)], [(0, 0xFFFF_FFFF)])),
         "image-info FILE",
         IMAGE,
-        "outside of its program header",
+        "outside its program header",
     ),
     Row("bomb.hex", packed(b"\n", 60 * MEGA), "image-info FILE", IMAGE, "damaged"),
     Row(

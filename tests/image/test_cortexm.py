@@ -141,7 +141,7 @@ def test_a_vector_table_at_an_odd_place_is_told() -> None:
     table = vector_table(image(STACK, BASE + 0x101, base=BASE + 0x10))
     assert table is not None
     assert not table.plausible
-    assert "cannot stand at 0x08004010" in table.problems[0]
+    assert "cannot be at 0x08004010" in table.problems[0]
 
 
 def merged(count: int) -> Image:
@@ -157,7 +157,7 @@ def test_a_second_program_inside_the_image_is_told() -> None:
     table = vector_table(merged(1))
     assert table is not None
     assert not table.problems
-    assert "another vector table stands at 0x08004400:" in table.notes[0]
+    assert "another vector table is at 0x08004400:" in table.notes[0]
     alone = vector_table(merged(0))
     assert alone is not None
     assert not alone.notes
@@ -195,7 +195,8 @@ def test_of_an_image_that_is_no_program_no_more_is_said_than_that() -> None:
     for base in (BASE, BASE + 4, None):
         table = vector_table(image(*words, base=base))
         assert table is not None
-        assert table.problems == ("the first word, 0x00000000, is no stack pointer of a Cortex-M",)
+        problem = "the first word, 0x00000000, is not a stack pointer of a Cortex-M"
+        assert table.problems == (problem,)
         assert table.notes == ()
     (note,) = known(vector_table(image(STACK, *words[1:]))).notes
     assert f"0x{BASE + 512:08X}" in note

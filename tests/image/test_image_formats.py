@@ -171,7 +171,7 @@ def test_a_count_is_no_end_when_records_follow_it(tmp_path: Path) -> None:
 
 
 def test_a_count_holds_no_data(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match=r"type S5 holds 1 bytes of data(.|\n)*line 2"):
+    with pytest.raises(ImageError, match=r"type S5 contains 1 bytes of data(.|\n)*line 2"):
         load(write(tmp_path, "app.s19", "S1040010AA41\nS504000107F3\n"))
 
 
@@ -207,8 +207,8 @@ def test_an_elf_segment_without_bytes_in_the_file_and_other_headers_are_left_out
 @pytest.mark.parametrize(
     ("at", "value", "words"),
     [
-        (5, b"\x07", "header is not whole"),
-        (42, b"\x10\x00", "program headers are not whole"),
+        (5, b"\x07", "header is truncated"),
+        (42, b"\x10\x00", "program headers are truncated"),
         (44, b"\x41\x00", "program headers"),
         (48, b"\x01\x20", "8193 sections"),
         (46, b"\x01\x00", "section table"),
@@ -222,7 +222,7 @@ def test_a_damaged_elf_header_is_refused(at: int, value: bytes, words: str, tmp_
 
 def test_an_elf_segment_that_lost_its_last_byte_is_refused(tmp_path: Path) -> None:
     whole = (SAMPLES / "bad" / "no_section.elf").read_bytes()
-    with pytest.raises(ImageError, match="program header 0 points behind the end"):
+    with pytest.raises(ImageError, match="program header 0 points past the end"):
         load(write(tmp_path, "app.elf", whole[:-1]))
 
 
@@ -282,11 +282,11 @@ def test_no_single_changed_character_gives_other_bytes(
 @each(
     "line, what",
     [
-        (":0G", "':0G' is not made of pairs of hex digits"),
-        (":" + "Z" * 39, f"':{'Z' * 39}' is not made of pairs of hex digits"),
-        (":" + "Z" * 40, f"':{'Z' * 39}...' is not made of pairs of hex digits"),
-        (":00000001", "':00000001' does not have the length that it states"),
-        (":00000001FE", "the check sum is FE, computed FF"),
+        (":0G", "':0G' does not consist of pairs of hex digits"),
+        (":" + "Z" * 39, f"':{'Z' * 39}' does not consist of pairs of hex digits"),
+        (":" + "Z" * 40, f"':{'Z' * 39}...' does not consist of pairs of hex digits"),
+        (":00000001", "':00000001' does not have the length in its count"),
+        (":00000001FE", "the checksum is FE, computed FF"),
     ],
 )
 def test_a_damaged_line_is_shown_and_not_more_of_it_than_fits(

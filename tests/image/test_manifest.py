@@ -200,7 +200,7 @@ def test_bytes_that_differ_are_refused_with_both_values(
 ) -> None:
     with pytest.raises(ImageError, match=key) as refused:
         release(**changes).check_bytes(IMAGE)
-    assert "the bytes to be sent have" in refused.value.where
+    assert "the bytes to send have" in refused.value.where
 
 
 def test_each_statement_stands_beside_what_the_bytes_have() -> None:

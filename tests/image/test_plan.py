@@ -157,7 +157,7 @@ def test_an_image_of_exactly_the_largest_size_is_planned(monkeypatch: pytest.Mon
 
 @each("bitrate_bps", [0, -250_000])
 def test_a_bit_rate_is_positive(bitrate_bps: int) -> None:
-    with pytest.raises(UsageError, match="no bit rate"):
+    with pytest.raises(UsageError, match="not a bit rate"):
         plan(Image.from_bytes(b"a"), BMS, bitrate_bps)
 
 

@@ -27,8 +27,8 @@ MARKED = [
     (b"\x7fELF\1\1\1" + bytes(200), "an ELF file read as a raw binary"),
     (bytes(257) + b"ustar\x0000" + bytes(200), "a tar archive"),
     (b"SQLite format 3\0" + bytes(200), "an SQLite database"),
-    (bytes(4096), r"one byte again and again \(0x00\)"),
-    (b"\xff" * 4096, r"one byte again and again \(0xFF\)"),
+    (bytes(4096), r"one repeated byte \(0x00\)"),
+    (b"\xff" * 4096, r"one repeated byte \(0xFF\)"),
     (b"\n<!DOCTYPE html>\n<html><body>404 \xe4</body></html>", "an HTML page"),
     (b'<?xml version="1.0"?><a/>', "an XML document"),
     (b"release notes", "a text"),
@@ -99,8 +99,8 @@ def test_every_good_sample_is_plausible(name: str) -> None:
 @each(
     "data, text, is_certain",
     [
-        (b"\0\0", "one byte again and again (0x00)", True),
-        (b"\1\1", "one byte again and again (0x01)", True),
+        (b"\0\0", "one repeated byte (0x00)", True),
+        (b"\1\1", "one repeated byte (0x01)", True),
         (b"\1", "too short to begin with a vector table", False),
         (b"MZ" + bytes(50) + b"\1" * 150, "no Cortex-M vector table", False),
         (b"MZ" + bytes(58) + struct.pack("<I", 1 << 24) + b"PE\0\0" + bytes(9), "no Cortex", False),

@@ -71,7 +71,7 @@ def test_bytes_that_a_library_reads_otherwise_are_not_used(
         ErrorCode.IMAGE_READINGS,
         ExitCode.IMAGE,
     )
-    assert "nothing of it is used" in caught.value.what
+    assert "nothing of it was used" in caught.value.what
     assert (
         caught.value.where
         == {

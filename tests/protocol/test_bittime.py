@@ -91,7 +91,7 @@ def test_an_empty_stream_has_no_lengths() -> None:
 
 @each("size_bytes", [1, 7, 9, 143])
 def test_a_stream_of_broken_frames_is_refused(size_bytes: int) -> None:
-    with pytest.raises(ValueError, match=f"{size_bytes} bytes are no whole number"):
+    with pytest.raises(ValueError, match=f"{size_bytes} bytes are not a whole number"):
         stream_bits(0x752, bytes(size_bytes))
 
 

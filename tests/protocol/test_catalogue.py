@@ -201,7 +201,7 @@ def test_an_answer_that_no_row_gives_is_a_mistake_in_the_catalogue() -> None:
     wrong = Item(
         asked.sender, asked.receiver, asked.mode, 0x3000, contents.Empty, "read nothing", 0x9900
     )
-    with pytest.raises(LookupError, match="752 3000 is answered by no row"):
+    with pytest.raises(LookupError, match="752 3000 has no answering row"):
         answer_of(wrong)
 
 

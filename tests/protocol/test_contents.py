@@ -287,7 +287,7 @@ GOOD: Final[dict[type[Content], Content]] = {
         (contents.DesignInformation, "design_voltage_v", 256, "design voltage: 256 does not fit"),
         (contents.DesignInformation, "cell_model", "EIGHT888", "cell model: .*than 7 characters"),
         (contents.VersionInformation, "model", "A" * 16, "model: .*than 15 characters"),
-        (contents.VersionInformation, "firmware_version", "V1.2", "firmware version: .*ends a"),
+        (contents.VersionInformation, "firmware_version", "V1.2", "firmware version: .*terminator"),
         (contents.VersionInformation, "hardware_version", "caf\xe9", "hardware version: .*ASCII"),
         (
             contents.VersionInformation,

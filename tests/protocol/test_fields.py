@@ -99,7 +99,7 @@ def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str
         (FlagsField(1, Lamp), 256, "256 does not fit 1 bytes"),
         (FlagsField(1, Lamp), -1, "-1 does not fit 1 bytes"),
         (TextField(4), "ABCD", "longer than 3 characters"),
-        (TextField(4), "A.", "ends a field"),
+        (TextField(4), "A.", "terminator of a field"),
         (TextField(4), WireText(b"ABCDE"), "5 bytes, not 4"),
         (DateField(), "", "'' is not YYYYMMDD"),
         (DateField(), "20220512 ", "is not YYYYMMDD"),

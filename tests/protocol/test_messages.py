@@ -131,7 +131,7 @@ def test_an_update_text_of_no_target_is_malformed(text: bytes) -> None:
     message = Message(0x752, 0x16, 0xA10B, text + b"\x80\x00\x00\x00")
     found = decode(message)
     assert isinstance(found, Malformed)
-    assert found.problem.startswith("no target is updated by the text")
+    assert found.problem.startswith("no target has the update text")
     assert found.problem.isprintable()
     assert found.problem.isascii()
 

@@ -48,7 +48,7 @@ def test_a_text_without_room_for_its_terminator_is_refused(text: str, size_bytes
 
 @each("text", [".", "V1.2", "BM36."])
 def test_a_text_with_the_terminator_in_it_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="which ends a field"):
+    with pytest.raises(ValueError, match="the terminator of a field"):
         encode_text(text, 16)
 
 

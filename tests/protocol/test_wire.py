@@ -19,7 +19,7 @@ def test_data_of_another_size_than_the_command_names_are_refused(size_bytes: int
 
 @each("size_bytes", [254, 255])
 def test_a_command_beyond_the_length_field_is_refused(size_bytes: int) -> None:
-    with pytest.raises(ValueError, match="longer than the length field"):
+    with pytest.raises(ValueError, match="exceeds the length field"):
         encode(Message(0x751, 0x0C, 0x1000 | size_bytes, bytes(size_bytes)))
 
 
