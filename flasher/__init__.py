@@ -5,22 +5,22 @@ The whole job:
     result = flasher.flash("firmware.hex", "bms", interface="socketcan", channel="can0")
     print(result.running_version)
 
-The same without hardware, with something to look at while it runs:
+The same without hardware, printing its events:
 
     flasher.flash("firmware.hex", "bms", mock=True, on_event=print)
 
-What would be sent, and how long it takes on the bus:
+Number of packets, and time on the bus:
 
     plan = flasher.make_plan(flasher.load("firmware.hex"), "bms")
     print(plan.total_packets, plan.wire_s)
 
-In two steps, to look at a failure instead of catching it:
+In two steps, to examine a failure instead of catching it:
 
     with flasher.connect(interface="pcan", channel="PCAN_USBBUS1") as connection:
         result = connection.device("bms").upgrade(plan)
     print(result.outcome.ending, result.outcome.device_left, result.error())
 
-A device on a bus: what it says of itself, typed, with units in the names; its memory; writing:
+Read typed data with units in the names, write an item, upgrade and verify the memory:
 
     with flasher.connect(interface="socketcan", channel="can0") as connection:
         battery = connection.device("bms")
@@ -34,8 +34,8 @@ With an event loop:
         async with flasher.aconnect(interface="socketcan", channel="can0") as connection:
             await connection.async_device("bms").flash("firmware.hex")
 
-Every failure is a `FlasherError` with its exit code, its likely cause and what to do; what happens
-meanwhile comes as the dataclasses of `flasher.events`.
+Every failure is a `FlasherError` with an exit code, a likely cause and a remedy. Progress is
+reported by the dataclasses of `flasher.events`.
 """
 
 from flasher import events

@@ -1,6 +1,6 @@
-"""What a program calls: a connection, the devices on it, and `flash`, the whole job in one call.
+"""Public API: connections, the devices on them, and `flash`, the whole job in one call.
 
-`Device` blocks; `AsyncDevice` is the same in a thread, for programs with an event loop.
+`Device` blocks; `AsyncDevice` runs the same methods in a thread, for programs with an event loop.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ T = TypeVar("T")
 P = ParamSpec("P")
 C = TypeVar("C", bound=Content)
 _TURN_PAUSE_S: Final = 0.01
-"""Between two looks whether the call of another task has ended, and whether this one is over."""
+"""Interval of checks whether another task's call has ended, and whether this one was cancelled."""
 _LOOP_GONE_S: Final = 5.0
-"""An event loop that was left alone for so long with an event in its hands is not coming back."""
+"""An event loop that does not handle an event for this long has ended."""
 
 
 # -- the bus --------------------------------------------------------------------------------------
@@ -104,17 +104,17 @@ _LOOP_GONE_S: Final = 5.0
 
 @dataclass(frozen=True)
 class Connection:
-    """An open way to a bus, with the clock that belongs to it."""
+    """Open connection to a bus, with its clock."""
 
     link: Link
     clock: Clock
     name: str
     bit_rate: BitRate | None = None
-    """What the bus runs at, and where that comes from; None where that is not known."""
+    """Bit rate of the bus and its source; None if unknown."""
     channel: str = ""
-    """The adapter's, as python-can has it; empty where there is none."""
+    """Channel of the adapter as in python-can; may be empty."""
     _turn: Lock = field(default_factory=Lock, init=False, repr=False, compare=False)
-    """Held by the call that is under way: two at once would take each other's frames."""
+    """Held by the current call: two at once would take each other's frames."""
 
     def device(
         self,
@@ -125,11 +125,11 @@ class Connection:
         is_alone: bool = False,
         **watch: Unpack[Watch],
     ) -> Device:
-        """A device on this bus. Nothing is sent yet.
+        """Create a device on this bus; nothing is sent yet.
 
-        `profile` is what holds for the product (its timings, its own reset and version query); it
-        goes before `target` and `dialect`. With `is_alone` no other tool can be on this bus, and
-        none is listened for before a question. Raises UsageError for a name that is none.
+        `profile` describes the product (timings, its own reset and version query), and overrides
+        `target` and `dialect`. `is_alone` means that no other tool can be on this bus, so that
+        queries need not listen for one first. Raises UsageError for an unknown name.
         """
         chosen = profile or _default_profile(target, dialect)
         return Device(self, chosen, is_alone=is_alone, watch=watch)
@@ -143,20 +143,20 @@ class Connection:
         is_alone: bool = False,
         **watch: Unpack[Watch],
     ) -> AsyncDevice:
-        """The same for a program with an event loop."""
+        """Same as `device`, for a program with an event loop."""
         chosen = profile or _default_profile(target, dialect)
         return AsyncDevice(self, chosen, is_alone=is_alone, watch=watch)
 
     def listen_first(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> None:
-        """Listen for a moment for another tool, as every question does before it is sent. Raises
-        BusError when there is one.
+        """Listen briefly for another tool, as every query does before it is sent. Raises BusError
+        if one is detected.
         """
         with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
             steps.listen_first()
 
     def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> Survey:
-        """Listen for a second, then ask the BMS for its version and state: who was heard, with
-        what. Raises BusError, and InterruptedByUserError when it was cancelled.
+        """Listen for a second, then ask the BMS for its version and state; return the traffic of
+        all nodes. Raises BusError; InterruptedByUserError if cancelled.
         """
         with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
             return steps.scan()
@@ -178,12 +178,12 @@ def connect(
 ) -> Iterator[Connection]:
     """Open an adapter through python-can and close it at the end.
 
-    `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...); its configuration
-    files and CAN_* variables hold too, and behind them the `fallback`. The bit rate is the
-    dialect's unless `bus` itself names another one. Meanwhile no other program of this user may
-    speak as the tool on this adapter: `holder` names this program to them; None does not lock the
-    adapter, for programs that never speak as the tool (a device model, a monitor). A program that
-    never `sends` can use an interface that only listens. Raises UsageError or BusError.
+    `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...). Its configuration
+    files and CAN_* variables apply too, and after them the `fallback`. The bit rate is the
+    dialect's unless `bus` itself names another one. The adapter is locked against other programs of
+    this user that send as the tool: `holder` names this program to them; None does not lock, for
+    programs that never send as the tool (a device model, a monitor). A program with `sends` False
+    can use an interface that only listens. Raises UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
     from flasher.bus.link import MonotonicClock  # noqa: PLC0415
@@ -223,12 +223,12 @@ def connect_mock(
     profile: DeviceProfile | None = None,
     on_event: EventHandler | None = None,
 ) -> Iterator[Connection]:
-    """A bus in this process with a device model on it, or, as `system`, with a whole bicycle.
+    """Create a bus in this process with a device model on it, or, as `system`, with a whole
+    bicycle.
 
-    Without an application the device sits in its bootloader, as one does whose upgrade failed.
-
-    It takes the time that a real bus takes, divided by `speed`; 0 means no time at all. `on_event`
-    gets what the device model reports.
+    Without an application the device stays in its bootloader, as after a failed upgrade. It takes
+    as long as a real bus, divided by `speed`; 0 means no time at all. `on_event` gets the events of
+    the device model.
     """
     from flasher.bus.bit_rate import BitRate  # noqa: PLC0415  loads python-can
     from flasher.bus.link import PacedClock, VirtualClock  # noqa: PLC0415
@@ -256,17 +256,17 @@ def connect_mock(
 def bit_rate(
     dialect: str | Dialect = "welling", *, fallback: Fallback | None = None, **bus: Any
 ) -> BitRate:
-    """The bit rate that `connect` would open with; all arguments are its own. Opens nothing.
+    """Return the bit rate with which `connect` would open; same arguments. Opens nothing.
 
-    Raises UsageError and BusError as `connect` does for a bit rate; where no adapter is configured,
-    the one that `bus` or else the dialect names.
+    Raises UsageError and BusError as `connect` does for a bit rate. Without a configured adapter it
+    is the one that `bus` or else the dialect names.
     """
     from flasher.bus import bit_rate as settling  # noqa: PLC0415  loads python-can
     from flasher.bus.opening import bus_config  # noqa: PLC0415
 
     try:
         merged = bus_config(bus, fallback)
-    except FlasherError:  # none is named, or none that there is: who opens it says so
+    except FlasherError:  # no valid adapter is named: opening it reports that
         merged = bus
     return settling.bit_rate(as_dialect(dialect).bitrate_bps, bus, merged, fallback)
 
@@ -275,11 +275,11 @@ def bit_rate(
 
 
 class Device:
-    """A device on a bus, for programs that wait for it; made by `Connection.device`.
+    """A device on a bus, for blocking programs; created by `Connection.device`.
 
-    Every method takes the keywords of `Watch`, and raises BusError when the adapter fails or
-    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so, UsageError
-    while another call is under way on the connection (in another thread, or around `on_event`).
+    Every method takes the keywords of `Watch`. It raises BusError if the adapter fails or another
+    tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and UsageError while
+    another call is running on the connection (in another thread, or around `on_event`).
     """
 
     def __init__(
@@ -299,32 +299,31 @@ class Device:
 
     @property
     def target(self) -> Target:
-        """Which device it is."""
         return self.profile.target
 
     def plan(self, image: Image | Plan) -> Plan:
-        """What an upgrade with this image would send. Raises ImageError and UsageError."""
+        """Plan an upgrade with this image. Raises ImageError and UsageError."""
         return self._steps({}).plan(image)
 
     def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
-        """Ask it everything that the documents let one ask; listen only where they give nothing.
+        """Send all documented queries; only listen if there are none.
 
-        Silence is no error: see `DeviceInfo.is_there`. Takes 12 s when nothing is answered by a
-        device that is heard, 4 s when it is not heard either.
+        Silence is not an error: see `DeviceInfo.is_there`. Takes 12 s if a device sends but answers
+        nothing, 4 s if it is silent.
         """
         with self._turn(watch) as steps:
             return steps.identify()
 
     def is_heard(self, **watch: Unpack[Watch]) -> bool:
-        """True when it sends a message, or answers a question for its version: nothing else is sent
-        to it. Takes 5 s at the most.
+        """True if it sends a message, or answers a version query; nothing else is sent to it. Takes
+        5 s at most.
         """
         with self._turn(watch) as steps:
             return steps.is_heard()
 
     def version(self, **watch: Unpack[Watch]) -> Content:
-        """Its version information, or the answer to the product's own version query. Raises
-        NoAnswerError when it does not answer, or nobody knows how to ask it.
+        """Return the version information, or the answer to the product's own version query. Raises
+        NoAnswerError if it does not answer or no query is known.
         """
         with self._turn(watch) as steps:
             return steps.version()
@@ -334,25 +333,25 @@ class Device:
     @overload
     def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
     def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
-        """Read an item: by its name ("running-information"), or by the class of its content
-        (`flasher.protocol.contents.RunningInformation`), where only one item has it. "model" and
-        "serial-number" give the version information, which holds them.
+        """Read an item by its name ("running-information"), or by the class of its content
+        (`flasher.protocol.contents.RunningInformation`) if only one item has it. "model" and
+        "serial-number" return the version information, which contains them.
 
-        Raises UsageError for what is not there, NoAnswerError when it does not answer.
+        Raises UsageError for an unknown item, NoAnswerError if it does not answer.
         """
         with self._turn(watch) as steps:
             return steps.read(what)
 
     def ask(self, request: Request, **watch: Unpack[Watch]) -> Content:
-        """Ask a question of your own. Raises NoAnswerError."""
+        """Send your own request. Raises NoAnswerError."""
         with self._turn(watch) as steps:
             return steps.ask(request)
 
     def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
-        """The bytes from address `start` up to `end`, which is not read any more (R5).
+        """Read the bytes from address `start` up to `end`, exclusive (R5).
 
-        Raises UsageError for an impossible range and for a target whose memory the documents do not
-        let one read, NoAnswerError when a piece is not answered.
+        Raises UsageError for an impossible range or a target without a memory query, NoAnswerError
+        if a piece is not answered.
         """
         with self._turn(watch) as steps:
             return steps.read_memory(start, end)
@@ -364,24 +363,25 @@ class Device:
         manufacturer: bool = False,
         **watch: Unpack[Watch],
     ) -> WriteResult:
-        """Write an item by name and read it back; old and new value are in the result.
+        """Write an item by name and read it back; the result has the old and the new value.
 
-        `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
-        value that does not fit, NoAnswerError when the device is silent before anything was
-        written, VerificationError when the write is not confirmed or reads back differently.
+        `manufacturer` allows items that the document reserves for the manufacturer. Raises
+        UsageError for a value that does not fit; NoAnswerError if the device is silent before
+        anything was written; VerificationError if the write is not confirmed or reads back
+        differently.
         """
         with self._turn(watch) as steps:
             return steps.write(name, values, manufacturer=manufacturer)
 
     def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content:
-        """The first half of a write: what the device holds now."""
+        """First half of a write: read the present content."""
         with self._turn(watch) as steps:
             return steps.content_before(plan)
 
     def carry_out(
         self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]
     ) -> WriteResult:
-        """The second half: write and read back. What went wrong stands in the result."""
+        """Second half of a write: write and read back. Failures are in the result."""
         with self._turn(watch) as steps:
             return steps.carry_out(plan, before)
 
@@ -398,11 +398,10 @@ class Device:
         """Upgrade it with an image file (or a loaded `Image`), and verify it.
 
         `verify` is "none", "version" or "memory"; None chooses (`default_level`). `identity` None
-        takes the manifest beside the file, if there is one, and waives no check. With `in_session`
-        a device that answers nothing gets an update command (R26): an upgrade of it was broken off,
-        and it may still wait in it. Returns the result of a good session, or of one that found
-        nothing to do; every other one is raised as the FlasherError that stands for it (see
-        flasher.errors).
+        uses the manifest next to the file, if any, and waives no check. With `in_session`, a device
+        that answers nothing gets an update command (R26), because an interrupted upgrade may have
+        left it waiting. Returns the result of a successful session, or of one that found nothing to
+        do; any other is raised as its FlasherError (see flasher.errors).
         """
         return self._carried_out(image, options, verify, identity, watch, in_session=in_session)
 
@@ -416,9 +415,9 @@ class Device:
         in_session: bool = False,
         **watch: Unpack[Watch],
     ) -> Result:
-        """`flash` for a device whose application does not run: waits until it announces its
-        bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then. With
-        `in_session` it is looked for as by `flash` before.
+        """`flash` for a device whose application does not run: wait until it announces its
+        bootloader at power-up, for `power_up_timeout_s` of the options, then upgrade it. With
+        `in_session`, first try to reach it as `flash` does.
         """
         return self._carried_out(
             image, options, verify, identity, watch, in_session=in_session, at_power_up=True
@@ -433,13 +432,12 @@ class Device:
         identity: Identity | None = None,
         **watch: Unpack[Watch],
     ) -> Result:
-        """The upgrade alone, to look at a failure instead of catching it: every end but that of the
-        adapter is a `Result`.
+        """Run the upgrade alone and return its result, so that a failure can be examined instead of
+        caught: only an adapter failure is raised.
 
-        `identity` says what the image may be flashed to; the device is asked who it is and held
-        against it before anything is written. Raises UsageError when the target or the image cannot
-        be verified so, BusError when the adapter fails, saying how far the upgrade had come and in
-        what state the device is left.
+        `identity` sets the requirements: the device is identified and compared with them before
+        anything is written. Raises UsageError if the target or the image cannot be verified at this
+        level; BusError if the adapter fails, with the progress and the state of the device.
         """
         with self._turn(watch) as steps:
             return steps.upgrade(image, options, verify, identity)
@@ -447,21 +445,21 @@ class Device:
     def verify(
         self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
     ) -> Verification:
-        """Whether it runs this image: by the version that it names, or by its memory too. What
-        speaks against it stands in the result. Raises UsageError for a level that is not possible.
+        """Check whether it runs this image, by the reported version or also by its memory.
+        Contradictions are in the result. Raises UsageError for an impossible level.
         """
         with self._turn(watch) as steps:
             return steps.verify(image, as_level(level))
 
     def reset(self, **watch: Unpack[Watch]) -> None:
-        """Restart its application. Raises NoAnswerError when it does not confirm, or when the
-        documents give no reset for it.
+        """Restart its application. Raises NoAnswerError if it does not confirm, or has no
+        documented reset.
         """
         with self._turn(watch) as steps:
             steps.reset()
 
     def run(self, engine: Engine, **watch: Unpack[Watch]) -> None:
-        """Run an engine of your own on the connection."""
+        """Run your own engine on the connection."""
         with self._turn(watch) as steps:
             steps.run(engine)
 
@@ -496,7 +494,7 @@ class Device:
 
     @contextmanager
     def _turn(self, of_call: Watch) -> Iterator[Procedures]:
-        """What a call does, while no other call is under way on the connection."""
+        """Run a call while no other call is running on the connection."""
         watch: Watch = {**self._watch, **of_call}
         turn = self.connection._turn  # noqa: SLF001  of this module
         cancelled = watch.get("cancelled")
@@ -518,7 +516,7 @@ class Device:
 def _in_thread(
     method: Callable[Concatenate[Device, P], T],
 ) -> Callable[Concatenate[AsyncDevice, P], Coroutine[Any, Any, T]]:
-    """A method of `Device` for `AsyncDevice`."""
+    """Adapt a method of `Device` for `AsyncDevice`."""
 
     async def call(self: AsyncDevice, /, *args: P.args, **kwargs: P.kwargs) -> T:
         return await self._call(method, *args, **kwargs)
@@ -528,11 +526,11 @@ def _in_thread(
 
 
 class AsyncDevice:
-    """`Device` for programs with an event loop; made by `Connection.async_device`. Every method is
-    that of `Device`, in a thread. `on_event` is called in the event loop, and the thread waits for
-    it; `taps` and `cancelled` are called in the thread. A task that is cancelled ends at the next
-    message boundary first; a write that was begun is read back. Calls of several tasks on one
-    connection wait for each other.
+    """`Device` for programs with an event loop; created by `Connection.async_device`. Every method
+    runs that of `Device` in a thread. `on_event` is called in the event loop, and the thread waits
+    for it; `taps` and `cancelled` are called in the thread. A cancelled task ends at the next
+    message boundary first; a write that has begun is read back. Concurrent calls on one connection
+    wait for each other.
     """
 
     def __init__(
@@ -545,11 +543,10 @@ class AsyncDevice:
 
     @property
     def target(self) -> Target:
-        """Which device it is."""
         return self.profile.target
 
     def plan(self, image: Image | Plan) -> Plan:
-        """What an upgrade with this image would send. Raises ImageError and UsageError."""
+        """Plan an upgrade with this image. Raises ImageError and UsageError."""
         return self._device.plan(image)
 
     identify = _in_thread(Device.identify)
@@ -572,7 +569,7 @@ class AsyncDevice:
     @overload
     async def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
     async def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
-        """Read an item, as `Device.read` does."""
+        """Read an item; see `Device.read`."""
         return await self._call(Device.read, what, **watch)
 
     async def _call(self, method: Callable[..., T], *args: object, **kwargs: Any) -> T:
@@ -586,8 +583,8 @@ class AsyncDevice:
         if hand.on_event is not None:
             kwargs["on_event"] = hand.over
         call = partial(copy_context().run, method, self._device, *args, **kwargs)
-        # A thread of its own: the loop's are few, and a call may take minutes. And not as a task,
-        # which the end of the loop would cancel before the call has ended.
+        # Its own thread, because the loop has few and a call may take minutes. Not a task, because
+        # the end of the loop would cancel it before the call has ended.
         thread = ThreadPoolExecutor(1, "flasher-call")
         work = loop.run_in_executor(thread, call)
         thread.shutdown(wait=False)
@@ -603,7 +600,7 @@ class AsyncDevice:
 
 @dataclass
 class _Hand:
-    """Between a call in a thread and the event loop that awaits it."""
+    """Connects a call in a thread with the event loop that awaits it."""
 
     loop: AbstractEventLoop
     on_event: EventHandler | None
@@ -612,16 +609,16 @@ class _Hand:
     loop_is_gone: bool = False
 
     def is_cancelled(self) -> bool:
-        """Asked in the thread."""
+        """Called in the thread."""
         if self.task_is_cancelled or self.loop_is_gone or self.loop.is_closed():
             return True
         return self.cancelled is not None and self.cancelled()
 
     def over(self, event: object) -> None:
-        """Have the loop handle an event, and wait for that in the thread: as long as there is a
-        loop. Raises what the handler raised.
+        """Handle an event in the loop, and wait for that in the thread while the loop exists.
+        Raises exceptions of the handler.
         """
-        from concurrent.futures import Future, wait  # noqa: PLC0415  no use without a loop
+        from concurrent.futures import Future, wait  # noqa: PLC0415  only needed with a loop
 
         handled: Future[None] = Future()
 
@@ -648,26 +645,24 @@ class _Hand:
 
 @dataclass(frozen=True)
 class Job:
-    """An upgrade as it was prepared without the device: what `flash`, the bench page and the
-    station run.
-    """
+    """Upgrade prepared without the device; run by `flash`, the bench page and the station."""
 
     plan: Plan
     options: UpgradeOptions
     level: Level
     identity: Identity
     waived: tuple[str, ...] = ()
-    """Names of the checks that somebody has waived (flasher.host.waivers)."""
+    """Names of the waived checks (flasher.host.waivers)."""
 
     @cached_property
     def checks(self) -> tuple[CheckResult, ...]:
-        """What the image and its manifest say of the target by themselves."""
+        """Results of the checks of image and manifest against the target."""
         return tuple(judge_image(self.plan.image, self.plan.target, self.identity))
 
     def checked(self) -> Job:
-        """The same. Raises ImageError when the image is hardly a program for the device,
-        WrongDeviceError when it or its manifest speaks against the target, UsageError when the
-        upgrade cannot be verified so.
+        """Return this job. Raises ImageError for an implausible image, WrongDeviceError if the
+        image or its manifest contradicts the target, UsageError if the upgrade cannot be verified
+        at this level.
         """
         for found in self.checks:
             error = refusal(self.plan, found)
@@ -677,11 +672,13 @@ class Job:
         return self
 
     def in_session(self) -> Job:
-        """The same for a device that an earlier upgrade may have left in its session (R26)."""
+        """Return this job for a device that an earlier upgrade may have left in its session
+        (R26).
+        """
         return replace(self, options=replace(self.options, in_session=True))
 
     def run(self, device: Device, **watch: Unpack[Watch]) -> Result:
-        """To its end, good or bad, as `Device.upgrade`."""
+        """Run it to its end, good or bad; see `Device.upgrade`."""
         return device.upgrade(
             self.plan,
             options=self.options,
@@ -702,11 +699,11 @@ def prepare(
     at_power_up: bool = False,
     waived: Iterable[str] = (),
 ) -> Job:
-    """What an upgrade settles before a bus is needed: load, plan, and choose what is left open.
-    Nothing speaks against it once it was `Job.checked`.
+    """Prepare an upgrade without a bus: load, plan, and choose defaults. Call `Job.checked` before
+    running it.
 
-    `waived` names checks of flasher.host.waivers; what `identity` and `options` say goes before it.
-    Raises ImageError and UsageError.
+    `waived` names checks of flasher.host.waivers; `identity` and `options` take precedence. Raises
+    ImageError and UsageError.
     """
     names = frozenset(waived)
     if isinstance(image, Image):
@@ -743,10 +740,10 @@ def flash(
     on_event: EventHandler | None = None,
     **bus: Any,
 ) -> Result:
-    """The whole job in one call: open the bus, `Device.flash`, close it.
+    """Do the whole job in one call: open the bus, `Device.flash`, close it.
 
-    `bus` are python-can's keywords, as for `connect`; with `mock` the built-in device model is
-    upgraded instead. An image that cannot be flashed is refused before the bus is opened.
+    `bus` are python-can's keywords, as for `connect`; `mock` upgrades the built-in device model
+    instead. An unusable image is refused before the bus is opened.
     """
     profile = _default_profile(target, dialect)
     job = prepare(
@@ -763,7 +760,7 @@ def flash(
 
 
 def _good(result: Result) -> Result:
-    """The result of a good session. Raises the error of every other one."""
+    """Return a good result; raise the error of any other."""
     error = result.error()
     if error is not None:
         raise error
@@ -771,9 +768,9 @@ def _good(result: Result) -> Result:
 
 
 def release_checked(image: Image, release: Release | None) -> Image:
-    """The image, with the version that its manifest gives where it names none itself.
+    """Return the image, with the version of its manifest if it names none itself.
 
-    Raises ImageError when its bytes are not those of the manifest.
+    Raises ImageError if its bytes are not those of the manifest.
     """
     if release is None:
         return image
@@ -782,7 +779,7 @@ def release_checked(image: Image, release: Release | None) -> Image:
 
 
 def refusal(plan: Plan, found: CheckResult) -> FlasherError | None:
-    """The error for a finding that speaks against an upgrade; None for any other."""
+    """Create the error for a check that refuses an upgrade; None for any other result."""
     if found.ending is None:
         return None
     refused = ended_before_start(

@@ -1,8 +1,8 @@
-"""The one loop: runs an engine on a link against a clock until it is done.
+"""Driver loop: runs an engine on a link against a clock until it is done.
 
-Its rules: everything that waits is received before `tick`, which is told the time of before, so
-that a stall of the computer does not become a timeout of the device; frames go out one at a time
-and the engine is told when each was accepted; waiting is a blocking receive with a deadline.
+All waiting frames are received before `tick`, which gets the earlier time, so that a stall of the
+computer does not become a timeout of the device. Frames are sent one at a time, and the engine is
+notified when each was accepted. Waiting is a blocking receive with a deadline.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 
 MAX_WAIT_S: Final = 0.1
-"""Longest blocking receive, in real seconds: the time after which a cancellation is seen at the
-latest."""
+"""Maximum blocking receive, in real seconds; also the maximum delay of a cancellation."""
 STALL_S: Final = 0.25
-"""A pause of the loop that is reported, in real seconds: half the time that a device has for an
-ACK (R12)."""
+"""Minimum reported pause of the loop, in real seconds: half the time that a device has for an ACK
+(R12)."""
 _CATCH_UP_FRAMES: Final = 10_000
-"""Frames received before a due `tick` at the most: a babbling bus must not stop the timers."""
+"""Maximum number of frames received before a due `tick`: a babbling bus must not stop the
+timers."""
 
 
 class Tap(Protocol):
-    """Sees every frame in both directions and changes nothing."""
+    """Observes every frame in both directions."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """One frame, with the time on the driver's clock."""
+        """Process one frame; `now` is on the driver's clock."""
         ...
 
 
@@ -44,24 +44,24 @@ def drive(
 ) -> None:
     """Run `engine` until it is done.
 
-    `on_event` gets every event the engine reports, and HostStalled where this computer paused the
-    loop for more than `STALL_S`; `cancelled` is asked between frames, and ends the engine at its
-    next message boundary. Raises BusError when the link fails.
+    `on_event` gets every event of the engine, and HostStalled if this computer paused the loop for
+    more than `STALL_S`. `cancelled` is called between frames, and ends the engine at its next
+    message boundary. Raises BusError if the link fails.
     """
     link.drain()
     cancel_seen = False
     came = None
     late_s = 0.0
-    """How much later than asked the last wait ended, and how long callbacks took before it."""
+    """How late the last wait ended, plus the time of callbacks before it."""
     while True:
-        heard_until = _hear(came, engine, link, clock, taps)
+        received_until = _hear(came, engine, link, clock, taps)
         sending_s = 0.0
         if cancelled is not None and not cancel_seen and cancelled():
             cancel_seen = True
             engine.cancel(clock.now())
         wanted = engine.deadline()
-        if wanted is not None and heard_until >= wanted:
-            engine.tick(heard_until)
+        if wanted is not None and received_until >= wanted:
+            engine.tick(received_until)
         now = clock.now()
         while (frame := engine.next_frame(now)) is not None:
             link.send(frame)
@@ -70,7 +70,7 @@ def drive(
             engine.frame_sent(now)
             for tap in taps:
                 tap(frame, sent=True, now=now)
-        stalled_s = (late_s + now - heard_until - sending_s) / clock.speed
+        stalled_s = (late_s + now - received_until - sending_s) / clock.speed
         if stalled_s > STALL_S and on_event is not None:
             on_event(events.HostStalled(round(stalled_s, 3)))
         for event in engine.take_events():
@@ -90,8 +90,8 @@ def drive(
 def _hear(
     frame: Frame | None, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
 ) -> float:
-    """Hand on a frame and all that wait behind it: what is sent next must not look like the cause
-    of what had come before. Returns the time up to which everything was heard.
+    """Pass on a frame and all that wait after it, so that the next message sent does not look like
+    their cause. Return the time up to which frames were received.
     """
     now_of, hear, receive = clock.now, engine.receive, link.receive
     now = now_of()

@@ -1,8 +1,8 @@
-"""Every way in which flasher can fail, with its exit code and what to do about it.
+"""All errors of flasher, with exit codes and remedies.
 
-One tree. Each class carries the exit code of the command-line contract; each instance says what
-happened, where (phase, packet), the likely cause, and what to do next. Nothing here prints or
-exits: that is the command line's business.
+Each class has the exit code of the command line; each instance describes what happened, where
+(phase, packet), the likely cause, and the next step. Printing and exiting are left to the command
+line.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from enum import IntEnum, StrEnum
 from typing import ClassVar, Final, Self
 
 _PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
-"""Between the user and the last @ of a URL: a password may hold an @ of its own."""
+"""Between the user and the last @ of a URL: a password may contain an @."""
 _NO_PORT: Final = re.compile(r"(:/+[^\s:/@]*):(?!\d+\b|\*+@)[^\s/@]+")
-"""In the place of a port there is no number: the host was forgotten."""
+"""A port that is not a number: the host was omitted."""
 _SECRET_NAME: Final = r"[\w-]*(?:password|passwd|passphrase|secret|token|api_?key)[\w-]*"  # noqa: S105  a pattern
 _SECRET: Final = re.compile(_SECRET_NAME, re.IGNORECASE)
 _IN_QUERY: Final = re.compile(rf"(?i)([?&]{_SECRET_NAME}=)[^\s&]*")
@@ -25,11 +25,11 @@ _IN_QUERY: Final = re.compile(rf"(?i)([?&]{_SECRET_NAME}=)[^\s&]*")
 _ARGUMENT: Final = re.compile(
     rf"(?i)(?<![\w?&-])({_SECRET_NAME}=)(?!\*\*\*['\")]*(?:[\s,]|$))(?:'[^']*'|\"[^\"]*\"|\S+?(?=['\"]?(?:\s|$)))"
 )
-"""Among words: `--bus-kwargs password=X`, `Bus(password='X')`."""
+"""In arguments: `--bus-kwargs password=X`, `Bus(password='X')`."""
 _WORD: Final = re.compile(rf"(?is)((?:--[\w-]+=)?{_SECRET_NAME}=).*")
-"""A whole word of a command line, whatever its value has in it."""
+"""A whole command-line argument with any value."""
 _IN_DICT: Final = re.compile(rf"(?i)((['\"]){_SECRET_NAME}\2: )(?:'[^']*'|\"[^\"]*\"|[^\s,}}]+)")
-"""In a dictionary of Python, or in JSON."""
+"""In a Python dictionary or in JSON."""
 
 
 class ExitCode(IntEnum):
@@ -52,13 +52,13 @@ class ExitCode(IntEnum):
 
 
 class ErrorCode(StrEnum):
-    """What went wrong, in short: printed behind it, told by `flasher help CODE` and by
+    """Error codes, printed after each error and explained by `flasher help CODE` and
     flasher/error_codes.md. The digits before the last two are the exit code.
     """
 
     BUG = "E100"
     INTERRUPTED = "E130"
-    """The exit code itself."""
+    """Same as the exit code."""
     USAGE = "E200"
     FILE_NOT_READ = "E201"
     FILE_NOT_WRITTEN = "E202"
@@ -134,15 +134,15 @@ class ErrorCode(StrEnum):
 def did_you_mean(
     word: str, known: Iterable[str], spelled: Callable[[str], str] = lambda known: known
 ) -> str:
-    """The known word that was probably meant, `spelled` as people write it, as a sentence with a
-    blank behind it; "" when none is close.
+    """Suggest the closest known word, `spelled` for people, as a sentence with a trailing space; ""
+    if none is close.
     """
     close = difflib.get_close_matches(word, list(known), n=1)
     return f"Did you mean {spelled(close[0])}? " if close else ""
 
 
 def hide_passwords(text: str) -> str:
-    """A text that may hold the URL of a database, or arguments, without the passwords in it."""
+    """Replace passwords in a text with database URLs or arguments."""
     text = _NO_PORT.sub(r"\1:***", _PASSWORD.sub(r"\1:***@", text))
     for secret in (_IN_QUERY, _ARGUMENT, _IN_DICT):
         text = secret.sub(r"\1***", text)
@@ -150,18 +150,18 @@ def hide_passwords(text: str) -> str:
 
 
 def without_password(word: str) -> str:
-    """A word of a command line, without the password in it."""
+    """Replace the password in a command-line argument."""
     whole = _WORD.fullmatch(word)
     return hide_passwords(word) if whole is None else f"{whole[1]}***"
 
 
 def is_secret(name: str) -> bool:
-    """Whether an argument of this name holds what nobody else may know."""
+    """True if an argument of this name contains a secret."""
     return _SECRET.fullmatch(name) is not None
 
 
 def printable(text: str) -> str:
-    """`text` with everything but printable ASCII escaped."""
+    """Escape everything but printable ASCII."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -171,25 +171,25 @@ def printable(text: str) -> str:
 
 
 def _hidden(text: str) -> str:
-    """The same without passwords; a sentence that has none stays one that can be translated."""
+    """Replace passwords; a sentence without any stays translatable."""
     hidden = hide_passwords(text)
     return text if hidden == text else hidden
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong with a file: "target[0].base cannot be -1."."""
+    """One problem in a file: "target[0].base cannot be -1."."""
 
     place: str
-    """The key, with the tables that it is in; "" is the whole file."""
+    """Key with its tables; "" for the whole file."""
     what: str
     remedy: str = ""
     alone: str = ""
-    """Says it with its place, where it is the only fault; empty: as `said` does."""
+    """Message with its place, if it is the only fault; empty: as `said`."""
 
     @property
     def said(self) -> str:
-        """The fault with its place."""
+        """Message with its place."""
         return self.what if self.what.startswith(self.place) else f"{self.place}: {self.what}"
 
     def __str__(self) -> str:
@@ -197,10 +197,10 @@ class Fault:
 
 
 class FlasherError(Exception):
-    """Base of all errors that flasher raises on purpose.
+    """Base class of all errors that flasher raises on purpose.
 
-    `what` is one sentence; `where`, `cause` and `remedy` complete it and may be empty. No password
-    of a URL is in them.
+    `what` is one sentence; `where`, `cause` and `remedy` complete it and may be empty. Passwords in
+    URLs are removed.
     """
 
     exit_code: ClassVar[ExitCode] = ExitCode.INTERNAL
@@ -219,23 +219,23 @@ class FlasherError(Exception):
         super().__init__(self.what)
         self.code = code or self.default_code
         self.command = ""
-        """The command that repairs what was left, to be copied as it stands; "" where none does."""
+        """Command that repairs the state, ready to be copied; "" without one."""
         self.needs_rescue = False
-        """True when a device was left that has no application, or perhaps none."""
+        """A device was left without an application, or perhaps without one."""
         self.waiver = ""
-        """The check of flasher.host.waivers that refused, where a person may waive it."""
+        """Refusing check of flasher.host.waivers, if it can be waived."""
         self.faults: tuple[Fault, ...] = ()
-        """Everything that is wrong with a file, where the error is about one."""
+        """All problems of a file, for an error about one."""
 
     def with_faults(self, faults: Iterable[Fault]) -> Self:
-        """The same, about a file with these faults."""
+        """Return this error with these faults of a file."""
         self.faults = tuple(faults)
         if self.code is ErrorCode.USAGE:
             self.code = ErrorCode.FILE_FAULTS
         return self
 
     def __str__(self) -> str:
-        """The whole message, one part a line, as a person reads it."""
+        """Whole message, one part per line."""
         lines = [self.what]
         if self.where:
             lines.append(f"  where: {self.where}")
@@ -249,14 +249,14 @@ class FlasherError(Exception):
 
 
 class UsageError(FlasherError):
-    """An argument or option makes no sense."""
+    """Invalid argument or option."""
 
     exit_code = ExitCode.USAGE
     default_code = ErrorCode.USAGE
 
 
 class ImageError(FlasherError):
-    """The image cannot be used: unreadable, damaged, empty, too large, wrong range."""
+    """Unusable image: unreadable, damaged, empty, too large, wrong range."""
 
     exit_code = ExitCode.IMAGE
     default_code = ErrorCode.IMAGE
@@ -270,7 +270,7 @@ class BusError(FlasherError):
 
 
 class TransmitBlockedError(BusError):
-    """The adapter took no further frame within the time allowed for it."""
+    """The adapter accepted no frame within the time limit."""
 
     default_code = ErrorCode.SEND_BLOCKED
 
@@ -283,9 +283,7 @@ class NoAnswerError(FlasherError):
 
 
 class WrongDeviceError(FlasherError):
-    """Another device answers than the one that was asked for, or the image is not meant for it, or
-    it is not in a state to be upgraded.
-    """
+    """Another device answers, the image is not meant for it, or it is not ready for an upgrade."""
 
     exit_code = ExitCode.WRONG_DEVICE
     default_code = ErrorCode.WRONG_DEVICE
@@ -313,7 +311,7 @@ class UnconfirmedError(FlasherError):
 
 
 class VerificationError(FlasherError):
-    """The application that runs after the upgrade is not the one that was sent."""
+    """The application after the upgrade is not the one sent."""
 
     exit_code = ExitCode.VERIFICATION
     default_code = ErrorCode.VERIFICATION

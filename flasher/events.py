@@ -1,7 +1,7 @@
-"""What flasher reports while it works: frozen dataclasses, one a kind of event.
+"""Events reported during work: one frozen dataclass per kind.
 
-The engines make them, the driver hands them on, and whoever called (the command line, a station, a
-program) decides what to show. Times are seconds on the clock that the engine was given.
+Engines create them, the driver passes them on, and the caller (command line, station, program)
+decides which to show. Times are seconds on the engine's clock.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import Enum
 
 
 class Phase(Enum):
-    """Where an upgrade stands, in the words of the protocol."""
+    """Phase of an upgrade."""
 
     LISTEN = "listen"
     IDENTIFY = "identify"
@@ -43,16 +43,15 @@ class BootVersionSeen:
 
 @dataclass(frozen=True)
 class PowerCycleAwaited:
-    """The device has to be switched off and on now; its announcement is waited for so long."""
+    """The device must be switched off and on within this time."""
 
     limit_s: float
 
 
 @dataclass(frozen=True)
 class CheckMade:
-    """Something was checked before the first write: `check` names it, `verdict` is "passed",
-    "unknown" (nothing to check against), "warned", "waived", "refused" or "skipped", `text` is one
-    sentence.
+    """A check before the first write: `check` is its name, `verdict` is "passed", "unknown"
+    (nothing to compare with), "warned", "waived", "refused" or "skipped", `text` is one sentence.
     """
 
     check: str
@@ -69,8 +68,8 @@ class ShutdownHeard:
 
 @dataclass(frozen=True)
 class ForeignQuery:
-    """Another tool asks the device that is upgraded for something; `title` names it. It writes
-    nothing, so the upgrade goes on. Reported once for each question.
+    """Another tool queries the device during the upgrade; `title` names the query. It writes
+    nothing, so the upgrade continues. Reported once per query.
     """
 
     title: str
@@ -78,8 +77,8 @@ class ForeignQuery:
 
 @dataclass(frozen=True)
 class SecondToolAwaited:
-    """Another tool writes to the device, which has no application any more; `seen` is what it sent.
-    Nothing is sent until it was silent for `quiet_s`, then the upgrade begins again.
+    """Another tool writes to the device, which has no application any more; `seen` describes its
+    frame. Nothing is sent until it was silent for `quiet_s`; then the upgrade starts over.
     """
 
     seen: str
@@ -88,7 +87,7 @@ class SecondToolAwaited:
 
 @dataclass(frozen=True)
 class AdapterLost:
-    """The adapter failed; for `wait_s` it is tried to be opened again."""
+    """The adapter failed; flasher tries to open it again for `wait_s`."""
 
     reason: str
     wait_s: float
@@ -96,15 +95,15 @@ class AdapterLost:
 
 @dataclass(frozen=True)
 class AdapterAwaited:
-    """The lost adapter is waited for `left_s` seconds more. Reported every second."""
+    """The lost adapter has `left_s` seconds more to come back. Reported every second."""
 
     left_s: int
 
 
 @dataclass(frozen=True)
 class BusBlocked:
-    """The adapter's frames do not leave any more; for `limit_s`, until the overall deadline, the
-    upgrade of a device that has no application goes on trying.
+    """The adapter's frames are not sent. The upgrade of a device without application keeps trying
+    for `limit_s`, until the overall deadline.
     """
 
     reason: str
@@ -113,19 +112,19 @@ class BusBlocked:
 
 @dataclass(frozen=True)
 class AdapterBack:
-    """The adapter works again; the attempt that follows is reported as every other."""
+    """The adapter works again."""
 
 
 @dataclass(frozen=True)
 class HostStalled:
-    """This computer did not run the loop for `stalled_s` longer than it meant to wait."""
+    """This computer paused the loop for `stalled_s` longer than intended."""
 
     stalled_s: float
 
 
 @dataclass(frozen=True)
 class PacketAcknowledged:
-    """The device has packet `number` of `total`; it was sent `tries` times."""
+    """The device acknowledged packet `number` of `total` after `tries` transmissions."""
 
     number: int
     total: int
@@ -134,7 +133,7 @@ class PacketAcknowledged:
 
 @dataclass(frozen=True)
 class MessageRepeated:
-    """A message is sent again; `what` names it, `reason` says why, in one word."""
+    """A message is sent again; `what` names it, `reason` is one word."""
 
     what: str
     reason: str
@@ -143,16 +142,16 @@ class MessageRepeated:
 
 @dataclass(frozen=True)
 class Reported:
-    """Something unexpected that does not stop the upgrade; one sentence."""
+    """Unexpected observation that does not stop the upgrade; one sentence."""
 
     what: str
 
 
 @dataclass(frozen=True)
 class UpgradeLeftOpen:
-    """The upgrade that began at `at` with `image` has no end (`has_end` False), or left the device
-    without an application, or perhaps so. A device that stays silent may still sit in it, and gets
-    an update command (R26).
+    """The upgrade begun at `at` with `image` has no end (`has_end` False), or may have left the
+    device without an application. If the device stays silent, it may still be in that session, and
+    gets an update command (R26).
     """
 
     at: str
@@ -163,7 +162,7 @@ class UpgradeLeftOpen:
 @dataclass(frozen=True)
 class AttemptStarted:
     """The transfer starts over; attempts count from 1. `left_s` is the time until the overall
-    deadline where only that ends the attempts, 0 where their number does.
+    deadline if only that limits the attempts, else 0.
     """
 
     attempt: int
@@ -193,21 +192,21 @@ class QueryUnanswered:
 
 @dataclass(frozen=True)
 class TwoDevicesSeen:
-    """Two devices of one kind have answered; `what` was seen, in words."""
+    """Two devices of one kind answered; `what` is the evidence."""
 
     what: str
 
 
 @dataclass(frozen=True)
 class VerificationStarted:
-    """The device has confirmed the image; now it is verified by `level` ("version", "memory")."""
+    """The device confirmed the image; its verification by `level` ("version", "memory") begins."""
 
     level: str
 
 
 @dataclass(frozen=True)
 class MemoryRead:
-    """So many of `total_bytes` were read back and are right."""
+    """Number of bytes read back correctly, of `total_bytes`."""
 
     read_bytes: int
     total_bytes: int
@@ -218,7 +217,7 @@ class MemoryRead:
 
 @dataclass(frozen=True)
 class BytesDamaged:
-    """Received bytes on a CAN id that made no message."""
+    """Received bytes on a CAN id that are not a message."""
 
     can_id: int
     reason: str
@@ -230,8 +229,8 @@ class BytesDamaged:
 
 @dataclass(frozen=True)
 class DeviceStateEntered:
-    """The device model is in another state. Storing a packet and waiting for the next one take
-    turns unreported: `PacketStored` tells.
+    """The device model changed its state. Alternation between storing a packet and waiting for the
+    next is only reported as `PacketStored`.
     """
 
     state: str
@@ -240,7 +239,7 @@ class DeviceStateEntered:
 
 @dataclass(frozen=True)
 class PacketStored:
-    """The device model has packet `number` of `total` in its flash."""
+    """The device model stored packet `number` of `total` in its flash."""
 
     number: int
     total: int
@@ -248,7 +247,7 @@ class PacketStored:
 
 @dataclass(frozen=True)
 class ImageStored:
-    """The device model has a whole new image of `size_bytes`; SHA-256 in hexadecimal."""
+    """The device model stored a complete image of `size_bytes`; SHA-256 in hexadecimal."""
 
     size_bytes: int
     sha256: str
@@ -263,7 +262,7 @@ class DeviceReported:
 
 @dataclass(frozen=True)
 class DeviceWritten:
-    """A write changed what the device model keeps: name of the item, old and new value, escaped."""
+    """A write changed a stored item of the device model; old and new value are escaped."""
 
     name: str
     before: str
@@ -279,7 +278,7 @@ class ShutdownAnnounced:
 
 @dataclass(frozen=True)
 class ShutdownEnded:
-    """The BMS model switches off; names of the nodes that were ready for it, and of the others."""
+    """The BMS model switches off; names of the nodes that were ready, and of the silent ones."""
 
     ready: tuple[str, ...]
     silent: tuple[str, ...]

@@ -1,8 +1,7 @@
-"""The one gate for every file that is read, and for what TOML and JSON files hold; and what makes a
-file readable by its owner alone.
+"""Safe reading of files: only regular files of limited size, checked TOML and JSON, private files.
 
-A name may lead to anything: a pipe that nobody writes to, a device, a link to itself, a file larger
-than the memory. Only a regular file of a stated size passes, and it is opened for reading alone.
+A name may lead to a pipe without writer, a device, a link to itself, or a huge file. Only a regular
+file of a stated size is opened, and only for reading.
 """
 
 from __future__ import annotations
@@ -21,17 +20,17 @@ from typing import Any, Final
 from flasher.errors import ErrorCode, Fault, FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
-"""In bytes, of any file of settings."""
+"""In bytes, for settings files."""
 JSON_MAX_SIZE: Final = 6 * 1024 * 1024
-"""In bytes, of a report. What JSON holds takes up to thirty times its size in memory."""
+"""In bytes, for reports. JSON takes up to thirty times its size in memory."""
 _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
 _DOTS_MAX: Final = 128
-"""In a line of TOML. The time that tomllib takes grows with the square of the parts of a key."""
+"""Per line of TOML. The time of tomllib grows with the square of the parts of a key."""
 _OWNER_ONLY: Final = 0o600
 _OF_OTHERS: Final = 0o077
 _OPEN_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""Not to wait for a pipe that took the place of the file in this moment; no line end translated."""
+"""Does not wait for a pipe that replaced the file meanwhile; no translation of line ends."""
 
 
 @contextmanager
@@ -45,16 +44,16 @@ def opened(
     may_grow: bool = False,
     was_named: bool = True,
 ) -> Iterator[tuple[BufferedReader, int]]:
-    """A regular file of at most `max_size` bytes, or of any size, open for reading; and its size
-    in bytes.
+    """Open a regular file of at most `max_size` bytes (None: any size) for reading; yield it with
+    its size in bytes.
 
-    `what` says in messages what kind of file was wanted. A recording that is still written to
-    `may_grow`; any other file must not change until the end of the block. Unless it `was_named` by
-    the user, it has to be the user's own or root's, and nobody else may write it (Windows: not
-    looked at).
+    `what` names the kind of file in messages. A file that `may_grow`, such as a recording in
+    progress, may get longer; any other must not change until the end of the block. Unless the user
+    named it (`was_named`), it must belong to the user or root, and nobody else may have write
+    permission (not checked on Windows).
 
-    Raises UsageError when there is no such file or it is no regular one; `error` when it is too
-    large, changes, or cannot be read, here or in the block.
+    Raises UsageError if the file does not exist or is not regular; `error` if it is too large,
+    changes, or cannot be read.
     """
     shown = printable(os.fspath(path))
     subject = f"The {what} {shown}" if what else shown
@@ -79,10 +78,10 @@ def opened(
                 raise error(
                     f"{subject} is too large: {before.st_size:,} bytes, where at most "
                     f"{max_size:,} are read.",
-                    cause="another file than the one that was meant",
+                    cause="another file was meant",
                 )
             if not before.st_size and os.read(descriptor, 1):
-                raise _no_regular(subject)  # as in /proc: made up while it is read
+                raise _not_regular(subject)  # as in /proc: created while it is read
             yield file, before.st_size
             after = os.fstat(descriptor)
     except OSError as problem:
@@ -90,9 +89,9 @@ def opened(
     is_changed = (after.st_size, after.st_mtime_ns) != (before.st_size, before.st_mtime_ns)
     if is_changed and not (may_grow and after.st_size >= before.st_size):
         raise error(
-            f"{subject} cannot be read: it changed meanwhile.",
+            f"{subject} cannot be read: it changed while being read.",
             cause="another program writes it",
-            remedy="Try again when that has ended, or copy the file.",
+            remedy="Try again when that program has finished, or copy the file.",
         )
 
 
@@ -105,7 +104,7 @@ def read(
     if_missing: str = "Correct the name.",
     was_named: bool = True,
 ) -> bytes:
-    """All bytes of a file. Raises as `opened`."""
+    """Read all bytes of a file. Raises as `opened`."""
     with opened(
         path, max_size, what=what, error=error, if_missing=if_missing, was_named=was_named
     ) as (file, size):
@@ -120,7 +119,7 @@ def read_toml(
     if_missing: str = "Correct the name.",
     was_named: bool = True,
 ) -> dict[str, Any]:
-    """What a TOML file of settings holds. Raises as `opened`, and `error` when it is none."""
+    """Read a TOML settings file. Raises as `opened`, and `error` for invalid TOML."""
     raw = read(
         path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing, was_named=was_named
     )
@@ -130,26 +129,26 @@ def read_toml(
 def parse_file(
     raw: bytes, path: str | os.PathLike[str], *, what: str, error: type[FlasherError] = UsageError
 ) -> dict[str, Any]:
-    """What the bytes of the TOML file `path` hold. Raises `error` when they are none."""
+    """Parse the bytes of the TOML file `path`. Raises `error` for invalid TOML."""
     try:
         return parse_toml(raw)
     except ValueError as problem:
         shown, why = printable(os.fspath(path)), printable(str(problem))
         refusal = error(
-            f"The {what} {shown} is no TOML file that can be read: {why}.",
+            f"The {what} {shown} is not a readable TOML file: {why}.",
             where=shown,
             remedy="Texts stand in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
             "or 0.5.",
         )
-        fault = Fault("", f"It is no TOML file: {why}.", refusal.remedy)
+        fault = Fault("", f"It is not a TOML file: {why}.", refusal.remedy)
         raise refusal.with_faults((fault,)) from problem
 
 
 def parse_toml(raw: bytes) -> dict[str, Any]:
-    """What a TOML file holds; a number in it may be `inf` or `nan`, as the format has them. Raises
-    ValueError saying why it is none, or has whole numbers of more than 64 bits.
+    """Parse TOML; numbers may be `inf` or `nan`. Raises ValueError for invalid TOML and for
+    integers of more than 64 bits.
     """
-    text = raw.decode("utf-8-sig")  # some editors write a BOM, which is no part of TOML
+    text = raw.decode("utf-8-sig")  # some editors write a BOM, which is not part of TOML
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") > _DOTS_MAX and not line.lstrip().startswith("#"):
             raise ValueError(f"more than {_DOTS_MAX} dots (at line {number})")
@@ -162,8 +161,8 @@ def parse_toml(raw: bytes) -> dict[str, Any]:
 
 
 def parse_json(raw: bytes) -> Any:
-    """What a JSON file holds. Raises ValueError as `parse_toml`, and for a number that is infinite,
-    which Python's reader takes and the format has not.
+    """Parse JSON. Raises ValueError as `parse_toml`, and for infinite numbers, which Python accepts
+    but JSON does not have.
     """
     try:
         document = json.loads(raw)
@@ -192,14 +191,14 @@ def _check_values(document: object, *, all_finite: bool) -> None:
 
 
 def owner_only(path: str, flags: int) -> int:
-    """An opener for `open`: a file that it creates is readable by its owner alone."""
+    """Opener for `open` that creates files readable only by their owner."""
     return os.open(path, flags, _OWNER_ONLY)
 
 
 def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) -> None:
-    """Create a file that its owner alone may read, for somebody who opens it by its name; one that
-    is there is emptied, unless it `is_appended_to`, and others lose their rights. Pipes and devices
-    are left alone. Raises OSError, also for a file of another user.
+    """Create a file readable only by its owner, to be opened by name. An existing one is emptied,
+    unless it `is_appended_to`, and loses the permissions of others. Pipes and devices are not
+    touched. Raises OSError, also for a file of another user.
     """
     with suppress(FileNotFoundError):
         if not stat.S_ISREG(os.stat(path).st_mode):  # noqa: PTH116  a name that is no path
@@ -213,7 +212,7 @@ def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) 
         try:
             os.fchmod(descriptor, _OWNER_ONLY)
         except PermissionError as error:
-            # A disk without rights (FAT) refuses its owner, or root who has mounted it.
+            # A file system without permissions (FAT) refuses its owner, or root who mounted it.
             if status.st_uid not in (os.geteuid(), 0):
                 raise PermissionError(error.errno, "it belongs to another user") from error
     finally:
@@ -228,18 +227,18 @@ def _check_regular(status: os.stat_result, subject: str) -> None:
             code=ErrorCode.FILE_NOT_READ,
         )
     if not stat.S_ISREG(status.st_mode):
-        raise _no_regular(subject)
+        raise _not_regular(subject)
 
 
 def _check_trusted(path: str | os.PathLike[str], status: os.stat_result, subject: str) -> None:
-    """Raises UsageError for an open file that another user has laid, or may write, where it is
-    looked for. Its folder does not matter: who puts another file there is the owner of that one.
+    """Raise UsageError for a file at a default place that another user owns or may write. Its
+    folder does not matter: the owner of a replaced file is checked too.
     """
     if os.name != "posix":
         return
     own = {os.geteuid(), 0}
     if not os.geteuid() and os.environ.get("SUDO_UID", "").isdecimal():
-        own.add(int(os.environ["SUDO_UID"]))  # who became root by sudo
+        own.add(int(os.environ["SUDO_UID"]))  # the user of sudo
     quoted = shlex.quote(os.fspath(path))
     laid = os.lstat(path)
     if laid.st_uid not in own or status.st_uid not in own:
@@ -253,14 +252,14 @@ def _check_trusted(path: str | os.PathLike[str], status: os.stat_result, subject
         return
     raise UsageError(
         f"{subject} is not taken: {why}.",
-        cause="it was not named; it was found where such a file is looked for",
-        remedy=f"Read what is in it; then `{printable(mended)}` lets it be taken.",
+        cause="it was not named on the command line, but found at a default place",
+        remedy=f"Check its contents; then `{printable(mended)}` lets it be taken.",
         code=ErrorCode.FILE_NOT_TRUSTED,
     )
 
 
 def _is_own_group(status: os.stat_result) -> bool:
-    """True for the group that many systems give each user alone, with the right to write."""
+    """True for a user's private group, to which many systems give write permission."""
     import grp  # noqa: PLC0415  not on Windows
     import pwd  # noqa: PLC0415
 
@@ -271,11 +270,11 @@ def _is_own_group(status: os.stat_result) -> bool:
     return group.gr_name == owner.pw_name and set(group.gr_mem) <= {owner.pw_name}
 
 
-def _no_regular(subject: str) -> UsageError:
+def _not_regular(subject: str) -> UsageError:
     return UsageError(
-        f"{subject} cannot be read: it is no regular file.",
+        f"{subject} cannot be read: it is not a regular file.",
         cause="a pipe, a device or another special file",
-        remedy="Name a file on a disk; what comes through a pipe has to be saved first.",
+        remedy="Name a file on a disk; save the output of a pipe first.",
         code=ErrorCode.FILE_NOT_READ,
     )
 

@@ -1,11 +1,11 @@
-"""What this computer has flashed: a file of JSON lines in the user's data folder.
+"""History of the flashes on this computer: a file of JSON lines in the user's data folder.
 
-Two lines a flash: one when it begins, one when it has ended. So a flash whose program was killed
-shows as begun, without an end. Lines are only added, under a lock; what is torn is left out when it
-is read. Only its owner may read the file: serial numbers and paths are nobody else's business.
+Each flash has two lines, at its beginning and its end, so that one whose program was killed has no
+end. Lines are only appended, under a lock; incomplete lines are skipped when reading. The file is
+private, because it contains serial numbers and paths.
 
-Beside it, while a flash is under way, stand a lock, which the operating system releases whatever
-happens to the program, and how far the flash has come. What a killed program leaves of them stays.
+During a flash, a lock (which the operating system releases in any case) and a progress file exist
+next to it. A killed program leaves them behind.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from flasher.i18n import text
 from flasher.wording import wording_of
 
 SIZE_MAX: Final = 2 * 1024 * 1024
-"""In bytes: beyond it the older half is dropped, some thousand flashes."""
+"""In bytes; above it the older half is dropped: some thousand flashes."""
 _READ_MAX: Final = 2 * SIZE_MAX
 """In bytes, from the end of the file: other programs may have made it larger."""
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
 _REACHED_SIZE: Final = 32
-"""In bytes: written over in one piece."""
+"""In bytes; written at once."""
 MOCK: Final = "the built-in mock"
-"""In the place of an adapter: the device is gone with the program."""
+"""Adapter name of a device model, which ends with its program."""
 _LEFT_IN: Final = {
     Phase.UPDATE.value: "perhaps_erased",
     Phase.TRANSFER.value: "no_application",
     Phase.END.value: "unknown",
     Phase.CONFIRM.value: "unknown",
 }
-"""Words of `flasher.host.outcome.DeviceLeft`, by the phase that was reached."""
+"""Values of `flasher.host.outcome.DeviceLeft` by the phase reached."""
 
 _TRANSFERRED: Final = {
     True: text("transferred"),
@@ -62,10 +62,10 @@ _COMPLETED: Final = {
 
 @dataclass(frozen=True)
 class Began:
-    """A flash that begins: nothing was written to the device yet."""
+    """Beginning of a flash: nothing was written to the device yet."""
 
     at: str
-    """Local time with its offset."""
+    """Local time with UTC offset."""
     command: str
     """"flash" or "rescue"."""
     target: str
@@ -73,27 +73,27 @@ class Began:
     """A device model, or a bus without hardware."""
     adapter: str
     image: str
-    """Name of the file as given."""
+    """File name as given."""
     image_sha256: str
-    """Of the bytes to be sent."""
+    """Of the bytes to send."""
     image_size_bytes: int
     image_version: str | None
     waived: str = ""
-    """Checks that somebody has waived, by their names, a comma between two."""
+    """Names of the waived checks, separated by commas."""
     again: str = ""
-    """The command line, as a shell takes it; empty for a page."""
+    """Command line, quoted for a shell; empty for a page."""
     folder: str = ""
-    """Where it was typed."""
+    """Its working directory."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How it ended. Of the three claims null is: not known."""
+    """End of a flash. For the three claims, null means unknown."""
 
     at: str
     exit_code: int
     what: str
-    """The error in a sentence; empty where there is none."""
+    """The error in a sentence; may be empty."""
     serial_number: str | None
     previous_version: str | None
     transferred: bool | None
@@ -101,15 +101,15 @@ class Ended:
     completed: bool | None
     """The device confirmed the complete image."""
     running_version: str | None
-    """What the application answers."""
+    """Version answered by the application."""
     needs_rescue: bool
     """The device was left without an application, or perhaps without one."""
     bundle: str | None
-    """The folder with trace and report."""
+    """Folder with trace and report."""
 
     @property
     def claims(self) -> tuple[str, str, str]:
-        """The three claims in words, of which none stands for another."""
+        """The three separate claims in words."""
         version = self.running_version
         return (
             _TRANSFERRED[self.transferred],
@@ -120,34 +120,34 @@ class Ended:
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a flash without an end has come, once the device was told to erase."""
+    """Progress of a flash without an end, after the update command."""
 
     phase: str
     packet: int
-    """The last one that the device has acknowledged; 0 before the first."""
+    """Last acknowledged packet; 0 before the first."""
 
 
 @dataclass(frozen=True)
 class Flash:
-    """One flash; `ended` is null when no end was recorded."""
+    """One flash; `ended` is null if no end was recorded."""
 
     began: Began
     ended: Ended | None
     is_running: bool = False
-    """A program is at work on it."""
+    """A program is running it."""
     reached: Reached | None = None
-    """Where it has no end."""
+    """Set if it has no end."""
 
     @property
     def device_left(self) -> str:
-        """The state in which a flash without an end has left the device, in a sentence."""
+        """State in which a flash without an end left the device, as a sentence."""
         if self.reached is None:
-            return text("as far as is known it was not told to erase anything")
+            return text("as far as is known it received no update command")
         return text(wording_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
 
     @property
     def left_device_open(self) -> bool:
-        """The device may sit in the session that it began."""
+        """The device may be in the session that it began."""
         return not self.is_running and (self.ended is None or self.ended.needs_rescue)
 
     @property
@@ -163,15 +163,17 @@ T = TypeVar("T", Began, Ended)
 
 
 class History:
-    """The file. Writing raises OSError, or TimeoutError when another program holds it."""
+    """The history file. Writing raises OSError, or TimeoutError if another program holds the
+    lock.
+    """
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or user_data_path("flasher", appauthor=False) / "history.jsonl"
         self._held: dict[str, FileLock] = {}
-        """The locks of flashes that are under way here."""
+        """Locks of the flashes running here."""
 
     def begin(self, began: Began) -> str:
-        """Add a flash that begins; returns what `end` wants."""
+        """Add the beginning of a flash; return its name for `end`."""
         name = token_hex(8)
         for folder in (self.path.parent, self._folder):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -179,13 +181,13 @@ class History:
         with lock:
             self._add({"flash": name, "event": _BEGAN, **dataclasses.asdict(began)})
             self._held[name] = lock
-            lock.acquire()  # once more: it stays
+            lock.acquire()  # a second time, so that it stays locked
         return name
 
     def reached(self, name: str, reached: Reached) -> None:
-        """Note how far the flash `name` has come. This may be called for every packet: nothing is
-        synced, so that it survives the program but not the computer. A phase in which nothing is
-        erased takes nothing back: a later attempt begins with those.
+        """Note the progress of the flash `name`. Suitable for every packet: nothing is synced, so
+        it survives the program but not the computer. Phases without erasing are ignored, because a
+        later attempt begins with them.
         """
         if reached.phase not in _LEFT_IN:
             return
@@ -197,7 +199,7 @@ class History:
             os.close(descriptor)
 
     def end(self, name: str, ended: Ended) -> None:
-        """Add how the flash `name` ended."""
+        """Add the end of the flash `name`."""
         try:
             self._add({"flash": name, "event": _ENDED, **dataclasses.asdict(ended)})
         finally:
@@ -214,7 +216,7 @@ class History:
         return self._folder / f"{name}.reached"
 
     def _forget(self, name: str) -> None:
-        """It is under way no more."""
+        """Release its lock and delete its files."""
         self._held.pop(name).release()
         for path in (self._lock_of(name), self._place_of(name)):
             with contextlib.suppress(OSError):
@@ -240,8 +242,8 @@ class History:
             return None
 
     def flashes(self) -> tuple[list[Flash], int]:
-        """Every flash, the latest last, and how many lines could not be read. Raises UsageError
-        for a file that cannot be read.
+        """Return all flashes, the latest last, and the number of unreadable lines. Raises
+        UsageError if the file cannot be read.
         """
         begun: dict[str, Began] = {}
         ended: dict[str, Ended] = {}
@@ -263,7 +265,7 @@ class History:
         ], damaged
 
     def _lines(self, max_size: int) -> list[bytes]:
-        """The lines in the last `max_size` bytes."""
+        """Return the lines in the last `max_size` bytes."""
         try:
             with opened(self.path, None, what="history", may_grow=True) as (file, size):
                 file.seek(max(0, size - max_size))
@@ -307,7 +309,7 @@ class History:
 
 
 def _ends_whole(descriptor: int) -> bool:
-    """False behind a line that a full disk or a power cut has torn."""
+    """False after a line that a full disk or a power cut left incomplete."""
     size = os.fstat(descriptor).st_size
     if not size:
         return True
@@ -316,7 +318,7 @@ def _ends_whole(descriptor: int) -> bool:
 
 
 def _made(kind: type[T], found: dict[str, Any]) -> T:
-    """Keys that a newer flasher has added are left out. Raises LookupError and TypeError."""
+    """Create a record; ignores keys of newer versions. Raises LookupError and TypeError."""
     values = {
         each.name: found[each.name]
         for each in dataclasses.fields(kind)
@@ -335,11 +337,11 @@ _TYPES: Final = {
     }
     for kind in (Began, Ended)
 }
-"""The types of each key."""
+"""Types of each key."""
 
 
 def working_folder() -> str:
-    """Where file names count from, escaped; empty for a folder that was deleted."""
+    """Working directory, escaped; empty if it was deleted."""
     try:
         return printable(str(Path.cwd()))
     except OSError:
@@ -347,8 +349,8 @@ def working_folder() -> str:
 
 
 def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | None:
-    """The latest flash of a target on an adapter that may have left its device in a session; None
-    where there is none, or where the device had an application after it.
+    """Return the latest flash of a target on an adapter that may have left its device in a session;
+    None without one, or if the device had an application later.
     """
     found = None
     for each in flashes:
@@ -364,7 +366,7 @@ def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | Non
 def matching(
     flashes: list[Flash], *, target: str | None, serial_number: str | None
 ) -> Iterator[Flash]:
-    """Those of a target, and those whose serial number has this text in it."""
+    """Yield the flashes of a target, and those whose serial number contains this text."""
     for each in flashes:
         serial = (each.ended and each.ended.serial_number) or ""
         if target in (None, each.began.target) and (serial_number or "").lower() in serial.lower():

@@ -1,7 +1,7 @@
-"""Events in the log of the standard library, under loggers named `flasher.*`.
+"""Logs events with the standard library, under loggers named `flasher.*`.
 
-Only who calls an engine logs: engines say what happens by events. Nothing is shown unless the
-program that uses flasher sets up logging.
+Only callers of engines log; engines report events. Nothing is shown unless the program using
+flasher configures logging.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _INFO: Final = frozenset(
         events.ShutdownEnded,
     }
 )
-"""Phases, and what a person waits for."""
+"""Phases, and what the user waits for."""
 _WARNING: Final = frozenset(
     {
         events.HostStalled,
@@ -50,7 +50,7 @@ _WARNING: Final = frozenset(
         events.DeviceReported,
     }
 )
-"""Trouble, whether it ends the work or not."""
+"""Problems, fatal or not."""
 BY_DEVICE: Final = frozenset(
     {
         events.DeviceStateEntered,
@@ -66,13 +66,13 @@ BY_DEVICE: Final = frozenset(
 _BAD_VERDICTS: Final = frozenset({"warned", "waived", "refused"})
 _CONTENT_WIDTH: Final = 400
 
-# A library does not print by itself: without this, warnings would go to stderr.
+# A library must not print: without this, warnings go to stderr.
 logging.getLogger(ROOT).addHandler(logging.NullHandler())
 
 
 def log_event(event: object) -> None:
-    """Log an event of flasher.events, or one like it: phases as INFO, trouble as WARNING, the rest
-    as DEBUG. The record has the event itself as `event`.
+    """Log an event: phases as INFO, problems as WARNING, others as DEBUG. The record has the event
+    as `event`.
     """
     logger = _DEVICE if type(event) in BY_DEVICE else _HOST
     level = level_of(event)
@@ -90,14 +90,14 @@ def level_of(event: object) -> int:
 
 
 def describe(event: object) -> str:
-    """An event on one line, escaped: its name, then its fields."""
+    """Format an event as one escaped line: its name, then its fields."""
     name = type(event).__name__
     if not dataclasses.is_dataclass(event):
         return printable(f"{name}: {event}")
-    said = ", ".join(
+    values = ", ".join(
         f"{field.name}={_shown(getattr(event, field.name))}" for field in dataclasses.fields(event)
     )
-    return f"{name}: {said}" if said else name
+    return f"{name}: {values}" if values else name
 
 
 def _shown(value: object) -> str:

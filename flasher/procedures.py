@@ -1,4 +1,4 @@
-"""What a `Device` of `flasher.api` does, step by step: engines that are run one after the other."""
+"""Procedures of `flasher.api.Device`: sequences of engines."""
 
 from __future__ import annotations
 
@@ -67,41 +67,39 @@ if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate
 
 INFO_LISTEN_S: Final = 0.5
-"""Long enough to hear faults twice, which come every 200 ms while there are any (5.1)."""
+"""Long enough to receive faults twice: they are sent every 200 ms while any is set (5.1)."""
 INFO_LISTEN_ONLY_S: Final = 3.0
-"""For devices that cannot be asked: their polls come about once a second."""
+"""For devices without queries: they send about once a second."""
 SCAN_LISTEN_S: Final = 1.0
 _WAS_OFF: Final = frozenset({TroubleKind.BUS_OFF, TroubleKind.RESTARTED})
 _REOPEN_PAUSE_S: Final = 0.1
-"""Between two tries to open a lost adapter again."""
+"""Pause between two tries to open a lost adapter."""
 
 
 EventHandler = Callable[[object], None]
 
 
 class Watch(TypedDict, total=False):
-    """How a call is watched and ended; what is left out is as the device was made."""
+    """Callbacks of a call; missing ones are those of the device."""
 
     taps: Sequence[Tap]
-    """See every frame in both directions."""
+    """Observe every frame in both directions."""
     on_event: EventHandler | None
-    """Gets what happens, as dataclasses of `flasher.events`."""
+    """Gets the events, dataclasses of `flasher.events`."""
     cancelled: Callable[[], bool] | None
-    """Asked while it runs; ends it at the next message boundary."""
+    """Called repeatedly; True ends the call at the next message boundary."""
     ends_write: Callable[[], bool] | None
-    """Asked while it writes an item, which `cancelled` does not end: the device may be another one
-    now, and nothing is repeated to it.
-    """
+    """Like `cancelled`, while an item is written, which `cancelled` does not end: the device may
+    have been exchanged, and nothing must be repeated to another one."""
     hung_up: Callable[[], bool] | None
-    """As `cancelled`, for a terminal that is gone: it does not end an upgrade that has begun to
-    erase.
-    """
+    """Like `cancelled`, for a closed terminal: it does not end an upgrade that has begun to
+    erase."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One question of `identify` and its answer, None when none came; `misfit` says in words what
-    came in another form, and `was_asked` is False when the device was given up before.
+    """One query of `identify` and its answer (None without one). `misfit` describes an answer of
+    another format; `was_asked` is False if the device was silent to earlier queries.
     """
 
     name: str
@@ -112,7 +110,7 @@ class Reading:
 
     @property
     def title(self) -> str:
-        """Its name as people read it."""
+        """Name for people."""
         return self.name.replace("-", " ")
 
     @property
@@ -127,29 +125,29 @@ class Reading:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What a device says about itself, and the traffic heard meanwhile."""
+    """Answers of a device, and the traffic received meanwhile."""
 
     target: Target
     dialect: Dialect
     readings: tuple[Reading, ...]
-    """In the order of the document; empty for devices that have no queries."""
+    """In the order of the document; empty for devices without queries."""
     survey: Survey
 
     @property
     def is_there(self) -> bool:
-        """True when the device answered or sent anything."""
+        """True if the device answered or sent anything."""
         return self.target.node in self.survey.heard
 
     @property
     def version(self) -> VersionInformation | None:
-        """Its answer to the question for it."""
+        """Answer to the version query."""
         answers = (reading.answer for reading in self.readings)
         return next((each for each in answers if isinstance(each, VersionInformation)), None)
 
     @property
     def no_faults(self) -> str:
-        """What silence about faults tells: they are heard, not asked for, and how long to wait for
-        one only one document says.
+        """Meaning of no received faults: they are sent unasked, and only one document gives their
+        interval.
         """
         is_periodic = self.dialect is WELLING
         proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
@@ -158,14 +156,14 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class Procedures:
-    """The procedures for the target of a profile, on a link with its clock: for one call."""
+    """Procedures for the target of a profile on a link, for one call."""
 
     link: Link
     clock: Clock
     profile: Profile
     bit_rate: BitRate | None
     is_alone: bool
-    """Nobody else can speak as the tool on this bus: it is not listened for before asking."""
+    """No other tool can be on this bus: queries need not listen for one first."""
     watch: Watch
 
     @property
@@ -183,11 +181,11 @@ class Procedures:
         hang_up_ends: Callable[[], bool] | None = None,
         on_event: EventHandler | None = None,
     ) -> None:
-        """Run an engine until it is done. `taps` see the frames after those of the caller, and
-        `on_event` gets its events before the caller does.
+        """Run an engine until it is done. `taps` see frames after those of the caller, and
+        `on_event` gets events before the caller.
 
-        Without `may_cancel` the user does not end it, only `ends_write` does; a terminal that
-        hangs up ends it only while `hang_up_ends` says so.
+        Without `may_cancel`, only `ends_write` ends it. A closed terminal ends it only while
+        `hang_up_ends` returns True.
         """
         drive(
             engine,
@@ -203,8 +201,8 @@ class Procedures:
         )
 
     def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:
-        """Wait for this moment of the clock. True when the user has cancelled, or when the terminal
-        hung up and that ends it.
+        """Wait until this time. Return True if the user cancelled, or the terminal was closed and
+        that ends the call.
         """
         self.clock.wait_until(moment)
         return self._is_cancelled(hang_up_ends)
@@ -224,14 +222,14 @@ class Procedures:
     # -- asking ----------------------------------------------------------------------------------
 
     def listen_first(self, *, may_cancel: bool = True) -> None:
-        """Listen for another tool before asking: a question in the middle of its packet spoils it.
-        Raises BusError when there is one.
+        """Listen for another tool before a query, which would disturb its transfer. Raises BusError
+        if one is detected.
         """
         if not self.is_alone:
             _check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
 
     def ask(self, request: Request, *, for_write: str = "") -> Content:
-        """Ask one question. Raises NoAnswerError, and what `_asked` raises."""
+        """Send one request. Raises NoAnswerError, and as `_asked`."""
         self.listen_first()
         query = self._asked(request, for_write=for_write)
         if query.cancelled:
@@ -241,7 +239,7 @@ class Procedures:
         return query.answer
 
     def read(self, what: str | type[Content]) -> Content:
-        """Read an item by its name, or by the type of its content."""
+        """Read an item by name, or by the type of its content."""
         return self.ask(Request(self._readable(what).item))
 
     def _readable(self, what: str | type[Content]) -> Readable:
@@ -259,7 +257,7 @@ class Procedures:
         )
 
     def version(self) -> Content:
-        """The answer to the version request of the document or the product."""
+        """Send the version query of the document or the product."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         if request is None:
             raise NoAnswerError(
@@ -269,7 +267,7 @@ class Procedures:
         return self.ask(request)
 
     def read_memory(self, start: int, end: int) -> bytes:
-        """The bytes from `start` up to `end`, exclusive (R5)."""
+        """Read the bytes from `start` up to `end`, exclusive (R5)."""
         if READ_MEMORY.receiver is not self.target.node:
             node = self.target.node.name
             raise UsageError(f"The documents give no way to read memory of the {node}.")
@@ -302,7 +300,7 @@ class Procedures:
     # -- writing ---------------------------------------------------------------------------------
 
     def content_before(self, plan: WritePlan) -> Content:
-        """What the device holds before a write."""
+        """Read the content before a write."""
         request = Request(plan.writable.read_back.item)
         try:
             return self.ask(request, for_write="Nothing was written.")
@@ -311,9 +309,9 @@ class Procedures:
             raise
 
     def carry_out(self, plan: WritePlan, before: Content | None) -> WriteResult:
-        """Write, wait for general feedback, read back. What went wrong stands in the result.
+        """Write, wait for general feedback, read back. Failures are in the result.
 
-        A write that was begun is looked after: it takes seconds, and is not ended by the user.
+        The user cannot cancel a write once it has begun; it takes seconds.
         """
         self.listen_first(may_cancel=False)
         request = Request(plan.writable.item, plan.content)
@@ -321,7 +319,7 @@ class Procedures:
         query = self._asked(request, may_cancel=False, for_write=both)
         written = WriteResult(plan, before, query.answer is not None, None)
         for _ in range(2):
-            # An answer on a broadcast id may be one to somebody who asked before the write.
+            # An answer on a broadcast id may belong to another node's query before the write.
             request = Request(plan.writable.read_back.item)
             again = self._asked(request, may_cancel=False)
             written = replace(written, read_back=again.answer)
@@ -343,7 +341,7 @@ class Procedures:
     # -- looking ---------------------------------------------------------------------------------
 
     def identify(self) -> DeviceInfo:
-        """Ask everything that the documents let one ask; listen only where they give nothing."""
+        """Send all documented queries; only listen if there are none."""
         items = readable(self.target, self.profile.dialect)
         asked = [entry for entry in items.values() if not entry.field]
         survey = self._survey(
@@ -357,7 +355,7 @@ class Procedures:
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
 
     def is_heard(self) -> bool:
-        """Listen for the device, and ask it for its version where it has a query for that."""
+        """Listen for the device, and send its version query, if any."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         survey = self._survey(
             () if request is None else [request],
@@ -389,8 +387,8 @@ class Procedures:
         return survey
 
     def _asked(self, request: Request, *, may_cancel: bool = True, for_write: str = "") -> Query:
-        """The question, asked. Raises WrongDeviceError when two devices answer in a write; its
-        argument says what may be written.
+        """Send one request. Raises WrongDeviceError if two devices answer during a write;
+        `for_write` describes what may be written.
         """
         queries = self._queries([request])
         self.run(queries, may_cancel=may_cancel)
@@ -410,7 +408,7 @@ class Procedures:
     # -- firmware --------------------------------------------------------------------------------
 
     def plan(self, image: Image | Plan) -> Plan:
-        """What an upgrade with this image would send."""
+        """Plan an upgrade with this image."""
         if isinstance(image, Plan):
             if image.target is not self.target:
                 planned, own = image.target.node.name, self.target.node.name
@@ -420,7 +418,7 @@ class Procedures:
         return plan_for(image, self.profile, rate)
 
     def verify(self, image: Image | Plan, level: Level) -> Verification:
-        """Whether the device runs this image: by its version, then by its memory."""
+        """Check whether the device runs this image: by its version, then by its memory."""
         plan, options = self.plan(image), self.profile.upgrade_options()
         check_level(plan, level, options)
         if level is Level.NONE:
@@ -433,7 +431,7 @@ class Procedures:
         return verification
 
     def checked(self, check: Runner[Verification]) -> Verification:
-        """What a check found. Raises InterruptedByUserError when it did not come to its end."""
+        """Run a check. Raises InterruptedByUserError if it was cancelled."""
         self.run(check)
         if check.result.verdict is Verdict.INTERRUPTED:
             raise _interrupted()
@@ -449,9 +447,9 @@ class Procedures:
         """Run one upgrade to its end, good or bad, and verify a good one. Raises ImageError for a
         firmware sample on a physical adapter.
 
-        A lost adapter is opened again for the time of the options while an attempt is left. Raises
-        BusError, saying how far it had come and in what state the device is left, when the adapter
-        fails for good or nobody on the bus acknowledges; InterruptedByUserError when the user
+        A lost adapter is opened again within the time of the options while an attempt is left.
+        Raises BusError, with the progress and the state of the device, if the adapter fails
+        permanently or no node on the bus acknowledges; InterruptedByUserError if the user
         interrupts a second time.
         """
         plan = self.plan(image)
@@ -498,9 +496,9 @@ class Procedures:
                     self._await_adapter(session, error, wait_s)
                 session.link_back(self.clock.now())
         except (BusError, InterruptedByUserError) as error:
-            # The adapter does not know what it was used for.
+            # The adapter does not know the session.
             error.where = f"{session.standing}; {error.where}".removesuffix("; ")
-            _say_what_is_left(error, session)
+            _add_device_state(error, session)
             raise
         except KeyboardInterrupt as interrupt:
             interrupted = InterruptedByUserError(
@@ -509,7 +507,7 @@ class Procedures:
                 cause="it may have ended in the middle of a message",
                 remedy=AGAIN,
             )
-            _say_what_is_left(interrupted, session)
+            _add_device_state(interrupted, session)
             raise interrupted from interrupt
         result = replace(session.result, stalled_s=sum(stalls_s))
         silence = result.error()
@@ -518,15 +516,15 @@ class Procedures:
         return result
 
     def _end_when_off(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """A tap that raises BusError as soon as the adapter reports bus-off: what the device says
-        until it is back is lost, and there is no use in waiting for it.
+        """Tap that raises BusError when the adapter reports bus-off: messages of the device are
+        lost until it is back.
         """
         if frame[4] and self.link.is_off:
             raise bus_off_error(str(self.link))
 
     def _check_bus(self, where: str, session: UpgradeSession, before: LinkHealth) -> None:
-        """Raise BusError when it is the bus that is silent, not the device, or when the adapter was
-        off the bus since `before` and came back by itself: what was said meanwhile is lost.
+        """Raise BusError if the bus is silent, not only the device, or if the adapter was bus-off
+        since `before` and came back automatically, so that messages were lost.
         """
         health, where = self.link.health(), f"{where}; {self.link}"
         error, trouble = health.error(where), health.last_trouble
@@ -534,16 +532,16 @@ class Procedures:
         if error is None and is_new and trouble is not None and trouble.kinds & _WAS_OFF:
             error = bus_off_error(where, "The adapter was off the bus for a while.")
         if error is not None:
-            _say_what_is_left(error, session)
+            _add_device_state(error, session)
             raise error
 
     def _await_contact(
         self, session: UpgradeSession, blocked: TransmitBlockedError, told_at: int | None
     ) -> int:
-        """Let a session go on whose frames do not leave: a device without power acknowledges none.
-        Reported unless nothing has arrived since it was, at `told_at` frames; returns how many
-        have. Raises the error where there is something to lose, and where the overall deadline
-        leaves no time for another try.
+        """Continue a session whose frames are not sent, because a device without power acknowledges
+        none. Reported unless nothing arrived since the last report, at `told_at` frames; returns
+        the number of received frames. Raises the error if there is something to lose, or if the
+        overall deadline leaves no time.
         """
         left_s = (session.deadline_at or inf) - self.clock.now()
         if not session.goes_on or left_s <= SEND_LIMIT_S + _REOPEN_PAUSE_S:
@@ -555,7 +553,7 @@ class Procedures:
         return received
 
     def _await_adapter(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:
-        """Wait for a lost adapter, where an attempt is left for it; raises BusError without."""
+        """Wait for a lost adapter while an attempt is left; else raise BusError."""
         if not session.may_begin_again or not wait_s:
             raise lost
         self._tell(events.AdapterLost(lost.what, wait_s))
@@ -563,8 +561,8 @@ class Procedures:
         self._tell(events.AdapterBack())
 
     def _reopen(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:
-        """Open a lost adapter again, as soon as it is back. Raises BusError when it is not within
-        the time given and the overall deadline, InterruptedByUserError when the user has enough.
+        """Open a lost adapter again as soon as it is back. Raises BusError after the time limit or
+        the overall deadline, InterruptedByUserError if the user cancels.
         """
         now = self.clock.now()
         give_up_at = now + wait_s
@@ -588,7 +586,7 @@ class Procedures:
             except BusError as error:
                 now = self.clock.now()
                 if now >= give_up_at:
-                    # Why it does not open now says what to do; why it was lost may be over.
+                    # Why it does not open now determines the remedy; the loss itself may be over.
                     error.where = error.where or lost.where
                     error.remedy = f"{error.remedy} {AGAIN}" if error.remedy else lost.remedy
                     error.cause = f"{error.cause}; it was lost with: {lost.what.rstrip('.')}"
@@ -606,9 +604,7 @@ class Procedures:
 
 
 def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:
-    """What an upgrade of a profile's device with this image would send. Raises ImageError and
-    UsageError.
-    """
+    """Plan an upgrade of a profile's device with this image. Raises ImageError and UsageError."""
     profile.check_fits(image)
     return make_plan(
         image,
@@ -620,17 +616,19 @@ def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:
 
 
 def check_sample(image: Image, link: Link) -> None:
-    """Raise ImageError for a firmware sample that would go out on a physical adapter."""
+    """Raise ImageError for a firmware sample on a physical adapter."""
     if is_sample(image) and link.is_physical:
         raise sample_error(image, str(link))
 
 
 def _may_end(session: UpgradeSession) -> Callable[[], bool]:
-    """Whether a terminal that hangs up may end a session: as long as the device has its program."""
+    """Return whether a closed terminal may end a session: while the device still has its
+    application.
+    """
     return lambda: not session.has_begun_to_erase
 
 
-def _say_what_is_left(error: FlasherError, session: UpgradeSession) -> None:
+def _add_device_state(error: FlasherError, session: UpgradeSession) -> None:
     left = session.device_left
     error.remedy = f"{error.remedy} State of the device: {wording(left)}.".lstrip()
     error.needs_rescue = left.needs_rescue
@@ -643,7 +641,7 @@ def _interrupted() -> InterruptedByUserError:
 def _check_no_other_tool(survey: Survey) -> None:
     if survey.other_tool_heard:
         raise BusError(
-            "Another tool speaks on this bus; nothing is asked or written now.",
+            "Another tool sends on this bus; nothing was queried or written.",
             where="while listening first",
             cause="an upgrade or a test is under way",
             remedy="Wait until it has ended. flasher monitor listens without asking.",
@@ -670,7 +668,7 @@ def _no_answer(asked: Query) -> NoAnswerError:
 
 
 def two_devices(target: Target, seen: str, written: str) -> WrongDeviceError:
-    """The error for two devices where one is meant; `written` says what may be written."""
+    """Create the error for two devices instead of one; `written` describes what may be written."""
     return WrongDeviceError(
         f"{target.node.name}: two devices answer on the same id ({seen}).",
         cause=TWO_DEVICES_CAUSE,
@@ -680,11 +678,11 @@ def two_devices(target: Target, seen: str, written: str) -> WrongDeviceError:
 
 
 def nobody_heard(survey: Survey, bitrate_bps: int) -> NoAnswerError:
-    """The error for a bus on which no node of the documents was heard."""
+    """Create the error for a bus without messages from any documented node."""
     count = survey.foreign_frames
     foreign = f"{count:,} frame{'' if count == 1 else 's'} under ids of other protocols came"
     return NoAnswerError(
-        f"Nobody of the drive system was heard at {bitrate_bps / 1000:g} kbit/s"
+        f"No device of the drive system sent anything at {bitrate_bps / 1000:g} kbit/s"
         f"{f'; {foreign}' if count else ''}.",
         cause="everything is off or asleep, the wiring is open, or the bit rate is another",
         remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",

@@ -1,7 +1,7 @@
-"""What people read for the words that programs see: everything that is said of an enumeration.
+"""English texts of enumeration members, for people.
 
-The members of enumerations have stable words as values, which stand in JSON and in records; their
-sentences stand here, by the name of the enumeration and the word, and can be translated here.
+Enumerations have stable words as values, used in JSON and records. Their texts are here, by name of
+the enumeration and word, so that they can be translated.
 """
 
 from __future__ import annotations
@@ -140,20 +140,19 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
 
 
 def wording(word: Enum) -> str:
-    """The text for a member of an enumeration."""
     return _TEXTS[type(word).__name__][word.value]
 
 
 def wording_of(enumeration: str, word: str) -> str:
-    """The text for a word of the enumeration of this name; the word itself where there is none."""
+    """Text for a word of the enumeration of this name; the word itself without one."""
     return _TEXTS[enumeration].get(word, word)
 
 
-# -- what a recorded trace shows ------------------------------------------------------------------
+# -- causes of failure in a trace -----------------------------------------------------------------
 
 
 class Explanation(NamedTuple):
-    """Likely cause and remedy, with {node} and {boot_name} to be filled in."""
+    """Likely cause and remedy, with placeholders {node} and {boot_name}."""
 
     likely: str
     remedy: str
@@ -268,5 +267,5 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
 
 
 def explanation(cause: Enum) -> Explanation:
-    """What is said to a cause; empty where it speaks for itself."""
+    """Explanation of a cause; empty if it needs none."""
     return _EXPLANATIONS.get(cause.value, _NOTHING)

@@ -81,7 +81,7 @@ def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
         return status
 
     monkeypatch.setattr(os, "stat", replaced)
-    with pytest.raises(UsageError, match="no regular file"):
+    with pytest.raises(UsageError, match="not a regular file"):
         read(path, 10)
 
 

@@ -274,14 +274,14 @@ def test_values_that_do_not_fit_together_are_refused(tmp_path: Path, text: str, 
 
 def test_what_is_no_toml_is_told_with_its_line(tmp_path: Path) -> None:
     error = refused(tmp_path, "attempts 3\n")
-    assert "is no TOML file" in error.what
+    assert "is not a readable TOML file" in error.what
     assert "line 1" in error.what
 
 
 def test_bytes_that_are_no_text_are_told(tmp_path: Path) -> None:
     path = tmp_path / "flasher.toml"
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="is no TOML file"):
+    with pytest.raises(UsageError, match="is not a readable TOML file"):
         check_profile(path)
 
 

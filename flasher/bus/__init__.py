@@ -1,1 +1,1 @@
-"""Ways to a bus: a real adapter, a simulated bus with exact bit times, and what they share."""
+"""CAN links: real adapters through python-can, and a simulated bus with exact bit times."""

@@ -1,8 +1,8 @@
-"""A real adapter behind a `Link`, through python-can.
+"""`Link` for a real adapter, through python-can.
 
-What python-can leaves to its users is done here: the bit rate never falls back to an adapter's own
-default (a wrong one disturbs a live bus), a full transmit queue is waited for (every back end says
-"full" in its own way), timeouts go by the monotonic clock, and foreign exceptions end at this edge.
+It adds what python-can leaves to its users: the bit rate never defaults to the adapter's (a wrong
+one disturbs a live bus), a full transmit queue is waited for (every back end reports it
+differently), timeouts use the monotonic clock, and foreign exceptions end here.
 """
 
 from __future__ import annotations
@@ -49,23 +49,24 @@ from flasher.protocol.spec import FRAME_DATA_SIZE
 from flasher.python_can import can
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
-"""Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""
+"""Pause between two tries on a full queue: about one frame on the wire. Frames are received
+meanwhile."""
 _DRAIN_FRAMES: Final = 100_000
 _KERNEL_STAMPS: Final = frozenset({"socketcan", "udp_multicast"})
-"""Back ends whose messages bear the time at which Linux had them, by the wall clock."""
+"""Back ends whose messages have Linux's receive time, by the wall clock."""
 _STAMP_AGE_MAX_S: Final = 1.0
-"""A frame that seems to have waited for longer: rather the wall clock was set meanwhile."""
+"""Maximum age of a frame; an older one means that the wall clock was set."""
 _UNREADABLE_LIMIT: Final = 100
-"""So many times in a row nothing could be read: rather the adapter is broken than its line."""
+"""Consecutive unreadable inputs after which the adapter, not its line, counts as broken."""
 _PASSED_OVER_LIMIT: Final = 1000
-"""What is no frame is passed over so often before a frame: a port that babbles is never empty."""
+"""Maximum number of skipped inputs before a frame: a babbling port is never empty."""
 _WAIT_MIN_S: Final = 0.02
 """A shorter wait may end early by rounding."""
 _HASTE_S: Final = 0.0005
-"""A back end that returns nothing sooner has not waited for it."""
+"""A back end that returns nothing sooner did not wait."""
 _HASTE_LIMIT_S: Final = 0.25
 _HASTE_LIMIT: Final = 100
-"""For so long, and so often, it has not: the adapter is gone."""
+"""If it does not wait for so long, and so often, the adapter is gone."""
 _PCAN_BUS_OFF: Final = 0x00010
 _PCAN_PASSIVE: Final = 0x40000
 _PCAN_WARNING: Final = 0x00004 | 0x00008
@@ -80,35 +81,35 @@ def open_adapter(
     fallback: Fallback | None = None,
     **config: Any,
 ) -> CanLink:
-    """Open the adapter that `config` (python-can's keywords), its variables and files, and the
-    `fallback` describe.
+    """Open the adapter described by `config` (python-can's keywords), python-can's variables and
+    files, and the `fallback`.
 
-    `default_bitrate_bps` is the dialect's, and what holds unless `config` itself names another bit
-    rate. As `holder` it is locked until it is closed (`lock.hold`). Who `sends` cannot use an
-    interface that only listens. `listen_only` keeps the adapter from acknowledging, where its back
-    end can be told (`opening.can_listen_only`).
+    `default_bitrate_bps` is the dialect's bit rate, which applies unless `config` itself names
+    another one. `holder` locks the adapter until it is closed (`lock.hold`). With `sends`, an
+    interface that only listens is refused. `listen_only` keeps the adapter from acknowledging, if
+    its back end supports that (`opening.can_listen_only`).
 
-    Raises UsageError for an interface that python-can does not know or a value that is no bit rate,
-    BusError when the bit rate is another one, the adapter cannot be opened, or somebody holds it.
+    Raises UsageError for an unknown interface or an invalid bit rate; BusError if the bit rate
+    differs, the adapter cannot be opened, or another program holds it.
     """
     merged = bus_config(config, fallback, listen_only=listen_only)
     rate = bit_rate(default_bitrate_bps, config, merged, fallback)
-    settled = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
+    settings = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
 
     interface = str(merged["interface"])
     channel = str(merged.get("channel") or "")
     place, give_back = place_of(merged), hold(merged, holder)
 
     def open_again() -> can.BusABC:
-        # An interface that is back may have been set up anew, and otherwise.
+        # The interface may have come back with other settings.
         bit_rate(default_bitrate_bps, config, merged, fallback)
         nonlocal place, give_back
-        # A serial port that is named by a link may be back as another one.
+        # A symbolic link may lead to another serial port now.
         new_place, give_new_back = place_of(merged), None
         if new_place != place:
             give_new_back = hold(merged, holder)
         try:
-            bus = open_bus(settled, sends=sends)
+            bus = open_bus(settings, sends=sends)
         except BaseException:
             if give_new_back is not None:
                 give_new_back()
@@ -120,11 +121,11 @@ def open_adapter(
 
     try:
         link = CanLink(
-            open_bus(settled, sends=sends),
+            open_bus(settings, sends=sends),
             interface,
             channel,
             open_again,
-            lambda: give_back(),  # noqa: PLW0108  another one after a reopening
+            lambda: give_back(),  # noqa: PLW0108  replaced when reopened
             gives_own=interface != "socketcan" or bool(merged.get("receive_own_messages")),
         )
     except BaseException:
@@ -135,7 +136,7 @@ def open_adapter(
 
 
 class CanLink:
-    """A python-can bus as a `Link` on the monotonic clock."""
+    """python-can bus as a `Link` on the monotonic clock."""
 
     def __init__(
         self,
@@ -153,12 +154,12 @@ class CanLink:
         self._name = f"{interface} {channel}".strip()
         self._open_again = open_again
         self.bit_rate: BitRate | None = None
-        """What the bus was opened with; None where that is not known."""
+        """Bit rate with which it was opened; None if unknown."""
         self._waiting: deque[tuple[Frame, float | None]] = deque()
         is_stamped = interface in _KERNEL_STAMPS and platform.system() == "Linux"
         self.stamp_source = "kernel" if is_stamped else ""
         self.received_at: float | None = None
-        """Of the frame that `receive` returned last (`StampingLink`)."""
+        """Arrival time of the frame that `receive` last returned (`StampingLink`)."""
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
         sender = FLAGGED_SENDER.get(interface, Sender.UNKNOWN)
         self._echoes = Echoes(sender, gives_own=gives_own)
@@ -167,22 +168,22 @@ class CanLink:
         self._use(bus)
 
     def _use(self, bus: can.BusABC | None) -> None:
-        """Send to and receive from this bus; None while there is none."""
+        """Use this bus; None while there is none."""
         self._bus = bus
         self._port: Any = getattr(bus, SERIAL_PORTS.get(self._interface, ""), None)
-        """The serial port that a back end works on, if it does."""
+        """Serial port of the back end, if any."""
         if self._port is not None and not self._send_options:
-            self._port.write_timeout = SEND_LIMIT_S  # a full port would block for ever
+            self._port.write_timeout = SEND_LIMIT_S  # otherwise a full port blocks forever
         self._unreadable_in_a_row = 0
         self._hasty = 0
-        """Waits in a row that a back end has ended at once, with nothing."""
+        """Consecutive waits that the back end ended at once without a frame."""
         self._hasty_since = 0.0
         self._was_passed_over = False
-        """The last receive has consumed something that is no frame for the caller."""
+        """The last receive consumed an input that is not a frame for the caller."""
         self._send_raw: Callable[..., None] = _no_bus if bus is None else bus.send
-        # recv() measures its timeout by the wall clock, so that a jump of it can hang the call;
-        # what it wraps does not. No filters are set that would need the wrapper, unless the back
-        # end was given some and leaves them to it.
+        # recv() measures its timeout by the wall clock, so that a clock jump can hang the call; the
+        # wrapped method does not. Its filters are only needed if the back end got some and leaves
+        # them to the wrapper.
         self._receive_raw: Callable[[float], tuple[can.Message | None, bool]]
         if bus is None:
             self._receive_raw = _no_bus
@@ -193,25 +194,25 @@ class CanLink:
 
     @property
     def channel(self) -> str:
-        """Which adapter of its kind; empty where that was not said."""
+        """Channel of the adapter; may be empty."""
         return self._channel
 
     def __str__(self) -> str:
-        """The adapter as the user named it."""
+        """Name of the adapter as given by the user."""
         return self._name
 
     def send(self, frame: Frame) -> None:
-        """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`. Of a remote
-        frame the data are as long as the answer that it asks for.
+        """Pass a frame to the adapter; wait up to `SEND_LIMIT_S` for room in a full queue. The data
+        of a remote frame give the length of the requested answer.
 
-        A controller that is known to be bus-off is an error at once: its driver may take frames
-        all the same, and lose them.
+        Raises BusError at once if the controller is bus-off: its driver may still accept frames,
+        and lose them.
         """
         give_up_at: float | None = None
         if self._health.state is ControllerState.BUS_OFF:
             raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
         while True:
-            # A back end may alter a message: never the same object twice.
+            # A back end may modify a message: never pass the same object twice.
             message = _message_of(frame)
             try:
                 self._send_raw(message, **self._send_options)
@@ -230,12 +231,12 @@ class CanLink:
                 self._pause()
             else:
                 self._health.sent += 1
-                sent = frame._replace(data=b"") if frame[3] else frame  # as it comes back
+                sent = frame._replace(data=b"") if frame[3] else frame  # as its echo
                 self._echoes.sent(sent)
                 return
 
     def receive(self, deadline: float) -> Frame | None:
-        """The next frame, or None at `deadline` (monotonic clock)."""
+        """Return the next frame, or None at `deadline` (monotonic clock)."""
         if self._waiting:
             waited, self.received_at = self._waiting.popleft()
             return waited
@@ -246,13 +247,13 @@ class CanLink:
                     return frame
             return None
         frame = self._receive_once(max(0.0, deadline - time.perf_counter()))
-        # A filtered or foreign frame ends a wait early.
+        # A filtered or foreign frame ends the wait early.
         while frame is None and (remaining_s := deadline - time.perf_counter()) > 0:
             frame = self._receive_once(remaining_s)
         return frame
 
     def drain(self) -> int:
-        """Throw away what is waiting, bounded on a babbling bus."""
+        """Discard waiting frames, with a limit for a babbling bus."""
         count = len(self._waiting)
         self._waiting.clear()
         while count < _DRAIN_FRAMES and self.receive(AT_ONCE) is not None:
@@ -260,7 +261,7 @@ class CanLink:
         return count
 
     def close(self) -> None:
-        """Shut the adapter down; a failure to do so is of no interest any more."""
+        """Shut the adapter down, ignoring failures."""
         self._shut_down()
         self._give_back()
 
@@ -269,15 +270,16 @@ class CanLink:
             with contextlib.suppress(Exception):
                 self._bus.shutdown()
         if self._port is not None:
-            # A back end that fails leaves it open, and Linux gives the adapter that is plugged in
-            # again another name then.
+            # A failing back end leaves it open; Linux then renames the adapter when it is plugged
+            # in again.
             with contextlib.suppress(Exception):
                 self._port.close()
 
     def reopen(self) -> None:
-        """Close the adapter and open it again as it was. Raises BusError while it is not back.
+        """Close the adapter and open it again with the same settings. Raises BusError while it is
+        not back.
 
-        Frames that were waiting are gone, and the health begins anew.
+        Waiting frames are lost, and the health is reset.
         """
         if self._open_again is None:
             raise BusError(
@@ -292,16 +294,16 @@ class CanLink:
 
     @property
     def is_off(self) -> bool:
-        """True while the adapter is bus-off by its own report."""
+        """True while the adapter reports bus-off."""
         return self._health.state is ControllerState.BUS_OFF
 
     @property
     def is_physical(self) -> bool:
-        """True unless the bus is known to exist in computers alone."""
+        """True unless the bus is known to be virtual."""
         return is_physical(self._interface, self._channel)
 
     def health(self) -> LinkHealth:
-        """What is known of the adapter and its bus. Sends nothing; takes up to 2 s on SocketCAN."""
+        """Return the health of adapter and bus. Sends nothing; takes up to 2 s on SocketCAN."""
         if self._interface == "socketcan":
             seen = read_interface(self._channel)
             if isinstance(seen, Interface):
@@ -309,12 +311,12 @@ class CanLink:
         return self._health.health(_asked_state(self._bus, self._interface))
 
     def _is_more_waiting(self) -> bool:
-        """True when a receive that returned no frame does not mean that none is waiting."""
+        """True if frames may be waiting although the last receive returned none."""
         if self._was_passed_over or self._port is None:
             return self._was_passed_over
-        try:  # a serial back end returns for each line, whatever it is
+        try:  # a serial back end returns after each line
             return bool(self._port.in_waiting)
-        except Exception:  # noqa: BLE001  the next receive reports what is wrong with the port
+        except Exception:  # noqa: BLE001  the next receive reports the failure
             return False
 
     def _receive_once(self, timeout_s: float) -> Frame | None:
@@ -339,7 +341,7 @@ class CanLink:
             self.received_at = _moment_of(message)
         if frame[0] in self._echoes.ids:
             frame = self._echoes.mark(frame, message.timestamp, is_rx=message.is_rx)
-        # What filters hide was received all the same; what an adapter reports passes them.
+        # Filtered frames count as received; error frames pass the filters.
         if message.is_error_frame:
             self._health.hear(frame)
             return frame
@@ -350,7 +352,7 @@ class CanLink:
         return frame if is_wanted else None
 
     def _judge(self, error: Exception) -> None:
-        """Return if the adapter works on after this error in receiving, else raise BusError."""
+        """Return if the adapter still works after this receive error, else raise BusError."""
         meaning = meaning_in_receiving(error, self._interface)
         self._was_passed_over = meaning is Meaning.UNREADABLE
         if isinstance(meaning, BusTrouble):
@@ -363,19 +365,19 @@ class CanLink:
             if self._unreadable_in_a_row > _UNREADABLE_LIMIT:
                 raise self._failure("receiving", error, meaning) from error
             if any(isinstance(each, UnicodeDecodeError) for each in causes(error)):
-                # slcan keeps a line that is no text, and trips over it again.
+                # slcan keeps a line that is not text, and fails on it again.
                 with contextlib.suppress(Exception):
                     self._bus.flush()  # type: ignore[union-attr]
         else:
             raise self._failure("receiving", error, meaning) from error
 
     def _check_haste(self, began: float, timeout_s: float) -> None:
-        """Raise BusError when a back end has kept returning nothing without waiting for it."""
+        """Raise BusError if the back end keeps returning nothing without waiting."""
         now = time.perf_counter()
         if timeout_s < _WAIT_MIN_S:
             return
         if now - began > _HASTE_S:
-            # A computer that is busy makes every call slow.
+            # A busy computer makes every call slow.
             self._hasty = 0 if now - began > _WAIT_MIN_S / 2 else self._hasty
             return
         if not self._hasty:
@@ -386,7 +388,7 @@ class CanLink:
             raise self._failure("receiving", gone, Meaning.LOST)
 
     def _pause(self) -> None:
-        """Wait for room in the transmit queue, and lose nothing that arrives meanwhile."""
+        """Wait for room in the transmit queue, and keep frames that arrive meanwhile."""
         frame = self._receive_once(_FULL_QUEUE_PAUSE_S)
         if frame is not None:
             self._waiting.append((frame, self.received_at))
@@ -411,33 +413,33 @@ class CanLink:
         return TransmitBlockedError(
             f"The adapter took no frame for {SEND_LIMIT_S:g} s: {words_of(error)}.",
             where=str(self),
-            cause="nobody on the bus acknowledges (device off, wrong bit rate, wiring, "
+            cause="no node on the bus acknowledges (device off, wrong bit rate, wiring, "
             "termination), or other traffic takes the whole bus",
             remedy="Check that the device has power and that the bit rate is right.",
         )
 
 
 def _moment_of(message: can.Message) -> float | None:
-    """The kernel's stamp on the monotonic clock, by how long ago it was."""
+    """Convert the kernel's time stamp to the monotonic clock."""
     age_s = time.time() - message.timestamp
     return time.perf_counter() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
 
 def _no_bus(*_arguments: object, **_options: object) -> NoReturn:
-    """What sending and receiving come to while an adapter is gone."""
+    """Send or receive while the adapter is gone."""
     raise can.CanOperationError("it is not open")
 
 
 def _asked_state(bus: can.BusABC | None, interface: str) -> ControllerState:
-    """What a back end says when asked. python-can's own `state` is a constant, and PCAN's is the
-    mode that was set; only ERROR is told by those that override it.
+    """Ask a back end for its state. python-can's default `state` is constant, and PCAN's is the
+    configured mode; only overrides report ERROR.
     """
     try:
         if interface == "pcan":
             return _pcan_state(int(bus.status()))  # type: ignore[union-attr]
         if bus is not None and bus.state is can.BusState.ERROR:
             return ControllerState.BUS_OFF
-    except Exception:  # noqa: BLE001  a vendor's library; the question is no reason to fail
+    except Exception:  # noqa: BLE001  a vendor's library; this query must not fail
         return ControllerState.UNKNOWN
     return ControllerState.UNKNOWN
 
@@ -451,8 +453,8 @@ def _pcan_state(status: int) -> ControllerState:
 
 
 def _frame_of(message: can.Message) -> Frame:
-    """The frame that a message is; it may have more data than it says. Raises whatever a message
-    leads to that is none: of a damaged line slcan makes ids and lengths that no frame has.
+    """Convert a message to a frame; extra data are cut off. Raises for an invalid message: slcan
+    makes impossible ids and lengths from a damaged line.
     """
     can_id, is_extended, data = message.arbitration_id, message.is_extended_id, message.data
     if message.is_error_frame:
@@ -468,7 +470,7 @@ def _frame_of(message: can.Message) -> Frame:
 
 
 def _message_of(frame: Frame) -> can.Message:
-    """The frame as python-can sends it."""
+    """Convert a frame to a message for python-can."""
     can_id, data, is_extended, is_remote = frame[:4]
     if is_remote:
         return can.Message(

@@ -1,7 +1,7 @@
-"""What exceptions of python-can's back ends mean: a damaged frame, a full queue, a lost adapter.
+"""Classifies exceptions of python-can's back ends: damaged frame, full queue, lost adapter.
 
-A back end may raise anything: its own CanError, what a serial port or a USB library raises, and
-whatever its parser trips over. `tests/bus/test_back_ends.py` has the table of what each can raise.
+A back end may raise anything: its own CanError, exceptions of serial ports and USB libraries, and
+errors of its parser. `tests/bus/test_back_ends.py` tabulates them.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from flasher.python_can import can
 
 
 class Meaning(Enum):
-    """What an exception of a back end says about its adapter."""
+    """Meaning of a back end's exception."""
 
     UNREADABLE = auto()
-    """What came cannot be read as a frame; the adapter works."""
+    """The input is not a frame; the adapter works."""
     QUEUE_FULL = auto()
     BUS_OFF = auto()
     LOST = auto()
-    """The adapter or its driver does not work any more."""
+    """The adapter or its driver no longer works."""
 
 
 SERIAL_PORTS: Final[Mapping[str, str]] = {
@@ -34,14 +34,14 @@ SERIAL_PORTS: Final[Mapping[str, str]] = {
     "serial": "_ser",
     "slcan": "serialPortOrig",
 }
-"""The attribute of a back end that is its serial port, of pyserial."""
+"""Attribute of each back end that is its pyserial port."""
 TAKES_SEND_TIMEOUT: Final = frozenset({"nixnet", "robotell", "slcan"})
-"""Back ends that wait for room for ever unless `send` is given a timeout. Others wait for something
-else then, or ignore it."""
+"""Back ends that wait forever for room unless `send` gets a timeout. Others use it for something
+else or ignore it."""
 SILENT_WHEN_GONE: Final = frozenset({"gs_usb", "seeedstudio", "socketcand"})
-"""Back ends that take the error of a lost adapter for silence, and return without waiting."""
+"""Back ends that mistake a lost adapter for silence, and return without waiting."""
 _LOSES_ITS_PLACE: Final = frozenset({"socketcand"})
-"""Back ends that cannot be used after an error: what they tripped over stays in their buffer."""
+"""Back ends that are unusable after an error: the bad input stays in their buffer."""
 
 _QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
     "iscan": frozenset({7}),  # device is transmitting a message
@@ -52,13 +52,13 @@ _QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
     "usb2can": frozenset({9, 21, 32}),  # FIFO_FULL, TRM_FULL, TIMEOUT
     "vector": frozenset({11}),  # XL_ERR_QUEUE_IS_FULL
 }
-"""Codes of the drivers, which python-can hands on."""
+"""Error codes of the drivers, passed on by python-can."""
 _QUEUE_FULL_TEXT: Final = re.compile(
     r"(transmit|send|tx|xmt|write)[ _-]?(queue|buffer|fifo)?.*\b(full|overflow)"
     r"|TXQUEUE_FULL|XMTFULL",
     re.IGNORECASE,
 )
-"""What others say in words (PCAN, IXXAT, NI-CAN, and SocketCAN's own "Transmit buffer full")."""
+"""Messages of other back ends (PCAN, IXXAT, NI-CAN, and SocketCAN's own "Transmit buffer full")."""
 _BUS_OFF_CODES: Final[Mapping[str, int]] = {"iscan": 17, "usb2can": 2}
 _BUS_OFF_TEXT: Final = re.compile(r"bus[ _-]?off", re.IGNORECASE)
 _REPORT_CODES: Final[Mapping[str, Mapping[int, TroubleKind]]] = {
@@ -87,14 +87,14 @@ _REPORT_TEXTS: Final = (
     (re.compile(r"warning limit", re.IGNORECASE), TroubleKind.WARNING),
     (re.compile(r"overrun|read too late", re.IGNORECASE), TroubleKind.OTHER),
 )
-"""Of PCAN and IXXAT, whose exceptions bear no code."""
+"""Of PCAN and IXXAT, whose exceptions have no code."""
 _UNREADABLE_TEXT: Final = re.compile(r"invalid delimiter|could not unpack|out of range")
-"""Damaged frames that a back end refuses by a CanError of its own (serial, udp_multicast)."""
+"""Damaged frames that a back end reports by its own CanError (serial, udp_multicast)."""
 _FOREIGN_DATAGRAM: Final = "could not unpack"
 
 
 def meaning_in_sending(error: Exception, interface: str) -> Meaning:
-    """What an exception of the back end `interface` means that its `send` raised."""
+    """Classify an exception raised by `send` of the back end `interface`."""
     chain = list(causes(error))
     if _is_bus_off(chain, interface):
         return Meaning.BUS_OFF
@@ -107,8 +107,8 @@ def meaning_in_sending(error: Exception, interface: str) -> Meaning:
 
 
 def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTrouble:
-    """What an exception means that its `recv` raised; the trouble where the controller reports
-    trouble on the bus by it, and the adapter works.
+    """Classify an exception raised by `recv`; return the trouble if the controller reports trouble
+    on the bus and the adapter works.
     """
     chain = list(causes(error))
     if _is_bus_off(chain, interface):
@@ -124,13 +124,15 @@ def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTroub
 
 
 def is_foreign_datagram(error: Exception) -> bool:
-    """Something else than a CAN frame on udp_multicast's port, which anybody may send to."""
+    """True for a datagram on udp_multicast's port that is not a CAN frame; any program may send
+    one.
+    """
     return _FOREIGN_DATAGRAM in str(error)
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """The exception and those that it was raised from: back ends wrap what matters. What flasher
-    was doing when it was raised is none of them.
+    """Yield the exception and those that it was raised from, because back ends wrap the relevant
+    one. Exceptions of flasher are excluded.
     """
     found: BaseException | None = error
     while found is not None and not isinstance(found, FlasherError):
@@ -139,7 +141,7 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def words_of(error: BaseException) -> str:
-    """What the back end said, without a full stop, or the kind of error when it said nothing."""
+    """Message of the back end without a full stop, or the type of the error if it is empty."""
     said: list[str] = []
     for each in causes(error):
         words = str(each).strip().rstrip(".!")
@@ -171,8 +173,6 @@ def _reported_trouble(chain: list[BaseException], interface: str) -> TroubleKind
 
 
 def _is_timeout(error: BaseException) -> bool:
-    """Nothing was taken for as long as the back end waits: what pyserial and pyusb raise then is
-    no TimeoutError.
-    """
+    """True for a timeout of the back end; those of pyserial and pyusb are not TimeoutErrors."""
     is_named_so = type(error).__name__ in ("SerialTimeoutException", "USBTimeoutError")
     return is_named_so or isinstance(error, TimeoutError)

@@ -1,8 +1,8 @@
-"""The one bit rate of a bus: what is said, recorded and opened, and where it comes from.
+"""Bit rate of a bus: the one value that is shown, recorded and opened, with its source.
 
-A wrong bit rate disturbs a live bus. So the dialect's holds, unless an option names another one;
-what a variable, a configuration file or the kernel says besides is compared, and refused where it
-differs.
+A wrong bit rate disturbs a live bus. The dialect's applies unless an option names another one.
+Values from variables, configuration files or the kernel are compared with it, and refused if they
+differ.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ LOWEST_BPS: Final = 5_000
 HIGHEST_BPS: Final = 1_000_000
 """Of classic CAN."""
 _TOLERANCE: Final = 0.005
-"""A kernel that reaches a bit rate with its own clock tells the one that it reaches."""
+"""The kernel reports the rate that its clock can reach."""
 _NAMES: Final = ("timing", "bitrate", "nom_tseg1", "tseg1")
-"""What decides the bit rate in a configuration; python-can makes a timing of the last two."""
+"""Keywords that determine the bit rate; python-can converts the last two to a timing."""
 DECIDING: Final = frozenset(
     {
         "timing", "f_clock", "f_clock_mhz", "brp", "tseg1", "tseg2", "sjw", "nof_samples",
         "nom_brp", "nom_tseg1", "nom_tseg2", "nom_sjw", "btr0", "btr1", "bitrate",
     }
 )  # fmt: skip
-"""All keywords of back ends that set it, or a part of it."""
+"""All keywords of back ends that set the bit rate or part of it."""
 _BY_OPTION: Final = {"bitrate": "-b", "timing": "--timing"}
 
 
 @dataclass(frozen=True)
 class BitRate:
-    """A bit rate in bit/s, and where it comes from, in words."""
+    """Bit rate in bit/s, and its source in words."""
 
     bps: int
     source: str
@@ -53,12 +53,11 @@ def bit_rate(
     merged: Mapping[str, Any],
     fallback: Fallback | None = None,
 ) -> BitRate:
-    """The bit rate that a bus has, or is opened with.
+    """Return the bit rate that a bus has, or is opened with.
 
-    `given` are the options, `merged` what they come to with python-can's variables and files, and
-    with the `fallback`.
-    Raises UsageError for a value that is no bit rate, BusError when the bit rate is not the
-    dialect's and no option says so, or when the kernel has set a SocketCAN interface otherwise.
+    `given` are the options, `merged` is their combination with python-can's variables and files and
+    with the `fallback`. Raises UsageError for an invalid bit rate; BusError if it is not the
+    dialect's and no option chose it, or if the kernel has set a SocketCAN interface differently.
     """
     named = named_bit_rate(given, merged, fallback)
     wanted = BitRate(dialect_bps, "the dialect's") if named is None else named
@@ -75,8 +74,8 @@ def bit_rate(
 def named_bit_rate(
     given: Mapping[str, Any], merged: Mapping[str, Any], fallback: Fallback | None = None
 ) -> BitRate | None:
-    """The bit rate that an option, a variable or a file names; None where none does. Raises
-    UsageError for a value that is no bit rate.
+    """Return the bit rate named by an option, a variable or a file; None without one. Raises
+    UsageError for an invalid one.
     """
     name = next((each for each in ("timing", "bitrate") if each in merged), None)
     if name is None:
@@ -89,7 +88,7 @@ def named_bit_rate(
         value = int(value)
     if type(value) is not int or not LOWEST_BPS <= value <= HIGHEST_BPS:
         raise UsageError(
-            f"{printable(str(value))} is no bit rate in bit/s.",
+            f"{printable(str(value))} is not a bit rate in bit/s.",
             where=source,
             remedy=f"Give one from {LOWEST_BPS} to {HIGHEST_BPS}, as 250000; without one the "
             "dialect's holds.",
@@ -115,9 +114,7 @@ def _configured_by(fallback: Fallback | None) -> str:
 
 
 def _of_kernel(merged: Mapping[str, Any]) -> BitRate | None:
-    """The bit rate that the kernel has set a SocketCAN interface to; None where it has, or tells,
-    none.
-    """
+    """Return the bit rate of a SocketCAN interface as set in the kernel; None if unknown."""
     channel = merged.get("channel")
     if merged.get("interface") != "socketcan" or not channel:
         return None
@@ -138,7 +135,7 @@ def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) ->
     raise BusError(
         f"The bit rate would be {found}, not {wanted}: nothing was opened.",
         where=f"interface {merged.get('interface')}, channel {merged.get('channel')}",
-        cause="another bit rate than that of the bus disturbs everybody on it",
+        cause="a wrong bit rate disturbs every node on the bus",
         remedy=f"If the bus runs at {wanted.bps} bit/s: {change}. If it runs at {found.bps}: "
         f"-b {found.bps}.",
         code=ErrorCode.OTHER_BIT_RATE,

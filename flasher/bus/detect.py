@@ -1,9 +1,8 @@
-"""Which adapters there are: what python-can's back ends detect, the kernel's CAN interfaces, and
-serial ports behind which one may be.
+"""Adapter detection: python-can's back ends, CAN interfaces of the kernel, and serial ports.
 
-Vendors' libraries hang, print and crash: they do it in another process, `python -m
-flasher.bus.detect NAME...`, which is ended in time. It asks every back end in a thread of its own,
-and says each answer at once.
+Vendors' libraries hang, print and crash, so they run in another process, `python -m
+flasher.bus.detect NAME...`, with a time limit. It asks every back end in its own thread, and prints
+each answer at once.
 """
 
 from __future__ import annotations
@@ -25,25 +24,25 @@ from typing import Any, Final
 from flasher.bus.inspect_interface import SYSFS, look_up
 
 LIMIT_S: Final = 4.5
-"""For everything together. The slowest honest back end (socketcand) listens for 4 s."""
+"""Total time limit. The slowest correct back end (socketcand) listens for 4 s."""
 _NOT_LOADED: Final = "not_loaded"
 _CANNOT_TELL: Final = "cannot_tell"
 _MARK: Final = "detected: "
-"""Begins the lines that are answers: vendors' libraries print too."""
+"""Prefix of answer lines: vendors' libraries print too."""
 _LIFE_S: Final = 30.0
-"""A process whose parent was killed ends itself after this."""
+"""A process whose parent was killed ends after this time."""
 _SLICE_S: Final = 0.2
-"""Between two looks whether the user wants to stop."""
+"""Interval of checks for cancellation."""
 _COMMAND: Final = (sys.executable, "-m", "flasher.bus.detect")
 BUILT_IN: Final = frozenset({"virtual", "udp_multicast"})
-"""Interfaces that are always there and reach no adapter."""
+"""Interfaces that always exist and reach no adapter."""
 SOCKETCAN: Final = "socketcan"
 SLOW: Final = frozenset({"socketcand"})
 """Back ends that wait for servers on the network."""
 SERIAL_PORTS: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
-"""Back ends that open a serial port. What is behind a port, only opening it would tell."""
+"""Back ends that open a serial port. Only opening a port would show what is connected to it."""
 _SERIAL_KEYS: Final = ("serial_number", "serial", "unique_hardware_id", "hw_serial", "hwid")
-"""Where back ends put an adapter's serial number."""
+"""Keys of the back ends for an adapter's serial number."""
 _USB_PATH: Final = "usb_path"
 _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
     "ixxat": ("unique_hardware_id",),
@@ -52,37 +51,37 @@ _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
     "systec": ("device_number",),
     "vector": ("channel_index",),
 }
-"""What a back end needs besides the channel to open this adapter and no other."""
+"""Keys besides the channel that a back end needs to open this adapter."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """An adapter that is plugged in, and what its back end tells about it."""
+    """Connected adapter, as reported by its back end."""
 
     interface: str
     channel: str
-    """Empty where the back end does not tell."""
+    """Empty if not reported."""
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def serial_number(self) -> str:
-        """Empty when not told."""
+        """Empty if not reported."""
         return next((str(self.details[key]) for key in _SERIAL_KEYS if self.details.get(key)), "")
 
     @property
     def usb_path(self) -> str:
-        """Its place on the USB, as "1-1.4"; empty when not told."""
+        """USB path such as "1-1.4"; empty if not reported."""
         return str(self.details.get(_USB_PATH, ""))
 
     @property
     def bus_kwargs(self) -> dict[str, Any]:
-        """The keywords besides interface and channel that choose it."""
+        """Keywords besides interface and channel that choose it."""
         names = _CHOOSING.get(self.interface, ())
         return {name: self.details[name] for name in names if name in self.details}
 
     @property
     def words(self) -> list[str]:
-        """The words that choose it on the command line."""
+        """Arguments that choose it on the command line."""
         words = ["-i", self.interface, "-c", self.channel or "CHANNEL"]
         for key, value in self.bus_kwargs.items():
             words += ["--bus-kwargs", f"{key}={value}"]
@@ -90,29 +89,29 @@ class Found:
 
     @property
     def arguments(self) -> str:
-        """The same as a shell takes it."""
+        """The same, quoted for a shell."""
         return shlex.join(self.words)
 
 
 @dataclass
 class Detected:
-    """What was found, and the back ends of which nothing is known."""
+    """Adapters found, and back ends without a result."""
 
     found: list[Found] = field(default_factory=list)
     hung: list[str] = field(default_factory=list)
-    """They did not answer in time."""
+    """Did not answer in time."""
     failed: dict[str, str] = field(default_factory=dict)
-    """They failed or crashed, with what they said."""
+    """Failed or crashed, with their message."""
     not_loaded: list[str] = field(default_factory=list)
-    """Their package is missing, or they are for another operating system."""
+    """Package missing, or for another operating system."""
     cannot_tell: list[str] = field(default_factory=list)
-    """They have no way to list their adapters."""
+    """Cannot list their adapters."""
 
 
 class Detection:
-    """Begins to look at once, in other processes, so that something else can be done meanwhile.
+    """Starts the detection at once, in other processes.
 
-    `collect` ends them. Use it as a context manager: whatever happens, no process is left.
+    `collect` ends them. Use it as a context manager, so that no process is left.
     """
 
     def __init__(
@@ -138,8 +137,8 @@ class Detection:
         self._end()
 
     def collect(self, cancelled: Callable[[], bool] = lambda: False) -> Detected:
-        """What was found. Waits for the rest of the time at the most, or until `cancelled` says so;
-        it is asked five times a second.
+        """Return the result; waits at most for the rest of the time, or until `cancelled` (checked
+        five times a second).
         """
         self._cancelled = cancelled
         detected = Detected()
@@ -148,7 +147,7 @@ class Detection:
         unanswered = set(self._names)
         crashed = self._gather(detected, unanswered)
         if crashed and unanswered and not self._cancelled():
-            # One of them took the others with it: each on its own, in the time that is left.
+            # A crash ended the others too: run each one alone in the remaining time.
             self._processes = [self._start([name]) for name in sorted(unanswered)]
             self._gather(detected, unanswered)
         detected.hung = sorted(unanswered - set(detected.failed))
@@ -163,11 +162,11 @@ class Detection:
             stderr=subprocess.DEVNULL,
             text=True,
             errors="replace",
-            start_new_session=True,  # Ctrl-C is for us: we end them
+            start_new_session=True,  # Ctrl-C is for this process, which ends them
         )
 
     def _gather(self, detected: Detected, unanswered: set[str]) -> bool:
-        """Take the answers of all processes; True when one ended without having answered."""
+        """Collect the answers of all processes; True if one ended without answering."""
         crashed = False
         for names, process in self._processes:
             said, is_over = self._wait_for(process)
@@ -181,7 +180,7 @@ class Detection:
         return crashed
 
     def _wait_for(self, process: subprocess.Popen[str]) -> tuple[str, bool]:
-        """What a process said, and whether it ended by itself; else it is ended."""
+        """Return the output of a process, and whether it ended by itself; else it is killed."""
         while True:
             remaining_s = max(self._ends_at - time.perf_counter(), 0.01)
             try:
@@ -223,38 +222,38 @@ def _take(said: str, detected: Detected, unanswered: set[str]) -> None:
 
 
 def network_adapters(sysfs: Path = SYSFS) -> Iterator[Found]:
-    """CAN interfaces of Linux, up or down, with what their USB device says."""
+    """Yield the CAN interfaces of Linux, up or down, with data of their USB device."""
     for folder in sorted(sysfs.glob("*")):
         if not getattr(look_up(folder.name, sysfs=sysfs), "is_can", False):
             continue
         device = (folder / "device").resolve()
-        # The link leads to the USB interface; the device is above it.
+        # The link leads to the USB interface; its parent is the device.
         serial = _text(device.parent / "serial") or _text(device / "serial")
         is_usb = (device.parent / "serial").exists() or (
             ":" in device.name and (device.parent / "idVendor").exists()
         )
         usb_path = device.name.partition(":")[0] if is_usb else ""
-        yield Found(SOCKETCAN, folder.name, _told(serial_number=serial, usb_path=usb_path))
+        yield Found(SOCKETCAN, folder.name, _without_empty(serial_number=serial, usb_path=usb_path))
 
 
 def serial_ports(interface: str) -> Iterator[Found]:
-    """Serial ports on the USB, each as an adapter of one of `SERIAL_PORTS`, which it may or may
-    not be. Others hardly have one behind them: computers have ports of their own (ttyS0, COM1).
+    """Yield the serial ports on USB, each as a possible adapter of one of `SERIAL_PORTS`. Built-in
+    ports (ttyS0, COM1) are skipped.
 
-    Raises ImportError where pyserial is missing.
+    Raises ImportError if pyserial is missing.
     """
     ports: Any = importlib.import_module("serial.tools.list_ports")
     for port in ports.comports():
         if port.vid is None:
             continue
         description = "" if port.description in (None, "n/a", port.device) else port.description
-        details = _told(
+        details = _without_empty(
             description=description, serial_number=port.serial_number, usb_path=port.location
         )
         yield Found(interface, port.device, details)
 
 
-def _told(**details: str | None) -> dict[str, str]:
+def _without_empty(**details: str | None) -> dict[str, str]:
     return {key: value for key, value in details.items() if value}
 
 
@@ -269,7 +268,7 @@ def _text(path: Path) -> str:
 
 
 def say_detected(names: Sequence[str]) -> None:
-    """Ask these interfaces and say what they answer, a line each."""
+    """Ask these interfaces and print their answers, one per line."""
     threads = [threading.Thread(target=_ask, args=(name,), daemon=True) for name in names]
     for thread in threads:
         thread.start()
@@ -304,7 +303,7 @@ def _sees(name: str) -> str:
 
 
 def _simple(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What JSON holds of a configuration: some have objects of their library in it."""
+    """Values of a configuration that JSON can hold: some contain objects of a library."""
     return {
         key: value
         for key, value in config.items()

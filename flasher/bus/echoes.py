@@ -1,9 +1,9 @@
-"""Own frames that come back: recognises the echoes that an adapter gives of what it sent.
+"""Recognises echoes: frames that an adapter returns after sending them.
 
-A link marks them once, as `Frame.is_echo`, and nothing else has to recognise them again. How late
-an echo is read proves nothing: this computer may have stalled meanwhile. An echo is recognised by
-the back end's own flag where that means this handle, else by content and order. Echoes may be
-missing, a few frames out of order, or come twice (a network with two ways).
+A link marks them as `Frame.is_echo`, so that nothing else has to recognise them. The delay of an
+echo proves nothing, because this computer may have stalled. An echo is recognised by the back end's
+flag if that identifies this handle, else by content and order. Echoes may be missing, slightly out
+of order, or doubled (a network with two paths).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Final
 from flasher.protocol.frame import Frame
 
 ECHO_FRAMES: Final = 1024
-"""Frames that may be on their way at once: 57 packets, of which the host sends one at a time."""
+"""Maximum number of frames without echo: 57 packets; the host sends one at a time."""
 REORDER_FRAMES: Final = 64
-"""How far an echo may be behind a later one: three packets and a half."""
+"""Maximum delay of an echo after a later one: three packets and a half."""
 DOUBLE_LIMIT_S: Final = 0.1
-"""The time stamps of two copies of an echo differ by at most this."""
+"""Maximum difference of the time stamps of two copies of an echo."""
 
 
 class Sender(Enum):
-    """Who sent a frame that python-can flags as transmitted (`is_rx` False)."""
+    """Sender of a frame that python-can flags as transmitted (`is_rx` False)."""
 
     THIS_HANDLE = "this handle"
     THIS_COMPUTER = "any program on this computer"
@@ -43,44 +43,44 @@ FLAGGED_SENDER: Final[Mapping[str, Sender]] = {
     "pcan": Sender.UNKNOWN,  # several programs may share a channel
     "vector": Sender.UNKNOWN,  # several programs may share a channel
 }
-"""For each interface of python-can 4.6 that sets the flag at all."""
+"""Interfaces of python-can 4.6 that set the flag."""
 
 
 class Echoes:
-    """Remembers what was sent through a link, and marks it when it comes back.
+    """Remembers frames sent through a link, and marks their echoes.
 
-    `gives_own` is False where the handle is known to receive nothing of what it sends itself (a
-    SocketCAN socket unless asked to): what looks like an echo there has another sender.
+    `gives_own` is False if the handle never receives its own frames (a SocketCAN socket by
+    default): an apparent echo then has another sender.
     """
 
     def __init__(self, flagged: Sender = Sender.UNKNOWN, *, gives_own: bool = True) -> None:
         self.ids: set[int] = set()
-        """CAN ids that were sent on."""
+        """CAN ids of frames sent."""
         self._flagged = flagged
         self._gives_own = gives_own
         self._expected: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Frames whose echo has not been seen, oldest first."""
+        """Frames without echo so far, oldest first."""
         self._unreturned: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Frames that this handle sent and is not going to receive."""
+        """Frames sent that this handle will not receive."""
         self._echoed: dict[Frame, float] = {}
-        """The last echoes that were seen, each with its time stamp."""
+        """Last echoes, with their time stamps."""
 
     def sent(self, frame: Frame) -> None:
-        """Note a frame that was handed to the adapter."""
+        """Note a frame passed to the adapter."""
         (self._expected if self._gives_own else self._unreturned).append(frame)
         self.ids.add(frame[0])
 
     def reopened(self) -> None:
-        """Note that the link has a new handle: frames that a driver's queue still held are sent
-        later, and the new handle receives them.
+        """Note that the link has a new handle: it receives frames that the driver's queue still
+        contained.
         """
         self._expected.extend(self._unreturned)
         self._unreturned.clear()
 
     def mark(self, frame: Frame, stamp_s: float, *, is_rx: bool) -> Frame:
-        """Return a received frame, marked if it is the echo of a sent frame or a second copy.
+        """Return a received frame, marked if it is an echo or a second copy of one.
 
-        `stamp_s` is the frame's time stamp in seconds on the adapter's own clock, `is_rx` the back
+        `stamp_s` is the frame's time stamp in seconds on the adapter's clock, `is_rx` the back
         end's flag.
         """
         if frame[0] not in self.ids:

@@ -1,4 +1,4 @@
-"""The bus as a file of settings names it: the last of the places that do."""
+"""Bus settings from a settings file, used if nothing else names them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Fallback:
-    """python-can's keywords for one adapter. Each holds where no option, variable or file of
-    python-can's has it; none of them, where these name an adapter of another interface.
+    """python-can's keywords for one adapter. Each applies unless an option, a variable or a file of
+    python-can sets it; none applies if these name another interface.
     """
 
     bus: Mapping[str, Any]
     source: str
-    """The file, safe to show."""
+    """Name of the file, escaped."""

@@ -1,8 +1,8 @@
-"""What an adapter tells about its bus: error frames decoded, and the health of a link.
+"""Health of a link: decoded error frames and counters.
 
-An error frame is no frame of the wire: the driver makes it up to report trouble. Drivers lay it out
-in two ways that are documented (Linux's error.h, PCAN-Basic); of any other it is only known that
-something went wrong.
+An error frame is not on the wire: the driver creates it to report trouble. Two formats are
+documented (Linux's error.h, PCAN-Basic); in any other, an error frame only means that something
+went wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flasher.protocol.frame import Frame
 
 
 class TroubleKind(Enum):
-    """What an error frame reports, the worst first."""
+    """Content of an error frame, the worst first."""
 
     BUS_OFF = "bus_off"
     RESTARTED = "restarted"
@@ -29,23 +29,23 @@ class TroubleKind(Enum):
 
 @dataclass(frozen=True)
 class BusTrouble:
-    """One error frame in words. Counters are those of the controller, None when not told."""
+    """Decoded error frame. Counters are those of the controller; None if not reported."""
 
     kinds: frozenset[TroubleKind]
     words: str
     tx_errors: int | None = None
     rx_errors: int | None = None
     is_active_again: bool = False
-    """True when the controller reports that it takes part normally again."""
+    """The controller reports that it participates normally again."""
 
     @property
     def kind(self) -> TroubleKind:
-        """The worst of what it reports."""
+        """The worst kind reported."""
         return next(kind for kind in TroubleKind if kind in self.kinds)
 
 
 class Layout(Enum):
-    """How a back end lays out its error frames."""
+    """Format of a back end's error frames."""
 
     SOCKETCAN = "socketcan"
     PCAN = "pcan"
@@ -58,7 +58,7 @@ LAYOUTS: Final[Mapping[str, Layout]] = {
     "socketcand": Layout.SOCKETCAN,  # the class in the id, no data
     "pcan": Layout.PCAN,
 }
-"""By python-can's name of the interface; every other one has none that is documented."""
+"""By python-can's name of the interface; other formats are not documented."""
 
 # -- Linux, include/uapi/linux/can/error.h --------------------------------------------------------
 
@@ -76,7 +76,8 @@ _WARNING_BITS: Final = 0x04 | 0x08
 _PASSIVE_BITS: Final = 0x10 | 0x20
 _ACTIVE_BIT: Final = 0x40
 _ACK_SLOT: Final = 0x19
-"""Place of an error in the frame: the acknowledge slot. Both layouts use the SJA1000's numbers."""
+"""Position of an error in the frame: the acknowledge slot. Both formats use the SJA1000's
+numbers."""
 _CLASSES: Final = (
     (_TX_TIMEOUT, TroubleKind.OTHER, "the driver's transmission timed out"),
     (_LOST_ARBITRATION, TroubleKind.OTHER, "arbitration lost"),
@@ -104,18 +105,18 @@ _VIOLATIONS: Final = (
 )
 _ERROR_FRAME_SIZE: Final = 8
 WARNING_LIMIT: Final = 96
-"""Error counter from which a controller warns."""
+"""Error counter at which a controller warns."""
 PASSIVE_LIMIT: Final = 128
-"""Error counter from which a controller is error-passive."""
+"""Error counter at which a controller becomes error-passive."""
 
 
 def decode_error_frame(frame: Frame, layout: Layout = Layout.SOCKETCAN) -> BusTrouble:
-    """What an error frame reports. Never raises, whatever its data."""
+    """Decode an error frame. Never raises."""
     if layout is Layout.SOCKETCAN:
         return _decode_socketcan(frame.can_id, frame.data.ljust(_ERROR_FRAME_SIZE, b"\0"))
     if layout is Layout.PCAN:
         return _decode_pcan(frame.can_id, frame.data.ljust(_ERROR_FRAME_SIZE, b"\0"))
-    return BusTrouble(frozenset({TroubleKind.OTHER}), "an error frame that says no more")
+    return BusTrouble(frozenset({TroubleKind.OTHER}), "an error frame without details")
 
 
 def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
@@ -129,14 +130,16 @@ def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
     is_active_again = bool(classes & _CONTROLLER and data[1] & _ACTIVE_BIT)
     if is_active_again:
         found.append((TroubleKind.OTHER, "error-active again"))
-    # Older kernels fill the counters without the class bit that announces them.
+    # Older kernels fill in the counters without setting their class bit.
     counted = classes & _COUNTERS or (classes & _CONTROLLER and any(data[6:8]))
     tx_errors, rx_errors = (data[6], data[7]) if counted else (None, None)
     return _trouble(found, tx_errors, rx_errors, is_active_again=is_active_again)
 
 
 def _decode_pcan(kind_of_error: int, data: bytes) -> BusTrouble:
-    """PCAN-Basic: the id names the kind of error, the data direction, place and both counters."""
+    """Decode a frame of PCAN-Basic: the id is the kind of error; the data are direction, position
+    and both counters.
+    """
     is_received, place, rx_errors, tx_errors = data[:4]
     names = {0: "", 1: "bit error", 2: "form error", 4: "stuff error"}
     words = names.get(kind_of_error, "bus error")
@@ -174,7 +177,7 @@ def _trouble(
 
 
 class ControllerState(Enum):
-    """How far a CAN controller takes part in the traffic."""
+    """Participation of a CAN controller in the traffic."""
 
     ACTIVE = "active"
     PASSIVE = "passive"
@@ -184,35 +187,35 @@ class ControllerState(Enum):
 
 @dataclass(frozen=True)
 class LinkHealth:
-    """What is known of a link since it was opened. Counters are None where nobody tells them."""
+    """State of a link since it was opened. Counters are None if not reported."""
 
     state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
     frames_sent: int
-    """Frames that the adapter accepted: no proof that they left."""
+    """Frames that the adapter accepted; they may not have been sent."""
     frames_received: int
-    """Frames of the wire, without error frames."""
+    """Frames from the wire, without error frames."""
     error_frames: int
     is_blocked: bool
-    """True when the adapter refused a frame for as long as a link waits."""
+    """The adapter refused a frame for the whole time limit of a link."""
     last_trouble: BusTrouble | None
     not_acknowledged: bool
-    """True when frames were sent, nothing at all was ever received, and error frames, the state or
-    the full queue say that nobody acknowledges."""
+    """Frames were sent, nothing was ever received, and error frames, the state or the full queue
+    show that no node acknowledges."""
     unreadable: int
-    """What the adapter delivered and no frame could be made of, over all its reopenings."""
+    """Inputs of the adapter that are not frames, including those before it was reopened."""
     last_unreadable: str
-    """What was wrong with the last of it, in words."""
+    """Problem of the last one, in words."""
 
     def error(self, where: str = "") -> BusError | None:
-        """The adapter's or the bus's failure that this health shows; None when it shows none."""
+        """Create the error for this health; None if it is good."""
         if self.state is ControllerState.BUS_OFF:
             return bus_off_error(where)
         if self.not_acknowledged:
             return BusError(
-                f"Nobody on the bus acknowledges: {self.frames_sent} frames were given to the "
-                "adapter, and nothing at all was received.",
+                f"No node on the bus acknowledges: {self.frames_sent} frames were passed to the "
+                "adapter, and nothing was received.",
                 where=where,
                 cause="the device is off or not connected, the bit rate is another, CAN-H and "
                 f"CAN-L are swapped or open, or termination is missing{self._evidence}",
@@ -231,7 +234,7 @@ class LinkHealth:
 
 
 def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> BusError:
-    """The error for a controller that went bus-off."""
+    """Create the error for a bus-off controller."""
     return BusError(
         what,
         where=where,
@@ -244,9 +247,9 @@ def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> Bu
 
 
 def unreadable_error(where: str, how_often: str, words: str) -> BusError:
-    """The error for an adapter of which nothing can be read."""
+    """Create the error for an adapter whose input is unreadable."""
     return BusError(
-        f"Nothing that the adapter delivers can be read, {how_often}: {words}.",
+        f"The adapter delivers unreadable data, {how_often}: {words}.",
         where=where,
         cause="its serial speed is another one, or its cable or plug is bad",
         remedy="Try another cable; for slcan, `--bus-kwargs tty_baudrate=...` sets the speed.",
@@ -255,7 +258,7 @@ def unreadable_error(where: str, how_often: str, words: str) -> BusError:
 
 
 class HealthKeeper:
-    """Counts for one link and remembers the troubles that it was told of."""
+    """Counts frames and remembers trouble of one link."""
 
     def __init__(self, layout: Layout = Layout.UNKNOWN) -> None:
         self._layout = layout
@@ -264,7 +267,7 @@ class HealthKeeper:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything but what was unreadable: the adapter was opened anew."""
+        """Reset after the adapter was reopened; keeps the unreadable inputs."""
         self.sent = 0
         self.received = 0
         self.error_frames = 0
@@ -276,19 +279,19 @@ class HealthKeeper:
         self._was_unacknowledged = False
 
     def hear(self, frame: Frame) -> None:
-        """A frame arrived, of the wire or an error frame."""
+        """Count a received frame or error frame."""
         if not frame.is_error:
             self.received += 1
             return
         self.report(decode_error_frame(frame, self._layout))
 
     def add_unreadable(self, words: str) -> None:
-        """The adapter delivered something that is no frame."""
+        """Count an input that is not a frame."""
         self._unreadable += 1
         self._last_unreadable = words
 
     def report(self, trouble: BusTrouble) -> None:
-        """The controller reported trouble, by an error frame or otherwise."""
+        """Note trouble reported by the controller."""
         self.error_frames += 1
         self._last = trouble
         if trouble.tx_errors is not None:
@@ -308,13 +311,15 @@ class HealthKeeper:
         tx_errors: int | None = None,
         rx_errors: int | None = None,
     ) -> LinkHealth:
-        """The health now; what the adapter itself was asked for counts more than error frames."""
+        """Return the current health; values reported by the adapter itself take precedence over
+        error frames.
+        """
         if state is ControllerState.UNKNOWN:
             state = self.state
         if tx_errors is None:
             tx_errors, rx_errors = self._tx_errors, self._rx_errors
-        # Without acknowledgement a controller stops at error-passive, by sending: it never goes
-        # bus-off. On another bit rate the receive counter may be the higher one: silence counts.
+        # Without acknowledgement a sending controller stops at error-passive, never
+        # bus-off. At a wrong bit rate the receive counter may be higher, so silence decides.
         says_so = self._was_unacknowledged or self.is_blocked or state is ControllerState.PASSIVE
         return LinkHealth(
             state=state,

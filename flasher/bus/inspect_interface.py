@@ -1,8 +1,8 @@
-"""What Linux says about a SocketCAN interface, without sending anything and without being root; and
-the commands by which root sets one up.
+"""State of a SocketCAN interface on Linux, without sending anything or being root, and the commands
+to set one up.
 
-`ip -details -json link show` tells most; where it is missing or too old, /sys tells whether the
-interface is there and up.
+Uses `ip -details -json link show`; if that is missing or too old, /sys shows whether the interface
+exists and is up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flasher.bus.health import ControllerState
 
 SYSFS: Final = Path("/sys/class/net")
 _WITHOUT_RESTART: Final = frozenset({"can327", "gs_usb", "slcan"})
-"""Drivers for which the kernel refuses every restart after bus-off, by itself or asked for."""
+"""Drivers whose restart after bus-off the kernel refuses, automatic or manual."""
 VIRTUAL_KINDS: Final = frozenset({"vcan", "vxcan"})
 """Interfaces without a controller: no bit rate, no error states."""
 _IP_LIMIT_S: Final = 2.0
@@ -31,11 +31,11 @@ _ARPHRD_CAN: Final = 280
 _IFF_UP: Final = 1
 
 Run = Callable[[Sequence[str]], str]
-"""Runs a command and gives its standard output. Raises OSError or subprocess.SubprocessError."""
+"""Runs a command and returns its standard output. Raises OSError or subprocess.SubprocessError."""
 
 
 class Unseen(Enum):
-    """Why nothing can be said about an interface."""
+    """Why the state of an interface is unknown."""
 
     MISSING = "missing"
     CANNOT_TELL = "cannot_tell"
@@ -43,41 +43,41 @@ class Unseen(Enum):
 
 @dataclass(frozen=True)
 class Interface:
-    """A network interface as the kernel describes it; None where it does not tell."""
+    """Network interface as described by the kernel; None for unknown values."""
 
     name: str
     is_can: bool
     is_up: bool
     has_carrier: bool | None = None
-    """False when the controller is bus-off, or the other end of a vxcan pair is down."""
+    """False if the controller is bus-off, or the other end of a vxcan pair is down."""
     kind: str = ""
-    """"can" (hardware), "vcan", "vxcan", "slcan"; empty when not told."""
+    """"can" (hardware), "vcan", "vxcan", "slcan"; may be empty."""
     bitrate_bps: int | None = None
     state_name: str = ""
-    """The kernel's word: ERROR-ACTIVE, ERROR-WARNING, ERROR-PASSIVE, BUS-OFF, STOPPED."""
+    """The kernel's name: ERROR-ACTIVE, ERROR-WARNING, ERROR-PASSIVE, BUS-OFF, STOPPED."""
     tx_errors: int | None = None
     rx_errors: int | None = None
     restart_ms: int | None = None
-    """Time after which a bus-off ends by itself; 0 never."""
+    """Time after which bus-off ends automatically; 0 for never."""
     queue_frames: int | None = None
     modes: frozenset[str] = frozenset()
-    """Control modes that are on: LISTEN-ONLY, LOOPBACK, ONE-SHOT, FD, ..."""
+    """Active control modes: LISTEN-ONLY, LOOPBACK, ONE-SHOT, FD, ..."""
     driver: str = ""
-    """The driver's name as its bit timing limits give it; empty when not told."""
+    """Name of the driver, from its bit timing limits; may be empty."""
 
     @property
     def state(self) -> ControllerState:
-        """The state of its controller."""
+        """State of its controller."""
         return _STATES.get(self.state_name, ControllerState.UNKNOWN)
 
     @property
     def only_listens(self) -> bool:
-        """True when it acknowledges nothing and drops what it is given to send."""
+        """True if it acknowledges nothing and drops frames to send."""
         return "LISTEN-ONLY" in self.modes
 
     @property
     def can_restart(self) -> bool:
-        """True when its driver takes `restart-ms`; False also when the driver is not known."""
+        """True if its driver supports `restart-ms`; False for an unknown driver."""
         return bool(self.driver) and self.driver not in _WITHOUT_RESTART
 
 
@@ -90,7 +90,7 @@ _STATES: Final = {
 
 
 def read_interface(name: str, *, run: Run | None = None, sysfs: Path = SYSFS) -> Interface | Unseen:
-    """All that can be learned about an interface. Takes 2 s at the most; never raises."""
+    """Read all that is known about an interface. Takes 2 s at most; never raises."""
     seen = look_up(name, sysfs=sysfs)
     if seen is Unseen.MISSING:
         return seen
@@ -99,7 +99,7 @@ def read_interface(name: str, *, run: Run | None = None, sysfs: Path = SYSFS) ->
 
 
 def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
-    """What /sys alone tells, in no time: there, a CAN interface, up, with a carrier."""
+    """Read from /sys alone, without delay: existence, type, up, carrier."""
     if not sysfs.is_dir():
         return Unseen.CANNOT_TELL
     if not _is_a_name(name) or not (sysfs / name).exists():
@@ -117,14 +117,16 @@ def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
 
 
 def start_command(channel: object, bitrate_bps: object) -> str:
-    """How root starts a SocketCAN interface; virtual ones, told by their name, take no options."""
+    """Command for root to start a SocketCAN interface; virtual ones, recognised by name, have no
+    options.
+    """
     if str(channel).startswith(tuple(VIRTUAL_KINDS)):
         return f"ip link set {channel} up"
     return f"ip link set {channel} up type can bitrate {bitrate_bps}"
 
 
 def kernel_has_can() -> bool:
-    """False on a kernel that was built without CAN, as many of virtual machines are."""
+    """False for a kernel without CAN, as in many virtual machines."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
@@ -133,21 +135,21 @@ def kernel_has_can() -> bool:
 
 
 def find_commands(channel: object) -> tuple[str, str]:
-    """What makes a virtual interface that is missing, or lists those that are there."""
+    """Commands that create a missing virtual interface, or list the existing ones."""
     if str(channel).startswith("vcan"):
         return (f"ip link add dev {channel} type vcan", f"ip link set {channel} up")
     return ("ip -brief link show type can", "dmesg | grep -i can")
 
 
 def restart_commands(channel: object) -> tuple[str, str]:
-    """How root starts an interface again after bus-off, with the settings that it has. `type can
-    restart` does so only where the driver has it.
+    """Commands for root to restart an interface after bus-off with its settings. `type can restart`
+    depends on the driver.
     """
     return (f"ip link set {channel} down", f"ip link set {channel} up")
 
 
 def change_commands(channel: object, *options: str) -> tuple[str, str, str]:
-    """How root changes options of a CAN interface, which it takes only while it is down."""
+    """Commands for root to change options of a CAN interface, which must be down meanwhile."""
     down, up = restart_commands(channel)
     return (down, f"ip link set {channel} type can {' '.join(options)}", up)
 
@@ -164,7 +166,7 @@ def _number(path: Path) -> int | None:
 
 
 def _ask_ip(name: str, run: Run) -> Interface | None:
-    """None when `ip` is missing, too old for JSON, or says something else than expected."""
+    """Return None if `ip` is missing, too old for JSON, or prints something unexpected."""
     try:
         answer = json.loads(run(("ip", "-details", "-json", "link", "show", "dev", name)))
         return _from_ip(answer[0])

@@ -1,7 +1,7 @@
-"""The edge between an engine and a bus: eight methods, and a clock to go with them.
+"""The interface between engine and bus: `Link`, and the clocks that belong to it.
 
-A link and its clock belong together: the deadlines that a link is given are times of that clock. A
-real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
+Deadlines of a link are times of its clock. A real adapter uses `MonotonicClock`; a simulated bus
+creates its own time.
 """
 
 from __future__ import annotations
@@ -17,98 +17,98 @@ SEND_LIMIT_S: Final = 2.0
 
 
 AT_ONCE: Final = float("-inf")
-"""A deadline in the past: only what is there already."""
+"""A deadline in the past: receive only what is already there."""
 _AWAKE_S: Final = 0.0001
-"""Real seconds that a paced clock waits awake."""
+"""Real time for which a paced clock busy-waits."""
 
 
 _MADE_UP_S: Final = 0.1
-"""The longest pause in real seconds after which a steady clock hurries to keep its pace."""
+"""Maximum pause, in real seconds, that a steady clock makes up for."""
 
 
 class Clock(Protocol):
-    """Seconds that only go forward."""
+    """Seconds that only increase."""
 
-    def now(self) -> float:
-        """The time."""
-        ...
+    def now(self) -> float: ...
 
     def wait_until(self, moment: float) -> None:
-        """Return when `moment` has come; at once when it has passed."""
+        """Return at `moment`; at once if it has passed."""
         ...
 
     @property
     def speed(self) -> float:
-        """Its seconds in one second of a person who waits."""
+        """Its seconds per real second."""
         ...
 
 
 class Link(Protocol):
-    """Sends and receives single CAN frames. Methods raise BusError when the adapter fails."""
+    """Sends and receives single CAN frames. Methods raise BusError if the adapter fails."""
 
     def send(self, frame: Frame) -> None:
-        """Hand a frame to the adapter; returns when it is accepted.
+        """Pass a frame to the adapter; return when it is accepted.
 
-        A full transmit queue is waited for, within the link's own limit; then
+        Waits for room in a full transmit queue up to the link's limit; then raises
         TransmitBlockedError.
         """
         ...
 
     def receive(self, deadline: float) -> Frame | None:
-        """The next frame received; None when `deadline` passed first. A deadline in the past
-        takes only what is there already.
+        """Return the next received frame; None at `deadline`. A deadline in the past returns only
+        what is already there.
         """
         ...
 
     def drain(self) -> int:
-        """Throw away what was received so far; returns how many frames."""
+        """Discard received frames; return their number."""
         ...
 
     def close(self) -> None:
-        """Release the adapter; harmless when repeated."""
+        """Release the adapter; may be repeated."""
         ...
 
     def reopen(self) -> None:
-        """Close the adapter and open it again as it was, for one that was lost and may be back.
+        """Close the adapter and open it again with the same settings, after it was lost.
 
-        Raises BusError while it is not; may be called again, not more often than every 100 ms.
+        Raises BusError while it is not back; call it again at most every 100 ms.
         """
         ...
 
     @property
     def is_off(self) -> bool:
-        """True while the adapter is bus-off by its own report. Asks nobody."""
+        """True while the adapter reports bus-off, as last seen."""
         ...
 
     @property
     def is_physical(self) -> bool:
-        """True unless the bus is known to exist in computers alone. Takes 2 s at most."""
+        """True unless the bus is known to be virtual. Takes 2 s at most."""
         ...
 
     def health(self) -> LinkHealth:
-        """What is known of the adapter and its bus. Sends nothing, never raises."""
+        """Return the health of adapter and bus. Sends nothing, never raises."""
         ...
 
 
 @runtime_checkable
 class StampingLink(Link, Protocol):
-    """A link that may know better than its reader when a frame arrived."""
+    """Link that may know the arrival time of a frame better than its reader."""
 
     @property
     def stamp_source(self) -> str:
-        """Who stamps the frames ("kernel"); empty where nobody does."""
+        """Source of the time stamps ("kernel"); empty without any."""
         ...
 
     @property
     def received_at(self) -> float | None:
-        """When the frame that `receive` returned last was there, in seconds on the link's clock;
-        None without a stamp that can be trusted.
+        """Arrival time of the frame that `receive` last returned, in seconds on the link's clock;
+        None without a reliable stamp.
         """
         ...
 
 
 class MonotonicClock:
-    """The computer's finest clock, `time.perf_counter`: jumps of the wall clock do not touch it."""
+    """The computer's finest clock, `time.perf_counter`; not affected by changes of the wall
+    clock.
+    """
 
     speed: Final = 1.0
     now = staticmethod(time.perf_counter)
@@ -121,9 +121,9 @@ class MonotonicClock:
 
 
 class PacedClock:
-    """Real time, but `speed` times as fast: what makes a demonstration look like the real thing.
+    """Real time multiplied by `speed`, for realistic demonstrations.
 
-    A sleep ends some 0.1 ms late, which a line would not do: the last of it is waited for awake.
+    A sleep ends about 0.1 ms late, so the last part is waited for actively.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
@@ -145,22 +145,22 @@ class PacedClock:
 
 
 class SteadyClock:
-    """Virtual time at the pace of real time, or `speed` times as fast: it passes only while
-    somebody waits for it. A pause of this computer pauses what is simulated as well.
+    """Virtual time at the pace of real time, or `speed` times as fast. It advances only during
+    waits, so that a pause of this computer also pauses the simulation.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
         self.speed = speed
         self._now = 0.0
         self._reached_at = time.perf_counter()
-        """When it should have been this time."""
+        """Real time at which it should have reached this time."""
 
     def now(self) -> float:
         """Simulated seconds since the clock was made."""
         return self._now
 
     def wait_until(self, moment: float) -> None:
-        """Sleep until the simulated `moment`. What a short pause has cost is made up for."""
+        """Sleep until the simulated `moment`; makes up for a short pause."""
         if moment <= self._now:
             return
         real = time.perf_counter()
@@ -172,7 +172,7 @@ class SteadyClock:
 
 
 class VirtualClock:
-    """Time that passes only when somebody waits for it."""
+    """Time that advances only by waiting."""
 
     speed: Final = 1.0
 
@@ -184,5 +184,5 @@ class VirtualClock:
         return self._now
 
     def wait_until(self, moment: float) -> None:
-        """Make it that time."""
+        """Advance to `moment`."""
         self._now = max(self._now, moment)

@@ -1,8 +1,8 @@
-"""One tool at a time on an adapter: an advisory lock, for the programs of one user on one computer.
+"""Adapter lock: one tool at a time on an adapter, for the programs of one user on one computer.
 
-Two tools on a bus spoil each other's dialogue. The lock is the operating system's, on a file in the
-user's state folder: a process that died holds nothing any more. What stands beside it only tells
-others who holds it.
+Two tools on a bus disturb each other. The lock is an advisory lock of the operating system on a
+file in the user's state folder, so that a dead process holds nothing. The file next to it only
+names the holder.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from flasher.protocol.text import printable
 
 _LOG: Final = logging.getLogger("flasher.bus")
 _IN_PROCESS: Final = "virtual"
-"""python-can's bus inside of a process: the same channel of another process is another bus."""
+"""python-can's bus inside a process: the same channel in another process is another bus."""
 _OPENED_ONCE: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
-"""On serial ports: who opens one sets it up anew, and so ends what another program does with it."""
+"""On serial ports: opening one reconfigures it, and so disturbs another program that uses it."""
 _LONG_PORT: Final = re.compile(r"^[\\/]{2}[.?][\\/](?=COM\d+$)", re.IGNORECASE)
-r"""Before the name of a serial port of Windows: \\.\COM3 is COM3."""
+r"""Prefix of a Windows serial port: \\.\COM3 is COM3."""
 _ON_A_PORT: Final = "udp_multicast"
-"""Hears every multicast group on its port, so the port is the bus."""
+"""Receives every multicast group on its port, so the port is the bus."""
 _MULTICAST_PORT: Final = 43113
 _PLACE: Final = ("channel", "host", "port", "index", "bus", "address", "serial", "serial_number",
                  "unique_hardware_id")  # fmt: skip
-"""Keywords of python-can's back ends that tell one adapter from another."""
+"""Keywords of python-can's back ends that identify an adapter."""
 
 
 def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
-    """Take the adapter that `config` (python-can's keywords) names; returns what gives it back,
-    which may be called twice.
+    """Lock the adapter that `config` (python-can's keywords) names; return the function that
+    unlocks it, which may be called twice.
 
-    `holder` is what others are told; None is for who never speaks as the tool, and takes only what
-    cannot be opened twice. Raises BusError, naming who has it, when somebody has. Where the state
-    folder cannot be written to, it is only logged that there is no lock.
+    `holder` is shown to others. None is for programs that never send as the tool: they lock only
+    what cannot be opened twice. Raises BusError with the holder if it is locked. If the state
+    folder is not writable, only a warning is logged.
     """
     interface = config["interface"]
     name = f"{interface} {config.get('channel') or ''}".strip()
@@ -60,36 +60,36 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
         lock.acquire()
     except Timeout:
         raise BusError(
-            f"{printable(name)} is in use by {_told(path)}.",
+            f"{printable(name)} is in use by {_holder_of(path)}.",
             where="before the adapter was opened",
-            cause="two tools on one bus spoil each other's dialogue, and an upgrade with it",
+            cause="two tools on one bus disturb each other, and any upgrade",
             remedy="Wait until it has ended, or end it; flasher monitor watches the bus meanwhile.",
             code=ErrorCode.ADAPTER_IN_USE,
         ) from None
     except OSError as error:
         _LOG.warning("no lock for %s: %s", name, error)
         return lambda: None
-    told = path.with_suffix(".json")
+    note_path = path.with_suffix(".json")
     note = {
         "holder": holder or "a program that listens",
         "pid": os.getpid(),
         "since": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S"),
     }
     with contextlib.suppress(OSError):
-        told.write_text(json.dumps(note))
+        note_path.write_text(json.dumps(note))
 
     def give_back() -> None:
         if lock.is_locked:
             with contextlib.suppress(OSError):
-                told.unlink()
+                note_path.unlink()
             lock.release()
 
     return give_back
 
 
 def place_of(config: Mapping[str, Any]) -> str:
-    """One adapter, whoever names it, as the name of a file. The folder may be shared with other
-    computers.
+    """Return the file name that identifies an adapter, however it is named. The folder may be
+    shared with other computers.
     """
     interface = str(config["interface"])
     place = {key: str(config[key]) for key in _PLACE if config.get(key) is not None}
@@ -104,9 +104,9 @@ def place_of(config: Mapping[str, Any]) -> str:
     return f"{readable}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _told(path: Path) -> str:
-    """Who holds the lock, as it says itself."""
+def _holder_of(path: Path) -> str:
+    """Name the holder of the lock."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        told = json.loads(path.with_suffix(".json").read_text())
-        return printable(f"{told['holder']} (process {told['pid']}, since {told['since']})")
-    return "another program that speaks as the tool"
+        note = json.loads(path.with_suffix(".json").read_text())
+        return printable(f"{note['holder']} (process {note['pid']}, since {note['since']})")
+    return "another program that sends as the tool"

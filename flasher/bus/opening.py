@@ -1,4 +1,4 @@
-"""Opening a python-can bus: its configuration, and in plain words why it cannot be opened."""
+"""Opens a python-can bus: merged configuration, and plain error messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "slcan": ("serial", "serial"),
     "udp_multicast": ("multicast", "msgpack"),
 }
-"""python-can's extra that an interface needs, and the module that it brings."""
+"""Extra of python-can that an interface needs, and the module it contains."""
 _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
     "cantact": {"monitor": True},
     "kvaser": {"driver_mode": False},
@@ -48,29 +48,29 @@ _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
     "systec": {"state": can.BusState.PASSIVE},
     "vector": {"listen_only": True},
 }
-"""What makes a back end listen without acknowledging. SocketCAN is set up so by root; of the others
-python-can offers nothing."""
+"""Arguments that make a back end listen without acknowledging. SocketCAN is configured by root; for
+others python-can offers nothing."""
 _PERMISSION: Final = frozenset({errno.EACCES, errno.EPERM})
 
 
 def needed_extra(interface: str) -> tuple[str, str] | None:
-    """python-can's extra for an interface and the module that it brings; None where none is."""
+    """Return python-can's extra for an interface and its module; None if none is needed."""
     return _EXTRAS.get(interface)
 
 
 def can_listen_only(interface: str) -> bool:
-    """True when a back end is told by an argument to listen without acknowledging."""
+    """True if an argument makes the back end listen without acknowledging."""
     return interface in _LISTEN_ONLY
 
 
 def bus_config(
     given: Mapping[str, Any], fallback: Fallback | None = None, *, listen_only: bool = False
 ) -> dict[str, Any]:
-    """All keywords for `can.Bus`, from what was given, variables, files and the `fallback`, in this
-    order, but for a bit rate that none of them names (`flasher.bus.bit_rate`).
+    """Merge all keywords for `can.Bus` from arguments, variables, files and the `fallback`, in this
+    order, without a bit rate that none of them names (`flasher.bus.bit_rate`).
 
-    `listen_only` adds what keeps the adapter silent, where its back end can be told. Raises
-    UsageError for a configuration that makes no sense, BusError when there is none.
+    `listen_only` adds arguments that keep the adapter silent, if its back end has any. Raises
+    UsageError for an invalid configuration, BusError without one.
     """
     merged = _configured(given, fallback)
     if "timing" in given:
@@ -87,7 +87,7 @@ def _configured(given: Mapping[str, Any], fallback: Fallback | None) -> dict[str
         return _by_python_can(given)
     try:
         merged = _by_python_can(given)
-    except BusError:  # nobody else names an interface
+    except BusError:  # only the fallback names an interface
         merged = _by_python_can({**given, "interface": fallback.bus["interface"]})
     if merged["interface"] != fallback.bus["interface"]:
         return merged
@@ -110,7 +110,7 @@ def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) -> bool:
-    """True when what was given, a variable or a file names an adapter, or its channel alone. Raises
+    """True if arguments, a variable or a file name an adapter, or only its channel. Raises
     UsageError as `bus_config`.
     """
     try:
@@ -120,8 +120,8 @@ def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) ->
 
 
 def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
-    """Open what `bus_config` gave. Raises BusError with cause and remedy, also for an interface
-    that is open and carries nothing, or that `sends` needs and that only listens.
+    """Open the bus of `bus_config`. Raises BusError with cause and remedy, also for an interface
+    that opens but is unusable, or only listens although the program `sends`.
     """
     interface, channel = str(config["interface"]), config.get("channel")
     try:
@@ -144,8 +144,8 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
 
 
 def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:
-    """A SocketCAN interface opens while it is down, bus-off or only listens. The carrier does not
-    tell: gs_usb keeps it after bus-off.
+    """Return the error for a SocketCAN interface that is down, bus-off or only listens, which opens
+    without error. The carrier alone is not enough: gs_usb keeps it after bus-off.
     """
     seen = read_interface(channel)
     if isinstance(seen, Unseen) or not seen.is_can:
@@ -155,7 +155,7 @@ def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | N
         return BusError(
             f"The adapter cannot be opened: the interface {channel} is down.",
             where=where,
-            cause="nobody has started it since it was plugged in",
+            cause="it was not started after it was plugged in",
             remedy=f"`{start_command(channel, bitrate_bps)}` (as root) starts it.",
             code=ErrorCode.ADAPTER_NOT_OPENED,
         )
@@ -196,7 +196,7 @@ def _no_interface(error: Exception) -> UsageError | BusError:
 
 
 def _code(error: BaseException) -> int | None:
-    """The operating system's code, which back ends wrap once or twice."""
+    """Error code of the operating system, which back ends wrap once or twice."""
     for each in causes(error):
         code = getattr(each, "errno", None) or getattr(each, "error_code", None)
         if isinstance(code, int):

@@ -1,4 +1,4 @@
-"""Tells an adapter on a real bus from a bus that exists in computers alone."""
+"""Distinguishes physical adapters from virtual buses."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _PSEUDO_TERMINAL_MAJORS: Final = range(136, 144)
 
 
 def is_physical(interface: str, channel: str) -> bool:
-    """False for python-can's own buses, for a vcan or vxcan by the kernel's word, whatever it is
-    called, and for a serial adapter at a pseudo terminal. What cannot be found out is physical.
-    Takes 2 s at most; never raises.
+    """Return False for python-can's own buses, for vcan and vxcan interfaces (as reported by the
+    kernel), and for a serial adapter at a pseudo terminal. Unknown adapters are physical. Takes 2 s
+    at most; never raises.
     """
     if interface in BUILT_IN:
         return False
@@ -31,7 +31,7 @@ def is_physical(interface: str, channel: str) -> bool:
 
 
 def _is_pseudo_terminal(port: str) -> bool:
-    """Asks the kernel for what the name leads to."""
+    """Ask the kernel for the type of the device."""
     try:
         found = os.stat(port)  # noqa: PTH116  a name that is no path fails here
     except (OSError, ValueError):

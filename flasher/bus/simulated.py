@@ -1,13 +1,12 @@
-"""A CAN bus in memory: exact bit times, arbitration by id, everybody hears everybody.
+"""CAN bus in memory: exact bit times, arbitration by id, every node receives every frame.
 
-Senders of one id at the same time are not parted by arbitration: the same frame becomes one, and
-different frames destroy each other until the controllers have counted so many errors that one is
-heard. Without `collides` they take turns, as on a virtual network.
+Arbitration does not separate simultaneous senders of one id: equal frames merge; different frames
+destroy each other until the error counters silence one sender. Without `collides` they take turns,
+as on a virtual network.
 
-The devices on it are engines (`attach`), the host comes through a `SimulatedLink`. It is driven by
-the link's calls and has no thread: sending and receiving make its time pass, on whichever clock it
-was given. With a `VirtualClock` an upgrade takes no time at all, with a `PacedClock` as long as on
-a real bus, with the same code.
+Devices are engines (`attach`); the host uses a `SimulatedLink`. The link's calls drive the bus,
+without a thread: sending and receiving advance its time, on the given clock. With a `VirtualClock`
+an upgrade takes no time, with a `PacedClock` as long as on a real bus.
 """
 
 from __future__ import annotations
@@ -31,31 +30,32 @@ from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 
 _ERROR_FRAME_BITS: Final = 20
-"""Error flag, delimiter and the pause after it, about."""
+"""Error flag, delimiter and following pause, approximately."""
 _ID_BITS: Final = 13
-"""Start, id and remote bit: what two senders of one id agree on."""
+"""Start, id and remote bit, which are equal for two senders of one id."""
 _PASSIVE: Final = 128
 _OFF: Final = 256
-"""Transmit errors from which on a controller disturbs nobody any more, or is reset."""
+"""Transmit errors at which a controller stops disturbing others, or is reset."""
 Disturbance = Callable[[Frame, float], Iterable[Frame]]
-"""What becomes of a frame on the wire, given its end time: itself, nothing, two of it, another."""
+"""Maps a frame and its end time to the frames received: itself, nothing, two copies, another
+one."""
 
 DEFAULT_QUEUE_FRAMES = 32
 """Transmit queue of the host's simulated adapter."""
 
 
 class _Node:
-    """Somebody on the bus: what it has to send."""
+    """Node on the bus."""
 
     def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
         """Frames to send, with the time at which each was queued."""
         self.tx_errors = 0
-        """What its controller counts: 8 for an error, one less for a frame that was sent."""
+        """Transmit error counter: plus 8 for an error, minus 1 for a frame sent."""
 
 
 class _Host(_Node):
-    """Driven from outside, through a link."""
+    """Driven from outside through a link."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -63,14 +63,14 @@ class _Host(_Node):
 
 
 class _Device(_Node):
-    """An engine, driven by the bus."""
+    """Engine driven by the bus."""
 
     def __init__(self, engine: Engine, on_event: Callable[[object], None] | None) -> None:
         super().__init__()
         self.engine = engine
         self.on_event = on_event
         self.deadline: float | None = None
-        """The engine's, since it was served."""
+        """Deadline of the engine when it was last served."""
 
 
 class SimulatedBus:
@@ -87,35 +87,35 @@ class SimulatedBus:
         self.clock = clock
         self.frames_carried = 0
         self.busy_s = 0.0
-        """Time that the wire was in use."""
+        """Time during which the wire was in use."""
         self._bitrate_bps = bitrate_bps
         self._disturbance = disturbance
         self._collides = collides
         self._nodes: list[_Node] = []
-        """All hosts and devices, in the order in which they came."""
+        """All hosts and devices in the order of arrival."""
         self._hosts: list[_Host] = []
         self._devices: list[_Device] = []
         self._sending: tuple[Sequence[_Node], Frame | None] | None = None
-        """Who sends, several the same frame in the same bits; None is a collision of different
-        frames, which nobody receives."""
+        """Current senders, several for equal frames in the same bits; None as frame is a collision,
+        which no node receives."""
         self._sending_ends_at = 0.0
         self._delivered_at: float | None = None
-        """When a frame was delivered to which nobody has answered yet: devices are as exact as the
-        wire, however late the clock woke."""
+        """Time of a delivered frame without answer: devices are as exact as the wire, even if the
+        clock woke late."""
         self.faults = AdapterFaults()
-        """What befalls the host's adapter; see `unplug`, `bus_off` and `nobody_acknowledges`."""
+        """Faults of the host's adapter; see `unplug`, `bus_off` and `nobody_acknowledges`."""
 
     def unplug(self, back_after_s: float | None = None) -> None:
-        """Pull the host's adapter out: its links raise BusError until it is back (`plug`, or by
-        itself after `back_after_s`) and they were opened again.
+        """Unplug the host's adapter: its links raise BusError until it is back (`plug`, or
+        automatically after `back_after_s`) and they were opened again.
         """
         now = self.clock.now()
         self.faults.unplug(None if back_after_s is None else now + back_after_s)
         self._silence_hosts()
 
     def bus_off(self, restart_after_s: float | None = None) -> None:
-        """Put the host's controller bus-off: nothing goes out or comes in until `plug`, or until
-        it restarts by itself.
+        """Set the host's controller bus-off: nothing is sent or received until `plug`, or until it
+        restarts automatically.
         """
         now = self.clock.now()
         self.faults.go_off(now, None if restart_after_s is None else now + restart_after_s)
@@ -127,8 +127,8 @@ class SimulatedBus:
 
     @property
     def nobody_acknowledges(self) -> bool:
-        """True while the host's adapter is alone: its frames never leave, its queue fills up, and
-        it hears nobody.
+        """True while the host's adapter is alone: its frames are never sent, its queue fills up,
+        and it receives nothing.
         """
         return self.faults.is_alone
 
@@ -137,26 +137,26 @@ class SimulatedBus:
         self.faults.be_alone(self.clock.now(), alone=alone)
 
     def attach(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
-        """Put a device on the bus; `on_event` is told what it reports."""
+        """Add a device; `on_event` gets its events."""
         device = _Device(engine, on_event)
         self._nodes.append(device)
         self._devices.append(device)
 
     def detach(self, engine: Engine) -> None:
-        """Take a device off the bus, with what it had still to send."""
+        """Remove a device and its unsent frames."""
         device = next(each for each in self._devices if each.engine is engine)
         self._nodes.remove(device)
         self._devices.remove(device)
 
     def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
-        """A way onto the bus for somebody who drives it from outside."""
+        """Create a link for a host."""
         host = _Host()
         self._nodes.append(host)
         self._hosts.append(host)
         return SimulatedLink(self, host, queue_frames)
 
     def advance(self, limit: float) -> None:
-        """Let time pass up to the next thing that happens, `limit` at the latest."""
+        """Advance to the next thing that happens, `limit` at the latest."""
         self._report_faults()
         now, self._delivered_at = self._delivered_at, None
         self._serve_devices(self.clock.now() if now is None else now)
@@ -181,14 +181,14 @@ class SimulatedBus:
                     host.inbox.append(report)
 
     def _silence_hosts(self) -> None:
-        """What the hosts had queued, or were sending, is gone."""
+        """Drop everything that the hosts queued or were sending."""
         for host in self._hosts:
             host.outbox.clear()
         if self._sending is not None and self._sending[0][0] in self._hosts:
             self._sending = None
 
     def _serve_devices(self, now: float) -> None:
-        """Let every device do what it wants to do now: one frame each waits for the wire."""
+        """Serve every device: one frame each waits for the wire."""
         anything_happened = False
         for device in self._devices:
             engine = device.engine
@@ -221,8 +221,8 @@ class SimulatedBus:
             winners = [node for node in waiting if node.outbox[0][1].can_id == lowest]
             if len(winners) > 1:
                 winners = self._contend(winners) if self._collides else winners[:1]
-        # A paced clock wakes a little late, the wire does not: a frame that waited for the one
-        # before follows it without a gap.
+        # A paced clock wakes slightly late, the wire does not: a frame that waited for the previous
+        # one follows it without a gap.
         begins_at = max(self._sending_ends_at, min(node.outbox[0][0] for node in winners))
         frame = winners[0].outbox[0][1]
         if any(node.outbox[0][1] != frame for node in winners):
@@ -236,8 +236,8 @@ class SimulatedBus:
         self.busy_s += bits / self._bitrate_bps
 
     def _contend(self, rivals: Sequence[_Node]) -> Sequence[_Node]:
-        """Who sends of several with one id, which arbitration does not part: all that send the
-        frame with the first dominant bit, and whoever still disturbs it.
+        """Return the senders among several with one id: those of the frame with the first dominant
+        bit, and any that still disturb it.
         """
         first = min(_bits_after_id(node.outbox[0][1]) for node in rivals)
         strongest = [node for node in rivals if _bits_after_id(node.outbox[0][1]) == first]
@@ -249,7 +249,7 @@ class SimulatedBus:
         return strongest
 
     def _collide(self, rivals: Sequence[_Node]) -> int:
-        """Senders of different frames under one id destroy both; returns the bits it takes."""
+        """Let senders of different frames with one id destroy each other; return the bits used."""
         different = {_bits_after_id(node.outbox[0][1]) for node in rivals}
         same = next(i for i, bits in enumerate(zip(*different, strict=False)) if len(set(bits)) > 1)
         for node in rivals:
@@ -281,12 +281,12 @@ class SimulatedBus:
 
 
 def _bits_after_id(frame: Frame) -> bytes:
-    """What decides between frames of one id, the lower first: a 0 is dominant."""
+    """Sort key of frames with one id; a 0 is dominant."""
     return bytes((frame.is_extended, len(frame.data))) + frame.data
 
 
 def _count_error(node: _Node) -> None:
-    """One that reaches bus-off loses its frame, and comes back at once."""
+    """Count an error; a node at bus-off loses its frame and comes back at once."""
     node.tx_errors += 8
     if node.tx_errors >= _OFF:
         node.tx_errors = 0
@@ -294,7 +294,7 @@ def _count_error(node: _Node) -> None:
 
 
 class SimulatedLink:
-    """The host's adapter on a simulated bus."""
+    """Host's adapter on a simulated bus."""
 
     def __init__(self, bus: SimulatedBus, host: _Host, queue_frames: int) -> None:
         self._bus = bus
@@ -304,11 +304,10 @@ class SimulatedLink:
         self._opened_at = bus.faults.times_unplugged
 
     def __str__(self) -> str:
-        """As messages name it."""
         return "the simulated bus"
 
     def send(self, frame: Frame) -> None:
-        """Queue a frame; while the queue is full, time passes, up to `SEND_LIMIT_S`."""
+        """Queue a frame; wait up to `SEND_LIMIT_S` for room in a full queue."""
         clock = self._bus.clock
         give_up_at = clock.now() + SEND_LIMIT_S
         self._check("sending")
@@ -317,18 +316,18 @@ class SimulatedLink:
                 self._health.is_blocked = True
                 raise TransmitBlockedError(
                     f"The simulated bus took no frame for {SEND_LIMIT_S:g} s.",
-                    cause="nobody on the bus acknowledges"
+                    cause="no node on the bus acknowledges"
                     if self._bus.nobody_acknowledges
                     else "other traffic takes the whole bus",
                 )
             self._bus.advance(give_up_at)
             self._check("sending")
         self._health.sent += 1
-        if not self._bus.faults.is_off:  # as drivers do until they have reported it
+        if not self._bus.faults.is_off:  # as drivers do until they report it
             self._host.outbox.append((clock.now(), frame))
 
     def receive(self, deadline: float) -> Frame | None:
-        """Let time pass until a frame arrives or the deadline comes."""
+        """Advance time until a frame arrives or the deadline comes."""
         inbox = self._host.inbox
         self._check_plugged("receiving")
         while not inbox:
@@ -341,7 +340,7 @@ class SimulatedLink:
         return frame
 
     def drain(self) -> int:
-        """Forget what has arrived, but not what the adapter reported."""
+        """Discard received frames, but count the adapter's reports."""
         count = len(self._host.inbox)
         for frame in self._host.inbox:
             self._health.hear(frame)
@@ -352,9 +351,9 @@ class SimulatedLink:
         """Nothing to release."""
 
     def reopen(self) -> None:
-        """Be there again, with empty queues. Raises BusError while the adapter is not back."""
+        """Reopen with empty queues. Raises BusError while the adapter is not back."""
         faults = self._bus.faults
-        self._bus.advance(self._bus.clock.now())  # somebody else may have let time pass
+        self._bus.advance(self._bus.clock.now())  # time may have passed elsewhere
         if not faults.is_plugged:
             raise BusError(
                 "The adapter cannot be opened: it is not there.",
@@ -372,7 +371,7 @@ class SimulatedLink:
 
     @property
     def is_off(self) -> bool:
-        """True while the adapter is bus-off by its own report."""
+        """True while the adapter reports bus-off."""
         return self._health.state is ControllerState.BUS_OFF
 
     @property
@@ -380,7 +379,7 @@ class SimulatedLink:
         return False
 
     def health(self) -> LinkHealth:
-        """As an adapter on Linux tells it: error-active unless something befell it."""
+        """Report like an adapter on Linux: error-active unless there was a fault."""
         faults = self._bus.faults
         if not faults.is_plugged:
             return self._health.health()

@@ -1,6 +1,6 @@
-"""What can happen to the host's adapter on a simulated bus, and what it reports of it.
+"""Faults of the host's adapter on a simulated bus, and its error frames.
 
-It is pulled out, it goes bus-off, or it is alone, with nobody to acknowledge. The error frames are
+The adapter is unplugged, goes bus-off, or is alone, without acknowledgement. The error frames are
 those of Linux's SocketCAN drivers. Pure: time is an argument.
 """
 
@@ -13,13 +13,15 @@ from flasher.bus.health import PASSIVE_LIMIT, WARNING_LIMIT
 from flasher.protocol.frame import Frame
 
 _ERRORS_PER_TRY: Final = 8
-"""A frame without acknowledgement raises the transmit counter by this."""
+"""Increase of the transmit error counter per frame without acknowledgement."""
 _ERROR_BITS: Final = 20
-"""Error flag, delimiter and the pause after it, about."""
+"""Error flag, delimiter and following pause, approximately."""
 
 
 def _error_frame(classes: int, controller: int = 0, tx_errors: int = 0) -> Frame:
-    """As Linux lays it out: class bits in the id, controller state and counters in the data."""
+    """Create a frame in Linux's format: class bits in the id, controller state and counters in the
+    data.
+    """
     return Frame(classes, bytes((0, controller, 0, 0, 0, 0, tx_errors, 0)), is_error=True)
 
 
@@ -31,28 +33,28 @@ ACTIVE_AGAIN: Final = _error_frame(0x204, 0x40)
 
 
 class AdapterFaults:
-    """The adapter's troubles; without any it is plugged in and takes part."""
+    """Fault state of the adapter; initially plugged in and working."""
 
     def __init__(self) -> None:
         self.is_plugged = True
         self.is_off = False
         self.is_alone = False
-        """True while nobody acknowledges."""
+        """True while no node acknowledges."""
         self.times_unplugged = 0
-        """A link opened before the last time is lost until it is opened again."""
+        """A link opened before the last time must be opened again."""
         self.due_at = inf
-        """When something is to happen next; infinite while nothing is."""
+        """Time of the next event; infinite without one."""
         self._back_at: float | None = None
         self._reports: list[tuple[float, Frame]] = []
         self._has_reported = False
 
     @property
     def takes_part(self) -> bool:
-        """True when its frames leave and others' frames arrive."""
+        """True if its frames are sent and others' frames are received."""
         return self.is_plugged and not self.is_off and not self.is_alone
 
     def unplug(self, back_at: float | None) -> None:
-        """Pull it out; it is back at a time, or when it is plugged in."""
+        """Unplug it until a time, or until it is plugged in."""
         self.is_plugged = False
         self.times_unplugged += 1
         self._back_at = back_at
@@ -60,14 +62,14 @@ class AdapterFaults:
         self._look_ahead()
 
     def go_off(self, now: float, back_at: float | None) -> None:
-        """Bus-off, until a time or until it is plugged in anew."""
+        """Go bus-off until a time, or until it is plugged in again."""
         self.is_off = True
         self._back_at = back_at
         self._reports = [(now, BUS_OFF)]
         self._look_ahead()
 
     def come_back(self, now: float) -> None:
-        """Plugged in, and its controller started anew."""
+        """Plug it in and restart its controller."""
         if self.is_off and self.is_plugged:
             self._reports.append((now, RESTARTED))
         self.is_plugged, self.is_off = True, False
@@ -75,14 +77,16 @@ class AdapterFaults:
         self._look_ahead()
 
     def be_alone(self, now: float, *, alone: bool) -> None:
-        """Cut it off from everybody else, or bring it together with them again."""
+        """Isolate it from all other nodes, or reconnect it."""
         if not alone and self._has_reported:
             self._reports = [(now, ACTIVE_AGAIN)]
         self.is_alone, self._has_reported = alone, False
         self._look_ahead()
 
     def try_in_vain(self, now: float, frame_s: float, bit_s: float) -> None:
-        """It sends a frame over and over: the error counter rises to error-passive and stays."""
+        """Repeat a frame without acknowledgement: the error counter rises to error-passive and
+        stays there.
+        """
         if not self.is_alone or self._has_reported:
             return
         self._has_reported = True
@@ -92,7 +96,7 @@ class AdapterFaults:
         self._look_ahead()
 
     def tick(self, now: float) -> list[Frame]:
-        """Come back when it is time; the error frames that the adapter reports now."""
+        """Come back when due; return the error frames to report now."""
         if self._back_at is not None and self._back_at <= now:
             self.come_back(now)
         due = [frame for at, frame in self._reports if at <= now]

@@ -108,7 +108,7 @@ def writing(path: Path, option: str) -> Iterator[Path]:
     """
     check_writable(path, option)
     if path.exists() and not path.is_file():
-        raise _not_written(path, option, "it is no regular file")
+        raise _not_written(path, option, "it is not a regular file")
     part = path.with_name(f".flasher-{token_hex(8)}-part{''.join(path.suffixes[-2:])}")
     try:
         _check_links(path, option)

@@ -1,3 +1,3 @@
-"""A model of an upgradable device, written from the document alone: it shares nothing with the host
-but `flasher.protocol`.
+"""Device model of upgradable devices, written from the documents alone: it shares only
+`flasher.protocol` with the host.
 """

@@ -1,8 +1,7 @@
-"""What runs on a device once its bootloader has started it (R19), and what it may ask of the
-machine that it runs on.
+"""Application of a device model, started by its bootloader (R19), and its interface to the machine.
 
-The base is silent: the documents tell nothing of what WMC and OBC would answer. `bms` answers,
-`clients` ask.
+The base class is silent, because the documents do not describe answers of WMC and OBC. `bms`
+answers, `clients` ask.
 """
 
 from __future__ import annotations
@@ -16,30 +15,28 @@ from flasher.protocol.wire import Message
 
 
 class Port(Protocol):
-    """The machine, as its application sees it."""
+    """The machine, as seen by its application."""
 
     @property
     def is_idle(self) -> bool:
-        """True when everything that was to be sent has been accepted by the bus. What repeats is
-        sent only then, so that a bus that takes nothing does not pile it up.
+        """True if everything was accepted by the bus. Repeated messages are only sent then, so that
+        they do not pile up on a blocked bus.
         """
         ...
 
     def send(self, message: Message) -> None:
-        """Send a message after those before it."""
+        """Queue a message."""
         ...
 
     def emit(self, event: object) -> None:
-        """Tell those who watch."""
+        """Report an event."""
         ...
 
-    def switch_off(self, now: float) -> None:
-        """Cut the machine's own power."""
-        ...
+    def switch_off(self, now: float) -> None: ...
 
 
 class Application:
-    """An application that is silent; base of those that are not."""
+    """Silent application; base class of the others."""
 
     def __init__(self, node: Node, dialect: Dialect) -> None:
         self.node = node
@@ -48,46 +45,45 @@ class Application:
 
     @property
     def hears(self) -> frozenset[int]:
-        """CAN ids of the messages that it takes."""
+        """CAN ids of the messages that it processes."""
         return frozenset()
 
     @property
     def port(self) -> Port:
-        """The machine that it runs on. Raises LookupError before it was attached to one."""
+        """The machine that it runs on. Raises LookupError before `attach`."""
         if self._port is None:
             raise LookupError("an application runs on a machine")
         return self._port
 
     def attach(self, port: Port) -> None:
-        """Put it on the machine that it runs on."""
         self._port = port
 
     def start(self, firmware: str, now: float) -> None:
-        """It starts, with the version text that its image holds."""
+        """Start, with the version text of its image."""
 
     def stop(self) -> None:
-        """A restart, or the power is gone: all is lost but what is kept on purpose."""
+        """Stop at a restart or power loss; only stored data are kept."""
 
     def heard(self, now: float) -> None:
-        """A frame was received, from any node."""
+        """Note a received frame of any node."""
 
     def take(self, message: Message, now: float) -> None:
-        """An intact message arrived on one of the ids that it hears."""
+        """Process an intact message on one of its ids."""
 
     def hold_key(self, now: float) -> None:
-        """The key was held for as long as it takes to switch off."""
+        """The key was held long enough to switch off."""
 
     @property
     def due_at(self) -> float:
-        """When it next wants `tick`; infinite while it waits for others."""
+        """When to call `tick` next; infinite for never."""
         return inf
 
     def tick(self, now: float) -> None:
-        """The time that it asked for has come."""
+        """Process the time `due_at`."""
 
 
 def ids_heard_by(node: Node, dialect: Dialect) -> frozenset[int]:
-    """CAN ids of all messages of the documents that others send to `node`, or to all."""
+    """CAN ids of all documented messages that others send to `node` or broadcast."""
     return frozenset(
         item.can_id
         for item in ITEMS
@@ -96,16 +92,16 @@ def ids_heard_by(node: Node, dialect: Dialect) -> frozenset[int]:
 
 
 def due_again(due_at: float, delay_s: float, now: float) -> float:
-    """When something that repeats is due again: `delay_s` after it was due, so that lateness does
-    not add up, but after `now` where that is over already, or where it was not due.
+    """Next time of something periodic: `delay_s` after it was due, so that delays do not add up;
+    but `delay_s` after `now` if that has passed, or it was not due.
     """
     following = due_at + delay_s
     return following if now < following < inf else now + delay_s
 
 
 def due_until(due_at: float, delay_s: float, end: float, now: float) -> float:
-    """The same, but `end` once that is nearer than half of `delay_s`: what is repeated last keeps
-    its time to be answered, whatever the sums of times say.
+    """Same as `due_again`, but `end` if that is closer than half of `delay_s`, so that the last
+    repetition keeps its time for an answer.
     """
     following = due_again(due_at, delay_s, now)
     return end if following > end - delay_s / 2 else following

@@ -1,7 +1,6 @@
-"""A battery model: charge, cells, temperature and current as functions of the time.
+"""Battery model: charge, cells, temperature and current as functions of time.
 
-Without random numbers and without a running simulation: the same time gives the same answer. Time
-counts from the first call.
+Deterministic: the same time gives the same values. Time counts from the first call.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ CELLS_FITTED: Final = 10
 DESIGN_CAPACITY_MAH: Final = 10_000
 DESIGN_VOLTAGE_V: Final = 36
 FULL_CAPACITY_MAH: Final = 9_800
-"""What is left of the design capacity."""
+"""Remaining part of the design capacity."""
 STATE_OF_HEALTH_PERCENT: Final = 98
 RESTING_CURRENT_MA: Final = -8
-"""What its own electronics take: less than either dialect's limit for an idle bus."""
+"""Consumption of its own electronics: below either dialect's limit for an idle bus."""
 
 Use = Literal["riding", "resting"]
 
 _RIDE_S: Final = 2 * 3600
 _CHARGE_S: Final = 3 * 3600
 _RIDES_FROM, _RIDES_TO = 0.85, 0.25
-"""Share of the full capacity at which a ride begins and ends."""
+"""Share of the full capacity at the beginning and the end of a ride."""
 _SWAY_S: Final = 20.0
-"""Period with which the current varies about its mean, as on hills."""
+"""Period of the current's variation, as on hills."""
 _SWAY: Final = 0.6
 _FIRST_RIDE_AT_S: Final = 900.0
 """The first call is a quarter of an hour into a ride."""
@@ -42,7 +41,7 @@ _WARMING_C: Final = 11.0
 
 @dataclass(frozen=True)
 class Reading:
-    """The battery at one moment; a discharging current is negative."""
+    """State of the battery at one time; a discharging current is negative."""
 
     elapsed_s: float
     current_ma: int
@@ -50,11 +49,11 @@ class Reading:
     temperature_c: int
     status: BatteryStatus
     cells_mv: tuple[int, ...]
-    """One voltage for each cell that the messages have room for; absent cells are 0."""
+    """One voltage per cell of the messages; absent cells are 0."""
 
     @property
     def voltage_mv(self) -> int:
-        """Of all cells together."""
+        """Of all cells."""
         return sum(self.cells_mv)
 
     @property
@@ -64,7 +63,9 @@ class Reading:
 
 
 class Battery:
-    """Rides and charges in turn for ever, or rests; `seed` decides how its cells differ."""
+    """Alternates between riding and charging, or rests; `seed` determines the differences between
+    its cells.
+    """
 
     def __init__(self, use: Use = "riding", seed: int = 1) -> None:
         self._use = use
@@ -72,7 +73,7 @@ class Battery:
         self._began_at: float | None = None
 
     def at(self, now: float) -> Reading:
-        """The battery at `now` (seconds)."""
+        """Return the state at `now` (seconds)."""
         if self._began_at is None:
             self._began_at = now
         elapsed_s = now - self._began_at
@@ -116,7 +117,7 @@ class Battery:
 
 
 def _spread(seed: int) -> list[int]:
-    """How far each cell is from the mean: the same for the same seed."""
+    """Deviation of each cell from the mean, determined by the seed."""
     spread_mv, state = [], seed
     for _ in range(CELLS_FITTED):
         state = (state * 1_103_515_245 + 12_345) % 2**31

@@ -1,8 +1,8 @@
-"""The application of a BMS: answers every query and write of chapter 3, tells its faults, and runs
-the shutdown handshake.
+"""BMS application: answers all queries and writes of chapter 3, reports faults, and runs the
+shutdown handshake.
 
-What a message looks like, and which one answers which, comes from the catalogue. What was written
-is kept through power cuts and upgrades, as in a memory of its own.
+Formats and answers of messages come from the catalogue. Written data survive power cuts and
+upgrades.
 """
 
 from __future__ import annotations
@@ -40,21 +40,22 @@ from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
 
 SHUTDOWN_PERIOD_S: Final = 0.2
-"""The announcement is repeated at this interval until all others are ready."""
+"""Interval of the announcement until all other nodes are ready."""
 SHUTDOWN_DELAY_S: Final = 1.0
-"""From the first announcement to the opening of the discharge switch, whoever answered."""
+"""From the first announcement to the opening of the discharge switch, regardless of answers."""
 FAULT_PERIOD_S: Final = 0.2
-"""Faults are told at this interval while any is set (5.1)."""
+"""Interval of fault messages while any fault is set (5.1)."""
 IDLE_SHUTDOWN_S: Final = 30 * 60.0
-"""A bus idle for this long, at a small pack current throughout, switches the battery off (5.1)."""
+"""A bus idle for this long, with a small pack current throughout, switches the battery off
+(5.1)."""
 IDLE_CURRENT_MA: Final = {WELLING: 50, MOTINOVA: 20}
-"""What is a small current (section 6)."""
+"""Limit of a small current (section 6)."""
 CURRENT_PERIOD_S: Final = 1.0
-"""How often the pack current is looked at meanwhile."""
+"""Interval of current checks meanwhile."""
 _FEEDBACK_IDS: Final = {
     can_id(node, Node.BMS): can_id(Node.BMS, node) for node in Node if node is not Node.BMS
 }
-"""Where a write is confirmed, by the id that it came on: 2.2.1(2) goes by the sender."""
+"""Id of the confirmation, by id of the write: it goes to the sender (2.2.1(2))."""
 _WRITE: Final = "write "
 _CELL_MODEL: Final = "21700A"
 _ID_FILLER: Final = b"\x01"
@@ -63,12 +64,12 @@ _NO_STATE_OF_HEALTH: Final = 0
 _NEWER_QUERIES: Final = frozenset(
     {(Node.OBC, contents.CellVoltages), (Node.HMI, contents.CellVoltages)}
 )
-"""Queries, by sender and content of the answer, that an older battery does not answer (section 6).
-"""
+"""Queries, by sender and content of the answer, that an older battery does not answer (section
+6)."""
 
 
 class Shutdown:
-    """One shutdown handshake (5.1): announce, collect the others' answers, switch off."""
+    """Shutdown handshake (5.1): announce, collect the answers, switch off."""
 
     def __init__(self, dialect: Dialect, port: Port, why: str, now: float) -> None:
         self._port = port
@@ -91,7 +92,7 @@ class Shutdown:
                 self.due_at = self._off_at
 
     def tick(self, now: float) -> None:
-        """Announce again, or switch off."""
+        """Repeat the announcement, or switch off."""
         if now >= self._off_at:
             self._port.emit(ShutdownEnded(_names(self._answered), _names(self._missing)))
             self._port.switch_off(now)
@@ -102,7 +103,7 @@ class Shutdown:
 
 
 class BmsApplication(Application):
-    """The BMS; `kept` holds what can be written, by the names of the catalogue."""
+    """BMS application; `kept` has the writable items by their names in the catalogue."""
 
     def __init__(self, profile: DeviceProfile, memory: MemoryMap) -> None:
         super().__init__(Node.BMS, DIALECTS[profile.dialect])
@@ -115,7 +116,8 @@ class BmsApplication(Application):
         self._shutdown: Shutdown | None = None
         self._fault_due_at = inf
         self._idle_since: float | None = None
-        """Since when there was no frame, and the current was small; None before the first tick."""
+        """Time since which there was no frame and the current was small; None before the first
+        tick."""
         self._current_due_at = -inf
         self._faults_item = _sent_item(contents.Faults, self.dialect)
         self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
@@ -156,17 +158,17 @@ class BmsApplication(Application):
         if self._fault_due_at <= now:
             if self.port.is_idle:
                 self.port.send(encode(self._faults_item, contents.Faults(self.faults)))
-            self._idle_since = now  # its own frames keep the bus busy too
+            self._idle_since = now  # its own frames count as traffic
             self._fault_due_at = due_again(self._fault_due_at, FAULT_PERIOD_S, now)
         if self._idle_due_at <= now:
             self._look_at_current(now)
         if self._shutdown is not None:
             self._shutdown.tick(now)
 
-    # -- what happens to it -----------------------------------------------------------------------
+    # -- faults and shutdown ----------------------------------------------------------------------
 
     def set_faults(self, faults: BatteryFault, now: float) -> None:
-        """These faults are set from now on, and no other."""
+        """Set exactly these faults."""
         self.faults = faults
         if not faults:
             self._fault_due_at = inf
@@ -174,7 +176,7 @@ class BmsApplication(Application):
             self._fault_due_at = now
 
     def hold_key(self, now: float) -> None:
-        """The key was held for 3 s: announce shutdown, then switch off."""
+        """Announce shutdown after the key was held for 3 s, then switch off."""
         self._announce_shutdown("key held", now)
 
     def _announce_shutdown(self, why: str, now: float) -> None:
@@ -186,7 +188,7 @@ class BmsApplication(Application):
     def _idle_due_at(self) -> float:
         if self.profile.idle_shutdown == "off" or self._shutdown is not None:
             return inf
-        # Without a frame so far, the time counts from the first tick.
+        # Without any frame, the time counts from the first tick.
         since = self._idle_since
         return -inf if since is None else min(self._current_due_at, since + IDLE_SHUTDOWN_S)
 
@@ -201,11 +203,11 @@ class BmsApplication(Application):
     # -- messages ---------------------------------------------------------------------------------
 
     def take(self, message: Message, now: float) -> None:
-        """Answer a query or a write; anything else of no concern is passed over."""
+        """Answer a query or a write; ignore anything else."""
         decoded = decode(message, self.dialect)
         if decoded is None:
-            # A write that is no row of the dialect is confirmed too, and changes nothing:
-            # 2.2.1(2) has general feedback follow every write, to its sender.
+            # A write outside the dialect is confirmed too, and changes nothing: every write is
+            # followed by general feedback to its sender (2.2.1(2)).
             answer_id = _FEEDBACK_IDS.get(message.can_id)
             is_silent = self.profile.is_silent_to(message.can_id, message.command)
             if answer_id is not None and message.mode == Mode.WRITE and not is_silent:
@@ -226,7 +228,7 @@ class BmsApplication(Application):
         if isinstance(content, contents.Handshake) and content != contents.Handshake():
             return
         name = item.title.removeprefix(_WRITE)
-        if item.mode is Mode.WRITE and name in self.kept:  # not so a reset with another text
+        if item.mode is Mode.WRITE and name in self.kept:  # excludes a reset with another text
             before, self.kept[name] = self.kept[name], content
             self.port.emit(DeviceWritten(name, _shown(before), _shown(content)))
         reply = self._reply(answer, content, now)
@@ -243,7 +245,7 @@ class BmsApplication(Application):
         return None if reader is None else reader(now)
 
     def _read_memory(self, wanted: contents.ReadMemory) -> Content | None:
-        """The memory asked for; nothing where there is none, and for more than fits (R5)."""
+        """Return the requested memory; None if there is none, or for more than fits (R5)."""
         found = None
         if 0 < wanted.end - wanted.start <= contents.MEMORY_PIECE_SIZE:
             found = self._memory.read(wanted.start, wanted.end)
@@ -254,7 +256,7 @@ class BmsApplication(Application):
         padded = found.ljust(contents.MEMORY_PIECE_SIZE, b"\xff")
         return contents.Memory(wanted.start, wanted.end, padded)
 
-    # -- what changes by itself -------------------------------------------------------------------
+    # -- measured values ---------------------------------------------------------------------------
 
     def _running_information(self, now: float) -> Content:
         reading = self.battery.at(now)
@@ -282,7 +284,7 @@ class BmsApplication(Application):
         )
 
     def _history(self, now: float) -> Content:
-        """The history of a battery whose protections never acted."""
+        """History of a battery whose protections never acted."""
         return contents.History(
             highest_cell_temperature_c=45,
             lowest_cell_temperature_c=-5,
@@ -306,9 +308,7 @@ class BmsApplication(Application):
 
 
 def _factory_settings(profile: DeviceProfile) -> dict[str, Content]:
-    """What leaves the factory, by the title of the message that reads or, without "write", writes
-    it.
-    """
+    """Initial items, by the title of the message that reads or, without "write", writes them."""
     design = contents.DesignInformation(
         DESIGN_CAPACITY_MAH, DESIGN_VOLTAGE_V, _text(_CELL_MODEL, 8)
     )
@@ -333,14 +333,14 @@ def _text(text: str, size_bytes: int = VERSION_FIELD_SIZE) -> WireText:
 
 
 def _version_text(text: str) -> WireText:
-    """A text as a field; one that fills the field has no terminator, a longer one is cut (R20)."""
+    """Encode a text; one that fills the field has no terminator, a longer one is cut (R20)."""
     if len(text) < VERSION_FIELD_SIZE:
         return _text(text)
     return WireText(text.encode("ascii")[:VERSION_FIELD_SIZE])
 
 
 def _sent_item(content: type[Content], dialect: Dialect) -> Item:
-    """The row of a message that the BMS sends on its own."""
+    """Row of a message that the BMS sends without a query."""
     return next(
         item
         for item in ITEMS

@@ -1,7 +1,7 @@
-"""The applications of WMC, OBC and HMI: what they ask the BMS, when, and how they shut down.
+"""Applications of WMC, OBC and HMI: their queries to the BMS, and their shutdown.
 
-The documents give the messages, not the rhythm: asking follows the rule of chapter 3 (every 200 ms,
-up to 1 s), and how often a question comes again is made up here. Nobody asks these nodes anything.
+The documents describe the messages, not their timing: queries follow the rule of chapter 3 (every
+200 ms, up to 1 s); the intervals between queries are assumptions. No node queries these nodes.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Message
 
 RUNNING_INFORMATION_PERIOD_S: Final = 1.0
-"""How often an OBC asks for running information."""
+"""Interval of an OBC's query for running information."""
 CELL_VOLTAGES_PERIOD_S: Final = 5.0
-"""How often an HMI asks for cell voltages."""
+"""Interval of an HMI's query for cell voltages."""
 PAUSE_S: Final = 1.0
-"""After a question in vain that has to be answered, before it is asked again."""
+"""Pause after an unanswered query that must be answered, before it is repeated."""
 
 
 @dataclass(frozen=True)
 class RoutineQuery:
-    """A query that a node sends when it starts: once, every `period_s`, or until answered."""
+    """Query that a node sends after its start: once, every `period_s`, or until answered."""
 
     title: str
     period_s: float | None = None
@@ -57,8 +57,8 @@ ROUTINES: Final[Mapping[Node, Sequence[RoutineQuery]]] = {
 
 
 class ClientApplication(Application):
-    """A node that asks the BMS what it needs, one question after the other, and gets ready when the
-    BMS announces shutdown. After that it is silent until it starts again.
+    """Node that sends its queries to the BMS one after the other, and confirms when the BMS
+    announces shutdown. Then it is silent until it starts again.
     """
 
     def __init__(self, node: Node, dialect: Dialect, timings: Timings = DEFAULT_TIMINGS) -> None:
@@ -78,7 +78,7 @@ class ClientApplication(Application):
         self._is_asleep = True
         self._said_goodbye = False
         self.answers: dict[str, int] = {}
-        """How often each question was answered, by its title."""
+        """Number of answers per query, by title."""
 
     # -- the machine's side -----------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ class ClientApplication(Application):
     # -- questions --------------------------------------------------------------------------------
 
     def _take_up_again(self, now: float) -> None:
-        """Periodic questions that are due wait their turn, each once."""
+        """Queue each periodic query that is due once."""
         for question in self._questions:
             routine, item = question
             due = self._periodic.get(item.title)
@@ -147,19 +147,19 @@ class ClientApplication(Application):
             self._due_at = now + self._timings.command_repeat_s
 
     def _say(self, item: Item) -> None:
-        # Never more than one copy unsent: a bus that takes nothing would get them all at once.
+        # At most one copy unsent: otherwise a blocked bus would get all of them at once.
         if self.port.is_idle:
             self.port.send(encode(item, item.content()))
 
     # -- messages ---------------------------------------------------------------------------------
 
     def take(self, message: Message, now: float) -> None:
-        """An answer ends its question; a shutdown of the BMS ends them all."""
+        """An answer ends its query; a shutdown of the BMS ends all."""
         decoded = decode(message, self.dialect)
         if decoded is None or self._is_asleep:
             return
         if decoded.item.sender is Node.BMS and decoded.content == contents.Shutdown():
-            # Each announcement asks anew, and each is answered.
+            # Every announcement is answered.
             self._waiting.clear()
             self._periodic.clear()
             self._asked = None

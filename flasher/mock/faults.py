@@ -1,8 +1,8 @@
 """Power cuts of a device at a given moment.
 
-One that matters comes in the middle of a flash operation, at a moment that nobody on the bus can
-know. So it is set beforehand (`FaultInjector.set`), and the injector, an engine around the device,
-lets it happen at that very moment.
+An interesting cut occurs during a flash operation, at a moment that is not visible on the bus. So
+it is scheduled in advance (`FaultInjector.set`), and the injector, an engine around the device,
+executes it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ POWER_OFF_S: Final = 0.5
 
 @dataclass(frozen=True)
 class InOperation:
-    """When `share` (0 to 1) of a flash operation is done, and of `operation` of them that begin
-    from now on, counted from 0: 0.0 is just before anything changed, 1.0 when it is over.
+    """Moment when `share` (0 to 1) of a flash operation is done; `operation` counts from 0 those
+    that begin from now on. 0.0 is just before any change, 1.0 at the end.
     """
 
     operation: int
@@ -29,7 +29,7 @@ class InOperation:
 
 @dataclass(frozen=True)
 class AtTime:
-    """At a time, in seconds on the clock of all calls."""
+    """Time in seconds on the clock of all calls."""
 
     at_s: float
 
@@ -39,18 +39,18 @@ Moment = InOperation | AtTime
 
 @dataclass(frozen=True)
 class PowerCut:
-    """The power goes, and comes back after `off_s` seconds; never with None."""
+    """Power loss of `off_s` seconds; permanent with None."""
 
     off_s: float | None = POWER_OFF_S
 
 
 class FaultInjector:
-    """An engine (`flasher.protocol.engine`): `device`, and one power cut at a time."""
+    """Engine (`flasher.protocol.engine`) around `device` with one scheduled power cut at a time."""
 
     def __init__(self, device: MockDevice) -> None:
         self.device = device
         self.happened = 0
-        """How many cuts happened so far."""
+        """Number of cuts so far."""
         self._cut: PowerCut | None = None
         self._moment: Moment | None = None
         self._operations_before = 0
@@ -59,20 +59,20 @@ class FaultInjector:
         self.cancel, self.take_events = device.cancel, device.take_events
 
     def set(self, cut: PowerCut, moment: Moment) -> None:
-        """Cut the power at `moment`, in place of a cut that is still to come."""
+        """Schedule a cut at `moment`, replacing a pending one."""
         self._cut, self._moment = cut, moment
         self._operations_before = self.device.operations_done
         self._due_at = moment.at_s if isinstance(moment, AtTime) else inf
         self._look_at_flash()
 
     def clear(self) -> None:
-        """Let none happen; power that is off still comes back."""
+        """Cancel a pending cut; power that is off still comes back."""
         self._cut = self._moment = None
         self._due_at = inf
 
     @property
     def is_set(self) -> bool:
-        """True while a cut is still to come."""
+        """True while a cut is pending."""
         return self._cut is not None
 
     # -- the engine interface ---------------------------------------------------------------------
@@ -98,10 +98,10 @@ class FaultInjector:
         due_at = min(self._due_at, self._power_due_at, inf if wanted is None else wanted)
         return None if due_at == inf else due_at
 
-    # -- how it happens ---------------------------------------------------------------------------
+    # -- execution --------------------------------------------------------------------------------
 
     def _look_at_flash(self) -> None:
-        """The moment of an operation is known once it is under way."""
+        """Determine the time of a cut during an operation once that has begun."""
         moment = self._moment
         if isinstance(moment, InOperation):
             begun = self.device.operations_done - self._operations_before
@@ -115,7 +115,7 @@ class FaultInjector:
             self.device.power_on(at_s)
         if self._cut is None or self._due_at > now:
             return
-        # At its own time, not when it was noticed: so much of the operation is done, and no more.
+        # Cut at the scheduled time, so that exactly that share of the operation is done.
         cut, at_s = self._cut, self._due_at
         self.clear()
         self.happened += 1

@@ -1,7 +1,7 @@
-"""What every node of the device model has: reception, sending, one timer, an application.
+"""Base of all nodes of the device model: reception, sending, one timer, an application.
 
-`MockDevice` (`model`) adds the bootloader; a `Unit` is a node without one. One timer is enough, as
-a bootloader waits for one thing in every state; the application has its own.
+`MockDevice` (`model`) adds the bootloader; a `Unit` is a node without one. One timer is enough,
+because a bootloader waits for one thing in every state; the application has its own.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
 
 _UNUSED_WIRE_S: Final = 0.0
-"""Nothing here counts from when a message has left the wire, so its time there is not computed."""
+"""Nothing here depends on the time on the wire, so it is not computed."""
 BUS_OFF_S: Final = 0.02
-"""How long a CAN controller stays off the bus unless told otherwise: longer than the 128 times 11
-bits that the standard asks for, as software has to notice first."""
+"""Default duration of bus-off: longer than the 128 times 11 bits of the standard, because software
+must react first."""
 
 
 class Machine(ABC):
-    """An engine (`flasher.protocol.engine`) that hears the ids of its application and its own
+    """Engine (`flasher.protocol.engine`) that receives the ids of its application and its own
     `own_ids`; base of `MockDevice` and `Unit`.
     """
 
     reassembler_type: ClassVar[type[Reassembler]] = Reassembler
-    """What makes messages of the frames on each id."""
+    """Reassembles messages on each id."""
 
     def __init__(
         self,
@@ -61,11 +61,11 @@ class Machine(ABC):
 
     @property
     def done(self) -> bool:
-        """True once it was cancelled and the message under way was sent."""
+        """True once it was cancelled and the current message was sent."""
         return self._is_cancelled and self._transmitter.idle
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A frame arrived. Only payload on the ids that concern this device is looked at."""
+        """Process a frame; only payload on the ids of this device matters."""
         if self._off_bus_until is not None:
             self._rejoin_bus(now)
         if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
@@ -125,7 +125,7 @@ class Machine(ABC):
         return self._transmitter.idle
 
     def send(self, message: Message) -> None:
-        """Send a message after those before it. Off the bus, it is lost."""
+        """Queue a message. Off the bus, it is lost."""
         if self._off_bus_until is not None:
             return
         frames = split(message.can_id, encode(message))
@@ -138,19 +138,17 @@ class Machine(ABC):
         self.power_cut(now)
 
     def hold_key(self, now: float) -> None:
-        """Somebody held the key for as long as it takes to switch off; the application knows
-        whether that is its business.
-        """
+        """Tell the application that the key was held long enough to switch off."""
         if self._runs_application:
             self.application.hold_key(now)
 
     # -- the bus's faults -------------------------------------------------------------------------
 
     def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
-        """The CAN controller leaves the bus and is back after `off_s` seconds.
+        """Leave the bus for `off_s` seconds.
 
-        What was to be sent is lost, the rest of a message half sent too, and so is everything that
-        is said meanwhile, by others or by the device.
+        Unsent messages are lost, a partly sent one included, and so is everything sent meanwhile by
+        others or by the device.
         """
         self._transmitter = Transmitter(self._bitrate_bps)
         self._off_bus_until = now + off_s
@@ -173,26 +171,26 @@ class Machine(ABC):
 
     @abstractmethod
     def power_cut(self, now: float) -> None:
-        """The power goes, and with it everything but the flash and what is kept on purpose."""
+        """Lose power, and with it everything but flash and stored data."""
 
     @abstractmethod
     def power_on(self, now: float) -> None:
-        """The power comes back."""
+        """Restore power."""
 
     @abstractmethod
     def _take_message(self, message: Message, now: float) -> None:
-        """An intact message arrived."""
+        """Process an intact message."""
 
     @abstractmethod
     def _take_damage(self, damage: Damage, now: float) -> None:
-        """Bytes arrived that were no message."""
+        """Process bytes that are not a message."""
 
     @abstractmethod
     def _expire(self, now: float) -> None:
-        """The timer is over: set it anew, or stop it."""
+        """Handle the expired timer: restart or stop it."""
 
     def _run_timer(self, now: float) -> None:
-        """Let the timer expire as often as it is due; with times of 0 one leads to the next."""
+        """Let the timer expire as often as it is due; times of 0 follow each other at once."""
         while self._due_at <= now:
             self._expire(now)
 
@@ -203,19 +201,19 @@ class Machine(ABC):
         self.emit(DeviceReported(what))
 
     def _forget_received(self) -> None:
-        """Forget every message of which the end is still to come."""
+        """Drop all incomplete messages."""
         for reassembler in self._reassemblers.values():
             reassembler.reset()
 
     def _lose_memory(self) -> None:
-        """Forget everything received, and everything to be sent at once, even half a message."""
+        """Drop everything received, and all unsent messages, a partly sent one included."""
         self._forget_received()
         self._transmitter = Transmitter(self._bitrate_bps)
         self._off_bus_until = None
         self._due_at = inf
 
     def _take(self, found: Message | Damage, now: float) -> None:
-        # A message before this one may have restarted the device.
+        # An earlier message may have restarted the device.
         if self._is_deaf:
             return
         due_before = self._due_at
@@ -224,14 +222,14 @@ class Machine(ABC):
             self._take_damage(found, now)
         else:
             self._take_message(found, now)
-        # What this message began is over at once with times of 0. A timer that ran before waits for
-        # `tick`: messages that were held up somewhere are taken first.
+        # With times of 0, what this message began ends at once. An older timer waits for `tick`, so
+        # that delayed messages are processed first.
         if self._due_at != due_before:
             self._run_timer(now)
 
 
 class Unit(Machine):
-    """A node without a bootloader: its application runs while there is power."""
+    """Node without a bootloader: its application runs while there is power."""
 
     def __init__(self, application: Application, *, bitrate_bps: int, timings: Timings) -> None:
         super().__init__(application, bitrate_bps=bitrate_bps, timings=timings)

@@ -1,8 +1,8 @@
-"""Flash memory as strict as the real thing, and the controller that works on it in time.
+"""Flash memory that is as strict as a real part, and the controller that operates it in time.
 
-What a real part does not allow is an error here: programming what is not erased, off the program
-unit, or outside. An operation can be left half done (`tear_...`), as a power cut leaves it; what is
-torn has to be erased before it is programmed again.
+Operations that a real part does not allow are errors: programming without erasing, off the program
+unit, or outside. An operation can be interrupted (`tear_...`), as by a power cut; torn memory must
+be erased before it is programmed again.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from typing import Final, NamedTuple
 from flasher.errors import FlasherError
 
 ERASED: Final = 0xFF
-"""What an erased byte reads as."""
+"""Value of an erased byte."""
 
 
 class FlashError(FlasherError):
-    """The flash was used in a way that a real part does not allow: a bug of the bootloader."""
+    """Flash was used in a way that a real part does not allow: a bug of the bootloader."""
 
 
 class FlashRangeError(FlashError):
-    """The address lies outside of the memory."""
+    """Address outside the memory."""
 
 
 class FlashAlignmentError(FlashError):
-    """The address or the size does not fit the page or the program unit."""
+    """Address or size does not match the page or the program unit."""
 
 
 class FlashNotErasedError(FlashError):
@@ -35,10 +35,10 @@ class FlashNotErasedError(FlashError):
 
 
 class Flash:
-    """`size_bytes` of flash from address `start`, erased by the page, programmed by the unit.
+    """`size_bytes` of flash from address `start`, erased by page, programmed by unit.
 
-    A unit counts as programmed even when it was programmed with FF, as in parts with ECC. Raises
-    ValueError when the sizes do not divide each other.
+    A unit counts as programmed even if it was programmed with FF, as in parts with ECC. Raises
+    ValueError if the sizes do not divide each other.
     """
 
     def __init__(
@@ -51,16 +51,16 @@ class Flash:
         self.page_size_bytes = page_size_bytes
         self.program_unit_bytes = program_unit_bytes
         self.erase_count = 0
-        """Pages erased to the end."""
+        """Completely erased pages."""
         self.program_count = 0
-        """Program operations carried out to the end."""
+        """Completed program operations."""
         self._erased_page = bytes((ERASED,)) * page_size_bytes
         self._pages: dict[int, bytearray] = {}
-        """By offset, those that are not erased: of megabytes, few pages are ever used."""
+        """Pages that are not erased, by offset; of megabytes, few are ever used."""
         self._used_units: set[int] = set()
 
     def read(self, address: int, size_bytes: int) -> bytes:
-        """The bytes there. Raises FlashRangeError."""
+        """Raises FlashRangeError."""
         offset = self._offset(address, size_bytes)
         first = offset - offset % self.page_size_bytes
         pages = range(first, offset + size_bytes, self.page_size_bytes)
@@ -88,23 +88,23 @@ class Flash:
         self.program_count += 1
 
     def carry_out(self, operation: Operation) -> None:
-        """Erase or program, to the end. Raises as these do."""
+        """Complete an erase or program operation. Raises as these do."""
         if operation.data is None:
             self.erase_page(operation.address)
         else:
             self.program(operation.address, operation.data)
 
     def tear(self, operation: Operation, fraction: float) -> None:
-        """Leave it interrupted after `fraction` of its time (0 to 1). Raises as `carry_out`."""
+        """Interrupt an operation after `fraction` of its time (0 to 1). Raises as `carry_out`."""
         if operation.data is None:
             self.tear_erase(operation.address, fraction)
         else:
             self.tear_program(operation.address, operation.data, fraction)
 
     def tear_erase(self, address: int, fraction: float) -> None:
-        """Leave the erasing of a page interrupted after `fraction` of its time (0 to 1).
+        """Interrupt the erasing of a page after `fraction` of its time (0 to 1).
 
-        That part of the page reads as erased, the rest as before, none of it can be programmed.
+        That part of the page reads as erased, the rest as before; none of it can be programmed.
         Raises as `erase_page`.
         """
         offset = self._page_offset(address)
@@ -113,8 +113,8 @@ class Flash:
         self._used_units.update(self._units(offset, self.page_size_bytes))
 
     def tear_program(self, address: int, data: bytes, fraction: float) -> None:
-        """Leave programming interrupted after `fraction` of its time (0 to 1): units before that
-        are programmed, the one under way half, the rest not at all. Raises as `program`.
+        """Interrupt programming after `fraction` of its time (0 to 1): earlier units are
+        programmed, the current one half, the rest not. Raises as `program`.
         """
         offset = self._programmable_offset(address, data)
         unit = self.program_unit_bytes
@@ -127,7 +127,7 @@ class Flash:
         offset = address - self.start
         if offset < 0 or size_bytes < 0 or offset + size_bytes > self.size_bytes:
             raise FlashRangeError(
-                f"{size_bytes} bytes at 0x{address:08X} lie outside of the flash",
+                f"{size_bytes} bytes at 0x{address:08X} are outside the flash",
                 where=f"flash from 0x{self.start:08X}, {self.size_bytes} bytes",
             )
         return offset
@@ -156,7 +156,7 @@ class Flash:
         return offset
 
     def _put(self, offset: int, data: bytes) -> None:
-        """Let the cells hold `data`, whatever a real part would allow."""
+        """Store `data` without any check."""
         while data:
             place = offset % self.page_size_bytes
             page = self._pages.setdefault(offset - place, bytearray(self._erased_page))
@@ -165,23 +165,23 @@ class Flash:
             offset, data = offset + len(part), data[len(part) :]
 
     def _units(self, offset: int, size_bytes: int) -> range:
-        """The program units that lie there."""
+        """Program units of this range."""
         unit = self.program_unit_bytes
         return range(offset // unit, (offset + size_bytes) // unit)
 
 
 class Operation(NamedTuple):
-    """Something to do to the flash: program `data` at `address`, or erase that page (no data)."""
+    """Flash operation: program `data` at `address`, or erase that page (no data)."""
 
     address: int
     data: bytes | None = None
 
 
 class FlashController:
-    """Carries operations out one after another, each taking its time.
+    """Executes operations one after another, each with its duration.
 
-    An operation changes the memory when its time is over. Cut short, it leaves as much of itself as
-    the time allowed; with times of 0 there is nothing to cut.
+    An operation changes the memory at its end. If interrupted, it leaves a partial change; with
+    times of 0 nothing can be interrupted.
     """
 
     def __init__(self, flash: Flash, *, erase_time_s: float, program_time_s: float) -> None:
@@ -194,24 +194,24 @@ class FlashController:
 
     @property
     def ends_at(self) -> float:
-        """When the operation under way is over; infinite while there is none."""
+        """End of the current operation; infinite without one."""
         reached_at = self.reached_at(1.0)
         return inf if reached_at is None else reached_at
 
     def reached_at(self, share: float) -> float | None:
-        """When `share` (0 to 1) of the operation under way is done; None while there is none."""
+        """Time when `share` (0 to 1) of the current operation is done; None without one."""
         if self._under_way is None:
             return None
         return self._began_at + share * self._duration_s(self._under_way)
 
     def run(self, operations: Iterable[Operation], now: float) -> None:
-        """Begin `operations`, after the one under way; those that still waited are forgotten."""
+        """Queue `operations` after the current one; others that wait are dropped."""
         self._waiting = deque(operations)
         if self._under_way is None:
             self._begin_next(now)
 
     def advance(self, now: float) -> bool:
-        """Finish what is over by now; True when nothing is left to do.
+        """Finish operations that are over; True if nothing is left.
 
         Raises FlashError for an operation that the flash refuses.
         """
@@ -224,7 +224,7 @@ class FlashController:
         return True
 
     def abort(self, now: float) -> None:
-        """Power or clock is gone: leave the operation under way torn, forget the rest."""
+        """Stop without power or clock: tear the current operation, drop the rest."""
         self.advance(now)
         self._waiting.clear()
         operation, self._under_way = self._under_way, None

@@ -1,12 +1,12 @@
-"""The device: a bootloader on a flash of its own, and the application that it starts, written from
-the document alone.
+"""Device model: a bootloader with its flash, and the application that it starts, written from the
+documents alone.
 
-How to read it: a message or an expired timer becomes an event (`_classify`, `_elapsed`), the table
-names the action and the next state, and the actions are the methods below, in the order of the
-states. An action may change everything but the state, and returns a few words for those who watch.
+A message or an expired timer becomes an event (`_classify`, `_elapsed`), the table names the action
+and the next state, and the actions are the methods below, in the order of the states. An action may
+change everything but the state, and returns a short description.
 
-Flash operations take their time in the controller. While they last the device hears, but a packet
-that comes before the answer to the one before is out of turn.
+Flash operations take time in the controller. Meanwhile the device receives, but a packet before the
+answer to the previous one is out of turn.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
-"""Firmware text of an application in whose image no version was found."""
+"""Firmware version of an image without one."""
 AnyRow = messages.UpgradeMessage | messages.Malformed | messages.Unknown
-"""A message as the bootloader takes it."""
+"""Message as processed by the bootloader."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 _DEAF: Final = frozenset((BootloaderState.OFF, BootloaderState.RESTARTING))
 _WORKS_ON_FLASH: Final = frozenset(
@@ -59,7 +59,7 @@ _UNTOLD: Final = (
     (BootloaderState.TRANSFER, BootloaderState.PROGRAMMING),
     (BootloaderState.PROGRAMMING, BootloaderState.TRANSFER),
 )
-"""Changes of state that happen with every packet."""
+"""Unreported changes of state, which occur with every packet."""
 _DURING_END: Final = frozenset((BootloaderState.CHECKING, BootloaderState.STARTING))
 _AFTER_END: Final = _DURING_END | {BootloaderState.REFUSED}
 _WAITS_FOR_UPDATE: Final = frozenset((BootloaderState.ANNOUNCING, BootloaderState.REFUSED))
@@ -69,7 +69,7 @@ _TIMER_EVENTS: Final = {
     BootloaderState.REFUSED: BootloaderEvent.HOLD_OVER,
     **dict.fromkeys(_WORKS_ON_FLASH, BootloaderEvent.FLASH_DONE),
 }
-"""What the timer of a state means when it expires; in the others it depends."""
+"""Event of the expired timer, for states with only one."""
 _UPGRADE: Final = frozenset((Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER))
 _PACKET_HEAD: Final = (
     HEADER
@@ -78,13 +78,13 @@ _PACKET_HEAD: Final = (
     + Command.PACKET.to_bytes(COMMAND_SIZE, "big")
 )
 _NUMBER_AT: Final = PREFIX_SIZE + COMMAND_SIZE + 1
-"""Where the packet number lies: behind the start byte."""
+"""Position of the packet number, after the start byte."""
 _NUMBER_END: Final = _NUMBER_AT + 2
 
 
 @dataclass
 class Transfer:
-    """An image on its way in: its size, and how many of its packets are stored."""
+    """Image being received: its size, and the number of stored packets."""
 
     size_bytes: int
     stored: int = 0
@@ -95,30 +95,29 @@ class Transfer:
 
     @property
     def wanted(self) -> int:
-        """Number of the packet that is next; of the last one when all are stored."""
+        """Number of the next packet; of the last one when all are stored."""
         return min(self.stored + 1, self.total)
 
 
 def is_damaged_packet(damage: Damage) -> bool:
-    """True when damaged bytes begin as a packet does, so that a NAK is due (TX-01)."""
+    """True if damaged bytes begin like a packet, so that a NAK is due (TX-01)."""
     return damage.data.startswith(_PACKET_HEAD)
 
 
 class MockDevice(Machine):
-    """One upgradable device, an engine (`flasher.protocol.engine`).
+    """One upgradable device as an engine (`flasher.protocol.engine`).
 
-    At construction it has been on for a while: its application runs, or, when there is none, its
-    bootloader announces itself from the first time it is given. A BMS has an application that
-    answers, others a silent one unless another is given. Raises UsageError for timings that would
-    make it announce without a pause.
+    It starts powered: its application runs, or, without one, its bootloader announces itself from
+    the first call on. A BMS has an answering application, others a silent one unless another is
+    given. Raises UsageError for timings that would make it announce itself without a pause.
     """
 
     store_type: ClassVar[type[ApplicationStore]] = ApplicationStore
     transfer_type: ClassVar[type[Transfer]] = Transfer
     burst: ClassVar[int] = BOOT_VERSION_BURST
-    """How often it announces itself before it starts the application."""
+    """Number of announcements before it starts the application."""
     in_ram: ClassVar[tuple[str, ...]] = ()
-    """Attributes that a power cut sets back to what the class has."""
+    """Attributes that a power cut resets to the class's values."""
 
     def __init__(
         self,
@@ -153,7 +152,7 @@ class MockDevice(Machine):
         self._announced = 0
         self._has_whole_application = has_application
         self._runs_application = has_application
-        # What the message in hand brought, for the action that follows it.
+        # Contents of the current message, for its action.
         self._offered_bytes = 0
         self._number: int | None = None
         self._payload = b""
@@ -166,39 +165,39 @@ class MockDevice(Machine):
             detail = "no application"
         self._events.append(DeviceStateEntered(self.state.value, detail))
 
-    # -- what tests and the conformance suite look at ---------------------------------------------
+    # -- for tests and the conformance suite -------------------------------------------------------
 
     @property
     def stored_image(self) -> bytes | None:
-        """The image of the whole application in the flash, exactly its size; None without one."""
+        """Image of the complete application in flash; None without one."""
         return self.store.image()
 
     @property
     def erase_count(self) -> int:
-        """Pages erased to the end since construction."""
+        """Pages erased since construction."""
         return self.store.flash.erase_count
 
     @property
     def program_count(self) -> int:
-        """Program operations (a packet, or the final record) done to the end since construction."""
+        """Program operations (a packet, or the final record) completed since construction."""
         return self.store.flash.program_count
 
     @property
     def operations_done(self) -> int:
-        """Flash operations, erasing a page or programming, done to the end since construction."""
+        """Erase and program operations completed since construction."""
         return self.erase_count + self.program_count
 
     def readback(self, size_bytes: int | None = None) -> bytes:
-        """The first `size_bytes` of the application area, whole or torn, as a debugger reads them;
-        all of it without a size.
+        """First `size_bytes` of the application area (None: all), complete or torn, as read by a
+        debugger.
         """
         return self.store.read(
             self.profile.application_area_bytes if size_bytes is None else size_bytes
         )
 
     def operation_reaches(self, share: float) -> float | None:
-        """When `share` (0 to 1) of the flash operation under way is done: the time for a power cut
-        in the middle of it. None while there is none.
+        """Time when `share` (0 to 1) of the current flash operation is done, for a power cut during
+        it. None without one.
         """
         return self._controller.reached_at(share)
 
@@ -209,11 +208,11 @@ class MockDevice(Machine):
         return self.state is not BootloaderState.OFF
 
     def power_cut(self, now: float) -> None:
-        """The power goes: all is lost but the flash, and an operation under way stays torn."""
+        """Lose everything but the flash; the current operation stays torn."""
         self._handle(BootloaderEvent.POWER_CUT, now)
 
     def power_on(self, now: float) -> None:
-        """The power comes back; the device passes through its bootloader (R19)."""
+        """Restart through the bootloader (R19)."""
         self._handle(BootloaderEvent.POWER_ON, now)
         self._run_timer(now)
 
@@ -221,7 +220,7 @@ class MockDevice(Machine):
 
     def _take_message(self, message: Message, now: float) -> None:
         self._message = message
-        # On other ids there is nothing for a bootloader, whatever the command.
+        # A bootloader ignores other ids, whatever the command.
         if message.can_id == self.target.request_id:
             self._take_row(messages.decode(message), now)
         else:
@@ -246,8 +245,8 @@ class MockDevice(Machine):
             self._handle(BootloaderEvent.PACKET_BAD, now)
 
     def _classify(self, row: AnyRow) -> BootloaderEvent:
-        """The event that a message is. Where the profile decides whether it changes the state, that
-        is decided here; where it decides what is answered only, the action does.
+        """Event of a message. Choices of the profile that change the state are applied here; those
+        that only change the answer are in the action.
         """
         if self.state is BootloaderState.APPLICATION:
             return _in_application(row)
@@ -283,7 +282,7 @@ class MockDevice(Machine):
             return BootloaderEvent.UPDATE_REFUSED
         if state in _WAITS_FOR_UPDATE:
             return BootloaderEvent.UPDATE
-        # One transfer, however often the host says it before packet 1 (UP-05).
+        # Repeated update commands before packet 1 are one transfer (UP-05).
         is_begun = state is BootloaderState.PROGRAMMING or transfer.stored
         if not is_begun and row.size_bytes == transfer.size_bytes:
             return BootloaderEvent.UPDATE_AGAIN
@@ -312,7 +311,7 @@ class MockDevice(Machine):
         return BootloaderEvent.END_WHOLE if self._accepts_image() else BootloaderEvent.END_WRONG
 
     def _accepts_image(self) -> bool:
-        """False when the product's images carry a checksum and this one's is wrong (R7)."""
+        """False if the product's images have a checksum and this one's is wrong (R7)."""
         if self.profile.image_checksum == "none":
             return True
         return checksum_fits(self.store.read(self._transfer.size_bytes))
@@ -324,7 +323,7 @@ class MockDevice(Machine):
             self._handle(self._elapsed(), now)
 
     def _elapsed(self) -> BootloaderEvent:
-        """What the expired timer means."""
+        """Event of the expired timer."""
         if self.state is BootloaderState.ANNOUNCING:
             if self._announced < self.burst or not self._has_whole_application:
                 return BootloaderEvent.ANNOUNCEMENT_DUE
@@ -373,7 +372,7 @@ class MockDevice(Machine):
         return "reset"
 
     def _restart(self, now: float) -> str:
-        """Without a word: general feedback is the application's (R15)."""
+        """Restart without general feedback, which is the application's (R15)."""
         self._transmitter.drop_unstarted()
         self._await_restart(now)
         return "into the bootloader"
@@ -384,14 +383,14 @@ class MockDevice(Machine):
         self._due_at = now + self.profile.reset_delay_s
 
     def _boot(self, now: float) -> str:
-        """Only what is whole may be started; without it the announcements go on (R14)."""
+        """Only a complete application is started; without one the announcements continue (R14)."""
         self._has_whole_application = self.store.image() is not None
         self._announced = 0
         self._due_at = now
         return "whole application" if self._has_whole_application else "no application"
 
     def _announce(self, now: float) -> str:
-        # A bus that takes nothing must not pile announcements up.
+        # Announcements must not pile up on a blocked bus.
         if not self._announced or self._transmitter.idle:
             version = self.profile.boot_version
             self._send(messages.BootVersion(self.target.boot_name, version))
@@ -412,7 +411,7 @@ class MockDevice(Machine):
         return f"version {firmware}"
 
     def _firmware(self) -> str:
-        """Version text in the image of the application."""
+        """Version in the image of the application."""
         return find_firmware_version(self.store.image() or b"") or NO_VERSION
 
     # -- actions: update command and transfer -----------------------------------------------------
@@ -425,7 +424,7 @@ class MockDevice(Machine):
         return ""
 
     def _erase(self, now: float) -> str:
-        """The record first, then the pages."""
+        """Erase the record first, then the pages."""
         self._transmitter.drop_unstarted()
         self._transfer = self.transfer_type(self._offered_bytes)
         self._work(self.store.erasing(self._offered_bytes), now)
@@ -439,7 +438,7 @@ class MockDevice(Machine):
         return self._reply(messages.RequestTransfer(), now)
 
     def _reply(self, row: messages.UpgradeMessage | None, now: float) -> str:
-        """Answer, or say nothing, and wait for what the host sends next."""
+        """Answer, or stay silent, and wait for the host."""
         if row is not None:
             self._send(row)
         self._await_host(now)
@@ -462,7 +461,7 @@ class MockDevice(Machine):
         return self._reply(messages.Ack(transfer.stored), now)
 
     def _answer_repeated(self, now: float) -> str:
-        """The first copy stays, whatever the second one holds (TX-05)."""
+        """Keep the first copy, whatever the second contains (TX-05)."""
         stored = self._transfer.stored
         if self.profile.repeated_packet == "ack":
             return self._reply(messages.Ack(stored), now)
@@ -501,7 +500,7 @@ class MockDevice(Machine):
         return ""
 
     def _refuse_end(self, now: float) -> str:
-        """The number in it is that of the packet wanted, of the last one when all are there."""
+        """Send NAK with the number of the next packet, or the last one when all are stored."""
         self._send(messages.Nak(self._transfer.wanted))
         if self.state is BootloaderState.REFUSED:
             self._due_at = now + self.profile.refused_hold_s
@@ -522,19 +521,19 @@ class MockDevice(Machine):
         return ""
 
     def _send(self, row: messages.UpgradeMessage) -> None:
-        """Send one of the upgrade's messages to the tool."""
+        """Send an upgrade message to the tool."""
         self.send(row.to_message(self.target.answer_id))
 
 
 def _in_application(row: AnyRow) -> BootloaderEvent:
-    """The event that a message to the running application is."""
+    """Event of a message to the running application."""
     match row:
         case messages.ResetCommand():
             return BootloaderEvent.RESET
         case messages.UpdateCommand() | messages.Packet() | messages.EndOfTransfer():
             return BootloaderEvent.UPGRADE_IN_APPLICATION
         case messages.Malformed():
-            # A write like others, which may be confirmed (2.2.1(2), R17).
+            # Like any write it may be confirmed (2.2.1(2), R17).
             is_upgrade = row.message.mode == Mode.WRITE and row.message.command in _UPGRADE
             return BootloaderEvent.UPGRADE_IN_APPLICATION if is_upgrade else BootloaderEvent.QUERY
         case messages.Unknown():

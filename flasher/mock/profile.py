@@ -1,7 +1,7 @@
-"""What a device may choose where the document leaves it open: one frozen dataclass.
+"""Device profile: the choices of a device where the documents leave them open.
 
-The cases of the conformance suite marked P name these choices. An option's allowed values are its
-type, and its help stands behind it; `flasher.settings.device_model` sets them from texts.
+Cases of the conformance suite marked P name these choices. An option's type gives its allowed
+values, the docstring after it its help; `flasher.settings.device_model` sets options from texts.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ NumberOrNone = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceProfile:
-    """The choices of one product; the defaults are this project's readings.
+    """Choices of one product; the defaults are this project's readings.
 
-    Raises UsageError when a value is not allowed.
+    Raises UsageError for an invalid value.
     """
 
     # Reset and announcements.
@@ -144,17 +144,17 @@ class DeviceProfile:
 
     @property
     def image_limit_bytes(self) -> int:
-        """Size of the largest image that is accepted."""
+        """Maximum size of an accepted image."""
         limit = self.largest_image_bytes
         area = min(self.application_area_bytes, IMAGE_MAX_SIZE)
         return area if limit is None else min(limit, area)
 
     def speaking(self, dialect: Dialect) -> Self:
-        """The same product with an application of this dialect."""
+        """Return the same product with an application of this dialect."""
         return replace(self, dialect=dialect.name)  # type: ignore[arg-type]
 
     def is_silent_to(self, can_id: int, command: int) -> bool:
-        """True for a query or write that `silent_queries` names."""
+        """True for a query or write listed in `silent_queries`."""
         return (None, command) in self._silent or (can_id, command) in self._silent
 
     @cached_property
@@ -201,13 +201,13 @@ class DeviceProfile:
 
 @cache  # evaluating the types takes longer than all that is checked by them
 def _choices() -> dict[str, tuple[str, ...]]:
-    """The words of every option that is a choice."""
+    """Words of every option that is a choice."""
     hints = get_type_hints(DeviceProfile).items()
     return {key: get_args(hint) for key, hint in hints if get_origin(hint) is Literal}
 
 
 def _parse_query(text: str) -> tuple[int | None, int]:
-    """`COMMAND` or `ID:COMMAND`, both in hexadecimal, as (id or None, command)."""
+    """Parse `COMMAND` or `ID:COMMAND`, both in hexadecimal, as (id or None, command)."""
     can_id, _, command = text.strip().rpartition(":")
     try:
         return (int(can_id, 16) if can_id else None), int(command, 16)

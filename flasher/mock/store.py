@@ -1,9 +1,9 @@
-"""What stands where in the memory of a device: the application, the record that says that it is
-whole, and the rest for those who read memory (0x4308).
+"""Memory layout of a device: the application, the record that marks it complete, and other memory
+for memory reads (0x4308).
 
-The application area is followed by one page for the record. The record is erased before anything
-else and written after everything else, its magic last, so a power cut at any moment leaves either
-a whole application or none: what boots is never a mixture.
+One page for the record follows the application area. The record is erased before everything else
+and written last, its magic at the end, so that a power cut at any moment leaves either a complete
+application or none.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
 AREA_START: Final = 0x0800_8000
-"""Address of the application area. Nothing on the wire depends on it (R8)."""
+"""Address of the application area; not visible on the wire (R8)."""
 _RECORD: Final = Struct("<II8s")
 _MAGIC: Final = b"WHOLEAPP"
 _CHECKSUM: Final = Struct("<I")
 _FACTORY_IMAGE_BYTES: Final = 500
 _ROM_START: Final = 0x0800_0000
 _ROM_SIZE_BYTES: Final = AREA_START - _ROM_START
-"""The bootloader, up to where the application area begins."""
+"""The bootloader, up to the application area."""
 _RAM_START: Final = 0x2000_0000
 _RAM_SIZE_BYTES: Final = 0x5000
 
 
 def checksum_fits(image: bytes) -> bool:
-    """True when the last four bytes are the CRC-32 of those before, little-endian (R7)."""
+    """True if the last four bytes are the CRC-32 of those before, little-endian (R7)."""
     body = image[: -_CHECKSUM.size]
     return len(image) > _CHECKSUM.size and _CHECKSUM.pack(zlib.crc32(body)) == image[len(body) :]
 
 
 def with_checksum(body: bytes, size_bytes: int) -> bytes:
-    """`body`, filled up with bytes that are not all alike, and the checksum of R7 behind it."""
+    """Return `body`, filled up with varying bytes, and with the checksum of R7 appended."""
     body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM.size))
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
 def factory_image(profile: DeviceProfile) -> bytes:
-    """The application that a device leaves the factory with: its version among filler, and the
-    checksum of R7, so that every profile accepts it.
+    """Initial application of a device: its version among filler, and the checksum of R7, so that
+    every profile accepts it.
     """
     size_bytes = min(_FACTORY_IMAGE_BYTES, profile.application_area_bytes)
     body = b"factory application " + profile.factory_version.encode("ascii") + b"\x00"
@@ -52,7 +52,7 @@ def factory_image(profile: DeviceProfile) -> bytes:
 
 
 class ApplicationStore:
-    """The application area and its record, on a flash of their own size."""
+    """Application area and its record, on their own flash."""
 
     flash_type: ClassVar[type[Flash]] = Flash
 
@@ -68,7 +68,7 @@ class ApplicationStore:
         )
 
     def image(self) -> bytes | None:
-        """The image that the record vouches for, exactly its size; None unless all of it fits."""
+        """Return the image described by the record; None unless it is intact."""
         size_bytes, crc, magic = _RECORD.unpack(self.flash.read(self._record_address, _RECORD.size))
         if magic != _MAGIC or not 0 < size_bytes <= self._area_bytes:
             return None
@@ -79,44 +79,42 @@ class ApplicationStore:
         return zlib.crc32(image) == crc
 
     def read(self, size_bytes: int) -> bytes:
-        """The first bytes of the area, whole or not."""
+        """Return the first bytes of the area, complete or not."""
         return self.flash.read(AREA_START, size_bytes)
 
     def erasing(self, size_bytes: int) -> list[Operation]:
-        """What makes room for an image: the record first, then the pages."""
+        """Operations that erase memory for an image: the record first, then the pages."""
         area_bytes = self._area_bytes if self._erases_all else size_bytes
         pages = range(AREA_START, AREA_START + area_bytes, self.flash.page_size_bytes)
         return [Operation(self._record_address), *(Operation(page) for page in pages)]
 
     def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
-        """What stores packet `number` of an image of `size_bytes`.
+        """Operation that stores packet `number` of an image of `size_bytes`.
 
-        Bytes beyond the size are not stored, whatever they are (TX-08).
+        Bytes beyond the size are not stored (TX-08).
         """
         offset = (number - 1) * PACKET_DATA_SIZE
         return Operation(AREA_START + offset, self._units(payload[: size_bytes - offset]))
 
     def recording(self, size_bytes: int) -> Operation:
-        """What declares the first `size_bytes` of the area, as they are, a whole application."""
+        """Operation that records the first `size_bytes` of the area as a complete application."""
         record = _RECORD.pack(size_bytes, zlib.crc32(self.read(size_bytes)), _MAGIC)
         return Operation(self._record_address, self._units(record))
 
     def load(self, image: bytes) -> None:
-        """Put an image and its record there as a factory does: no time, no operation counted."""
+        """Program an image and its record like a factory: no time, no operation counted."""
         self.flash.program(AREA_START, self._units(image))
         self.flash.carry_out(self.recording(len(image)))
         self.flash.program_count = 0
 
     def _units(self, data: bytes) -> bytes:
-        """`data` filled up to whole program units."""
+        """Fill `data` up to whole program units."""
         unit = self.flash.program_unit_bytes
         return data.ljust(-(-len(data) // unit) * unit, bytes((ERASED,)))
 
 
 class MemoryMap:
-    """Bootloader, flash and RAM, with nothing between them; what stands in the first and the last
-    is made up, but fixed.
-    """
+    """Bootloader, flash and RAM; contents of bootloader and RAM are invented, but constant."""
 
     def __init__(self, flash: Flash) -> None:
         self._areas = (
@@ -126,7 +124,7 @@ class MemoryMap:
         )
 
     def read(self, start: int, end: int) -> bytes | None:
-        """The bytes from `start` to before `end`; None when one of them is nowhere."""
+        """Return the bytes from `start` up to `end`, exclusive; None if any is outside memory."""
         found = b""
         while start < end:
             area = next((each for each in self._areas if 0 <= start - each[0] < each[1]), None)

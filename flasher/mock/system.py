@@ -1,7 +1,7 @@
-"""A whole bicycle as one engine: BMS, WMC, OBC and, in the MOTINOVA dialect, HMI talk to each other
-on the bus, and each of the first three can be upgraded meanwhile.
+"""A whole bicycle as one engine: BMS, WMC, OBC and, in the MOTINOVA dialect, HMI communicate on the
+bus, and each of the first three can be upgraded.
 
-The battery feeds the others: when it switches off, they are off.
+The battery supplies the others: when it switches off, they are off.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ _DEFAULT_PROFILE: Final = DeviceProfile()
 
 
 class System:
-    """An engine (`flasher.protocol.engine`) made of several, which hear each other as well.
-
-    `profile` and `has_application` are those of `device`, the one that `target` names; `profile`
-    is the BMS's too. Events are those of `device`. Put it on a simulated bus, or drive it on a
-    link: its members' frames take turns.
+    """Engine (`flasher.protocol.engine`) made of several engines that also receive each other.
+    `profile` and `has_application` apply to `device`, the one named by `target`; `profile` also to
+    the BMS. Events are those of `device`. Attach it to a simulated bus, or drive it on a link:
+    frames of its members take turns.
     """
 
     def __init__(
@@ -42,7 +41,7 @@ class System:
         own_profile = profile.speaking(dialect)
         plain_profile = _DEFAULT_PROFILE.speaking(dialect)
         self.members: dict[Node, Machine] = {}
-        """Each node's machine."""
+        """Machine of each node."""
         for node in dialect.nodes:
             if node is Node.CDL:
                 continue
@@ -55,15 +54,15 @@ class System:
                     profile=own_profile if is_target or node is Node.BMS else plain_profile,
                     timings=timings,
                     has_application=has_application or not is_target,
-                    application=asks,  # a BMS answers, with the application of its own
+                    application=asks,  # a BMS has its own application
                 )
             elif asks is not None:
                 self.members[node] = Unit(asks, bitrate_bps=dialect.bitrate_bps, timings=timings)
         device = self.members[target.node]
         if not isinstance(device, MockDevice):
-            raise TypeError(f"{target.name} is no device that can be upgraded")
+            raise TypeError(f"{target.name} cannot be upgraded")
         self.device = device
-        """The one that is to be upgraded."""
+        """Device to upgrade."""
         self._battery = self.members[Node.BMS]
         self._turns = list(self.members.values())
         self._sending: Machine | None = None
@@ -75,17 +74,16 @@ class System:
         return self._battery.has_power
 
     def hold_key(self, now: float) -> None:
-        """Hold the battery's key for as long as it takes to switch off."""
+        """Hold the battery's key long enough to switch off."""
         self._battery.hold_key(now)
 
     def power_cut(self, now: float) -> None:
-        """The power goes everywhere."""
         for member in self._turns:
             if member.has_power:
                 member.power_cut(now)
 
     def power_on(self, now: float) -> None:
-        """The power comes back everywhere; devices pass through their bootloaders (R19)."""
+        """Restore the power; devices restart through their bootloaders (R19)."""
         for member in self._turns:
             if not member.has_power:
                 member.power_on(now)
@@ -97,9 +95,9 @@ class System:
         return all(member.done for member in self._turns)
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A frame arrived from outside, or is the adapter's echo of one of its own."""
+        """Process a frame from outside, or the adapter's echo of an own one."""
         if frame.is_echo:
-            return  # the members have heard it already
+            return  # the members already received it
         for member in self._turns:
             member.receive(frame, now)
 
@@ -127,7 +125,7 @@ class System:
         return None
 
     def frame_sent(self, now: float) -> None:
-        """The adapter has accepted it: the other members hear it, and it is their turn."""
+        """The adapter accepted it: pass it to the other members, whose turn it is."""
         sender, self._sending = self._sending, None
         frame = sender.next_frame(now) if sender is not None else None
         if sender is None or frame is None:
@@ -143,7 +141,7 @@ class System:
             member.cancel(now)
 
     def take_events(self) -> Sequence[object]:
-        """What happened to `device` since the last call."""
+        """Return the events of `device` since the last call."""
         for member in self._turns:
             if member is not self.device:
                 member.take_events()

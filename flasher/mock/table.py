@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 
 class BootloaderState(Enum):
-    """Where the device stands; the value is how the documentation names it."""
+    """States of the device; the value is the name in the documentation."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
 
@@ -31,7 +31,7 @@ class BootloaderState(Enum):
 
 
 class BootloaderEvent(Enum):
-    """A received message or an expired timer, classified; the value is its name in diagrams."""
+    """Classified message or expired timer; the value is the name in diagrams."""
 
     __hash__ = object.__hash__
 
@@ -72,11 +72,11 @@ MESSAGE_EVENTS: Final = frozenset(BootloaderEvent) - {
     _E.RESTART_DUE, _E.ANNOUNCEMENT_DUE, _E.WINDOW_OVER, _E.FLASH_DONE, _E.PAUSE_OVER,
     _E.HOLD_OVER, _E.START_DUE, _E.START_BY_RESTART_DUE, _E.POWER_CUT, _E.POWER_ON,
 }  # fmt: skip
-"""The events that a message on the bus can be."""
+"""Events of messages."""
 
 
 class BootloaderTransition(NamedTuple):
-    """What follows an event: the name of the action, and the next state (None: the same one)."""
+    """Action after an event, and the next state (None: the same)."""
 
     action: str
     state: BootloaderState | None = None

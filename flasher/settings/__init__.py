@@ -1,1 +1,1 @@
-"""What is read from files: one way of reading, one style of telling what is wrong."""
+"""Settings files: one reader, with one style of error messages."""

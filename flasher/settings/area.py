@@ -1,4 +1,4 @@
-"""Where the application lies in the memory of a device. The documents give no addresses."""
+"""Address range of the application in a device. The documents give no addresses."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from flasher.settings.profile import Profile
 
 @dataclass(frozen=True)
 class Area:
-    """A range of addresses, `end` exclusive."""
+    """Range of addresses, `end` exclusive."""
 
     start: int
     end: int
     source: str
-    """Who says so."""
+    """Where the range comes from."""
 
     @property
     def size_bytes(self) -> int:
@@ -26,7 +26,7 @@ class Area:
 
 
 def area_of_image(image: Image) -> Area | None:
-    """Where this image lies; None for a raw binary. Raises UsageError for what is no range."""
+    """Range of this image; None for a raw binary. Raises UsageError for an invalid range."""
     if image.base is None:
         return None
     end = image.base + image.size_bytes
@@ -35,7 +35,7 @@ def area_of_image(image: Image) -> Area | None:
 
 
 def area_of_profile(profile: Profile) -> Area | None:
-    """Where the profile says that the application lies. Raises UsageError for what is no range."""
+    """Application area of the profile, if any. Raises UsageError for an invalid range."""
     area = profile.application_area
     if area is None:
         return None

@@ -1,4 +1,4 @@
-"""The adapter in a file of settings, in which a target profile may stand too.
+"""Adapter settings, table [bus] of a settings file, which may also contain a target profile.
 
 [bus]
 interface = "pcan"
@@ -24,7 +24,7 @@ from flasher.python_can import can
 from flasher.settings.reading import Reader, Table
 
 BUS: Final = "bus"
-"""The table's name."""
+"""Name of the table."""
 
 
 class BusTable(Table):
@@ -35,7 +35,7 @@ class BusTable(Table):
     channel: str | None = None
     """Which adapter or port."""
     bitrate: int | None = Field(default=None, ge=LOWEST_BPS, le=HIGHEST_BPS)
-    """Bits per second; another one than the dialect's is refused unless -b says it."""
+    """Bits per second; a rate other than the dialect's is refused unless given with -b."""
     fd: bool | None = None
     """Open the adapter for CAN FD."""
     data_bitrate: int | None = Field(default=None, ge=LOWEST_BPS)
@@ -62,7 +62,7 @@ class BusTable(Table):
     def _check_kwargs(cls, value: dict[str, Any]) -> dict[str, Any]:
         own = cls.model_fields.keys() - {"bus_kwargs"}
         if beside := sorted(own & value.keys()):
-            raise ValueError(f"{beside[0]} stands in [{BUS}] itself")
+            raise ValueError(f"{beside[0]} belongs directly in [{BUS}]")
         if deciding := sorted(DECIDING & value.keys()):
             raise ValueError(f"{deciding[0]} decides the bit rate: only --timing may set it")
         return value
@@ -72,14 +72,14 @@ READER: Final = Reader(BusTable, "profile")
 
 
 def bus_faults(table: object) -> list[Fault]:
-    """Everything that is wrong with the table of a file."""
+    """Return all problems of the table."""
     if not isinstance(table, dict):
         return [READER.fault((BUS,), f"is a table, [{BUS}].")]
     return READER.check(table, (BUS,))[1]
 
 
 def read_bus(table: object, path: str | os.PathLike[str]) -> Fallback:
-    """What the table of the file `path` says. Raises UsageError with all faults."""
+    """Read the table of the file `path`. Raises UsageError with all problems."""
     faults = bus_faults(table)
     if faults or not isinstance(table, dict):
         raise READER.refusal(path, faults)

@@ -1,4 +1,4 @@
-"""The options of the device model, as `flasher mock --set KEY=VALUE` gives them."""
+"""Options of the device model, as given by `flasher mock --set KEY=VALUE`."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def reader() -> Reader[DeviceProfile]:
 
 
 def set_option(profile: DeviceProfile, key: str, text: str) -> DeviceProfile:
-    """`profile` with the option `key` set to what `text` says.
+    """Return `profile` with option `key` set from `text`.
 
-    Whole numbers take 0x and the suffixes K and M. Raises UsageError, naming what is known, for
-    an unknown key and for a value that is not allowed.
+    Integers accept 0x and the suffixes K and M. Raises UsageError, with the known ones, for an
+    unknown key or an invalid value.
     """
     return reader().read({**asdict(profile), key: text}, "--set")
 
 
 def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile:
-    """`profile` with options that are each written as KEY=VALUE. Raises UsageError."""
+    """Return `profile` with options written as KEY=VALUE. Raises UsageError."""
     for choice in choices:
         key, equals, value = choice.partition("=")
         if not equals:
@@ -42,7 +42,7 @@ def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile
 
 
 def describe_options() -> list[tuple[str, str, str]]:
-    """All options as (key, allowed values with the default first, one line of help)."""
+    """List all options as (key, allowed values with the default first, one line of help)."""
     described = []
     for key in reader().keys.values():
         default = "none" if key.default is None else str(key.default)

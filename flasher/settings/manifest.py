@@ -11,7 +11,7 @@
     minimum_boot_version = "V1.0.0"
     previous_from = "V1r0r0_20220512"
 
-A manifest that cannot be read, or is wrong, is an ImageError: its image is not trustworthy then.
+An unreadable or invalid manifest is an ImageError, because its image is not trustworthy.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 FORMAT_KEY: Final = "format"
 FORMAT_VERSION: Final = 1
 STATEMENTS: Final = tuple(each.name for each in fields(Release) if each.name != "source")
-"""The keys, in the order in which they are written."""
+"""Keys in the order in which they are written."""
 SUFFIX: Final = ".toml"
 
 
 def manifest_path(image_path: str | os.PathLike[str]) -> Path:
-    """Where the manifest of an image lies: beside it, with `.toml` behind its whole name."""
+    """Path of an image's manifest: next to it, with `.toml` appended to its whole name."""
     path = Path(image_path)
     return path.with_name(path.name + SUFFIX)
 
@@ -51,14 +51,14 @@ def manifest_path(image_path: str | os.PathLike[str]) -> Path:
 def find_release(
     image_path: str | os.PathLike[str], given: str | os.PathLike[str] | None = None
 ) -> Release | None:
-    """The release of the manifest `given`, else of the one beside the image; None without any.
+    """Read the manifest `given`, else the one next to the image; None without any.
 
     Raises as `read_release`.
     """
     if given is not None:
         return read_release(given)
     beside = manifest_path(image_path)
-    # A link that leads nowhere is there too: what it should have said is not known.
+    # A dangling link counts as existing, so that it is an error.
     return read_release(beside) if os.path.lexists(beside) else None
 
 
@@ -77,10 +77,10 @@ def reader() -> Reader[Release]:
 
 
 def read_release(path: str | os.PathLike[str]) -> Release:
-    """The release that a manifest states.
+    """Read the release in a manifest.
 
-    Raises UsageError when there is no such file or it is no regular one, ImageError when it cannot
-    be read, is no TOML, has another format version, or with everything that is wrong with it.
+    Raises UsageError if the file does not exist or is not regular; ImageError, with all problems,
+    if it cannot be read, is not TOML, or has another format version.
     """
     document = read_toml(
         path,
@@ -94,7 +94,7 @@ def read_release(path: str | os.PathLike[str]) -> Release:
 
 
 def check_statement(key: str, value: object) -> None:
-    """Raise ValueError saying why a manifest cannot hold this value."""
+    """Raise ValueError if a manifest cannot contain this value."""
     _, faults = reader().check({key: value}, source="")
     for fault in faults:
         if fault.place.startswith(key):
@@ -106,11 +106,11 @@ def _check_format(document: Mapping[str, Any], shown: str) -> None:
     if type(version) is int and version == FORMAT_VERSION:
         return
     newer = type(version) is int and version > FORMAT_VERSION
-    said = "does not say its format" if version is None else f"has the format {version!a:.60}"
+    problem = "does not state its format" if version is None else f"has the format {version!a:.60}"
     raise ImageError(
-        f"The manifest {said}; this flasher reads {FORMAT_KEY} = {FORMAT_VERSION}.",
+        f"The manifest {problem}; this flasher reads {FORMAT_KEY} = {FORMAT_VERSION}.",
         where=shown,
-        cause="it was written by a newer flasher" if newer else "it is no manifest of flasher",
+        cause="it was written by a newer flasher" if newer else "it is not a manifest of flasher",
         remedy="Use a newer flasher." if newer else "Write it with `flasher manifest create`.",
         code=ErrorCode.MANIFEST,
     )
@@ -124,17 +124,17 @@ def release_of(
     firmware_version: str | None = None,
     **statements: str | Sequence[str] | None,
 ) -> Release:
-    """The release that an image is, with other `statements` by the keys of a manifest; the firmware
-    version is by default the one inside.
+    """Create the release of an image, with other `statements` by the keys of a manifest. The
+    default firmware version is the one inside the image.
 
-    Raises ImageError when the given firmware version is not the one inside, ValueError for a value
-    that a manifest cannot hold.
+    Raises ImageError if the given firmware version differs from the one inside, ValueError for a
+    value that a manifest cannot contain.
     """
     if firmware_version and image.version and firmware_version != image.version:
         raise ImageError(
             f"The image is version {image.version}, not {printable(firmware_version)}.",
             where=f"the text inside {printable(image.source)}",
-            remedy="Leave the version out: the one inside holds.",
+            remedy="Omit the version: the one inside applies.",
             code=ErrorCode.MANIFEST,
         )
     stated = {
@@ -151,7 +151,7 @@ def release_of(
 
 
 def to_toml(release: Release) -> str:
-    """The text of a manifest; what is not stated is left out."""
+    """Text of a manifest, without unset values."""
     values: dict[str, Any] = {FORMAT_KEY: FORMAT_VERSION}
     for key in STATEMENTS:
         value = getattr(release, key)

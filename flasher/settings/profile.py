@@ -1,6 +1,6 @@
-"""The target profile: what the documents leave open, or a product does its own way.
+"""Target profile: settings that the documents leave open, or that a product changes.
 
-A file holds values for every device, and tables for single ones that go before them:
+A file has values for every device, and tables for single devices that override them:
 
     attempts = 5
     [timings]
@@ -62,13 +62,13 @@ if TYPE_CHECKING:
 
 FILE_NAME: Final = "flasher.toml"
 _BUS: Final = "bus"
-"""The table of the adapter, which is no part of the profile (`flasher.settings.bus`)."""
+"""Table of the adapter, which is not part of the profile (`flasher.settings.bus`)."""
 DEFAULT: Final = "default"
 DOCUMENT: Final = "document"
 _DOCUMENTED: Final = frozenset({"command_repeat_s", "command_timeout_s", "boot_version_spacing_s"})
-"""The timings that the documents give; all others are readings (R12)."""
+"""Timings given by the documents; all others are readings (R12)."""
 _BESIDE: Final = ("target", "dialect", "sources")
-"""Fields of `Profile` that do not stand in the file."""
+"""Fields of `Profile` that are not in the file."""
 _TABLES: Final = ("timings", "application_area", "version_query")
 _DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
 _DAY_S: Final = 24 * 3600
@@ -96,14 +96,14 @@ Data = Annotated[
 
 
 def sent_ids(target: Target) -> dict[int, Node | None]:
-    """The CAN ids that a device sends on, with their receivers; None is all."""
+    """CAN ids on which a device sends, with their receivers; None is broadcast."""
     receivers = (None, *(node for node in Node if node is not target.node))
     return {can_id(target.node, receiver): receiver for receiver in receivers}
 
 
 @dataclass(frozen=True)
 class ApplicationArea:
-    """Where a device's application lies; what is outside of it must not be sent (R8)."""
+    """Address range of a device's application; nothing outside must be sent (R8)."""
 
     start: Number32
     """Address of the application."""
@@ -118,8 +118,8 @@ class ApplicationArea:
 
 @dataclass(frozen=True)
 class VersionQuery:
-    """How to ask a device for its firmware version: a query without data, and where the text stands
-    in the data of its answer.
+    """How to ask a device for its firmware version: a query without data, and the position of the
+    text in the answer.
     """
 
     command: Number16
@@ -129,12 +129,12 @@ class VersionQuery:
     answer_command: Number16
     """Command of the answer."""
     offset: Annotated[int, NumberRange(ge=0, le=_DATA_MAX)]
-    """Where the text begins in the data."""
+    """Position of the text in the data."""
     size_bytes: Annotated[int, NumberRange(ge=1, le=_DATA_MAX)]
     """Size of the text."""
 
     def request(self, target: Target) -> Request:
-        """The question for `flasher.host.query`; its answer is a `VersionAnswer`."""
+        """Create the request; its answer is a `VersionAnswer`."""
         rest_bytes = data_size(self.answer_command) - self.offset - self.size_bytes
         answer = Item(
             target.node,
@@ -149,19 +149,19 @@ class VersionQuery:
 
 
 class VersionAnswer(Content):
-    """The answer to a version query that a profile describes."""
+    """Answer to a version query of a profile."""
 
     firmware_version: WireText
 
 
-def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> type[Content]:
-    """The content of such an answer: what stands around the text is kept, not read."""
+def _version_answer(before_bytes: int, text_bytes: int, after_bytes: int) -> type[Content]:
+    """Create the content type of such an answer; bytes around the text are kept."""
     return make_dataclass(
         "VersionAnswer",
         [
             ("before", bytes, wire_field(BytesField(before_bytes))),
             ("firmware_version", WireText, wire_field(TextField(text_bytes))),
-            ("behind", bytes, wire_field(BytesField(behind_bytes))),
+            ("after", bytes, wire_field(BytesField(after_bytes))),
         ],
         bases=(VersionAnswer,),
         frozen=True,
@@ -169,7 +169,7 @@ def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> ty
 
 
 def documented_query(target: Target) -> VersionQuery | None:
-    """Version information as chapter 3 has it, for the BMS only."""
+    """Version query of chapter 3, for the BMS only."""
     if not target.has_version_query:
         return None
     offset = 0
@@ -188,29 +188,29 @@ def documented_query(target: Target) -> VersionQuery | None:
 
 @dataclass(frozen=True)
 class Profile:
-    """What holds for one target in one dialect. `sources` has "default" (a reading of this
-    project), "document", or the path of a file for each name of `values()`.
+    """Settings for one target in one dialect. For each name of `values()`, `sources` has "default"
+    (a reading of this project), "document", or the path of a file.
     """
 
     target: Annotated[Target, Parsed("a target", TARGETS.__getitem__)]
     dialect: Annotated[Dialect, Parsed("a dialect", DIALECTS.__getitem__)] = WELLING
     has_upgrade: bool = WELLING.has_upgrade
-    """Upgrade, even where the document has cancelled it (section 6)."""
+    """Upgrade, even if the document has cancelled it (section 6)."""
     timings: Timings = DEFAULT_TIMINGS
     attempts: Tries = DEFAULT_ATTEMPTS
-    """How often the upgrade may begin. The default holds until the device is erased."""
+    """Maximum number of attempts. The default applies until the device is erased."""
     timeout_s: Time | None = None
-    """Overall deadline; without it one is computed from the plan."""
+    """Overall deadline; by default computed from the plan."""
     power_up_timeout_s: Time = UpgradeOptions.power_up_timeout_s
     """Wait for a power cycle."""
     adapter_return_s: Annotated[float, NumberRange(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
     """Wait for a lost adapter."""
     cpu: Cpu = Identity.cpu
-    """The device's processor; other: no vector table is looked for in images."""
+    """The device's processor; other: images need no vector table."""
     low_charge_percent: Annotated[int, NumberRange(ge=0, le=100)] = Identity.low_charge_percent
     """Warn before an upgrade below this state of charge."""
     in_use_ma: Annotated[int, NumberRange(ge=0, le=0x7FFF)] = Identity.in_use_ma
-    """A discharge beyond this is a vehicle in use."""
+    """A larger discharge current means a vehicle in use."""
     frame_gap_s: Annotated[float, NumberRange(ge=0, le=1)] = UpgradeOptions.frame_gap_s
     """Silence between the frames of a message."""
     packet_gap_s: Annotated[float, NumberRange(ge=0, le=PACKET_GAP_MAX_S)] = (
@@ -224,21 +224,21 @@ class Profile:
     reset_data: Data = b"RESET"
     """The data of reset_command."""
     image_limit_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)] | None = None
-    """The largest image that the device takes."""
+    """Largest image that the device accepts."""
     application_area: ApplicationArea | None = None
     version_query: VersionQuery | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def check_fits(self, image: Image) -> None:
-        """Raise ImageError when the image is too large for the device, or lies outside of its
-        application area (R8). What the profile does not know is not judged.
+        """Raise ImageError if the image is too large for the device, or outside its application
+        area (R8). Unknown limits are not checked.
         """
         area = self.application_area
         limits = (self.image_limit_bytes, area.size_bytes if area else None)
         limit = min((each for each in limits if each is not None), default=None)
         if limit is not None and image.size_bytes > limit:
             raise ImageError(
-                f"{image.source}: {image.size_bytes} bytes are more than the device takes, {limit}",
+                f"{image.source}: {image.size_bytes} bytes exceed the limit of the device, {limit}",
                 where="the profile's limit",
                 cause="a merged file, or an image for another device",
                 remedy="choose the application with --range START:END",
@@ -248,7 +248,7 @@ class Profile:
             return
         if not area.start <= image.base <= image.base + image.size_bytes <= area.end:
             raise ImageError(
-                f"{image.source} lies outside of the device's application area",
+                f"{image.source} is outside the device's application area",
                 where=f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}, the area is "
                 f"0x{area.start:08X}..0x{area.end - 1:08X}",
                 cause="a merged file, or an image for another device",
@@ -257,11 +257,11 @@ class Profile:
             )
 
     def upgrade_options(self, **overrides: Any) -> UpgradeOptions:
-        """The options of an upgrade. `overrides` are its fields or those of `Timings`, by name;
-        one that is None was not given. Raises TypeError for another name.
+        """Create the options of an upgrade. `overrides` are its fields or those of `Timings`, by
+        name; None means not given. Raises TypeError for another name.
 
-        The product's own version query is among them, not the document's: its answer tells the
-        hardware version too.
+        They include the product's own version query, but not the document's, whose answer also has
+        the hardware version.
         """
         given = {name: value for name, value in overrides.items() if value is not None}
         names = {known.name for known in fields(UpgradeOptions)}
@@ -283,12 +283,12 @@ class Profile:
         return UpgradeOptions(**options)
 
     def _is_chosen(self, name: str) -> bool:
-        """True when somebody has set this value, be it to its default."""
+        """True if this value was set, even to its default."""
         return self.sources.get(name, DEFAULT) != DEFAULT
 
     def identity(self, **overrides: Any) -> Identity:
-        """What is checked before an upgrade, with the limits of this product. `overrides` are the
-        other fields of `Identity`.
+        """Create the requirements for an upgrade, with the limits of this product. `overrides` are
+        the other fields of `Identity`.
         """
         return Identity(
             low_charge_percent=self.low_charge_percent,
@@ -298,8 +298,8 @@ class Profile:
         )
 
     def values(self) -> Iterator[tuple[str, object]]:
-        """Every value with its name; those of a table have the table's name before a point. A table
-        that is not there is one value, None.
+        """Yield every value with its name; those of a table as TABLE.NAME. A missing table is one
+        value, None.
         """
         for name in (known.name for known in fields(self)):
             value = getattr(self, name)
@@ -316,10 +316,10 @@ class Profile:
 def load_profile(
     path: str | os.PathLike[str] | None, target: Target, dialect: Dialect = WELLING
 ) -> Profile:
-    """The profile of a target: of the file `path`, else of the `flasher.toml` that `find_profile`
-    finds, else the defaults. With os.devnull as `path` no file is looked for.
+    """Load the profile of a target: from the file `path`, else from the `flasher.toml` of
+    `find_profile`, else the defaults. With os.devnull as `path` no file is searched.
 
-    Raises UsageError with everything that is wrong with the file.
+    Raises UsageError with all problems of the file.
     """
     found = Path(path) if path is not None else find_profile()
     if found is not None and found != Path(os.devnull):
@@ -331,7 +331,7 @@ def load_profile(
 
 
 def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
-    """Check a whole file, for every target; returns the targets it has a table for.
+    """Check a whole file for every target; return the targets that have a table.
 
     Raises UsageError as `load_profile`.
     """
@@ -342,7 +342,7 @@ def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
 
 
 def find_profile() -> Path | None:
-    """The `flasher.toml` of the working directory, else the one of the user; None without any."""
+    """Find the `flasher.toml` of the working directory, else the user's; None without any."""
     return next(_found(), None)
 
 
@@ -357,11 +357,11 @@ def _found() -> Iterator[Path]:
 
 
 def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
-    """The adapter that the first file with a table [bus] names: the file `path`, the `flasher.toml`
-    of the working directory, the one of the user; None without any. With os.devnull as `path` no
-    file is looked for. What else a file says is not looked at.
+    """Return the adapter of the first file with a table [bus]: the file `path`, the `flasher.toml`
+    of the working directory, or the user's; None without any. With os.devnull as `path` no file is
+    searched. Other contents of a file are ignored.
 
-    Raises UsageError with everything that is wrong with the table.
+    Raises UsageError with all problems of the table.
     """
     if path is not None and Path(path) == Path(os.devnull):
         return None
@@ -378,20 +378,20 @@ def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
 
 @cache
 def reader() -> Reader[Profile]:
-    """Reads profiles, and knows every key of one."""
+    """Reader for profiles, with all their keys."""
     from flasher.settings.reading import Reader  # noqa: PLC0415
 
     return Reader(Profile, "profile", beside=_BESIDE, also=(*TARGETS, _BUS))
 
 
 class _File:
-    """A file whose keys and values are right, each taken by itself. Raises UsageError."""
+    """File whose keys and values are valid individually. Raises UsageError."""
 
     def __init__(self, path: Path, *, was_named: bool = True) -> None:
         self._path = path
         self._common: dict[str, Any] = {}
         self.tables: dict[str, Any] = {}
-        """By the name of the target."""
+        """By name of the target."""
         faults: list[Fault] = []
         document = read_toml(path, what="profile", was_named=was_named)
         for key, value in document.items():
@@ -416,12 +416,12 @@ class _File:
             raise reader().refusal(path, faults)
 
     def _check(self, table: Mapping[str, Any], prefix: tuple[str, ...]) -> list[Fault]:
-        """What is wrong with the values that are there; others may stand in another table."""
+        """Return the problems of the given values; others may be in another table."""
         names = {"target": "bms", "dialect": WELLING.name, "sources": {}}
         return reader().check(table, prefix, is_whole=False, **names)[1]
 
     def profile(self, target: Target, dialect: Dialect) -> Profile:
-        """What the file says of a target, over what holds without it."""
+        """Merge the file's values for a target over the defaults."""
         given = _over(self._common, self.tables.get(target.name, {}))
         query = documented_query(target)
         without = {
@@ -442,7 +442,7 @@ class _File:
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with the values in place of its own, table by table."""
+    """Merge `values` over `base`, table by table."""
     tables = {
         name: {**base[name], **values[name]}
         for name in values
@@ -468,7 +468,7 @@ def _sources(profile: Profile, given: Mapping[str, Any], path: str) -> dict[str,
 
 
 def _contradictions(profile: Profile) -> Iterator[Fault]:
-    """Values that are wrong together."""
+    """Yield values that contradict each other."""
     fault = reader().fault
     wanted = data_size(profile.reset_command)
     if len(profile.reset_data) != wanted:

@@ -1,7 +1,7 @@
-"""Reads what a TOML file holds into a type, and tells everything that is wrong with it at once.
+"""Reads a TOML file into a type, and reports all its problems at once.
 
-The type is the description: its fields are the keys, annotations their limits, the texts behind the
-fields their help. Messages and the tables of the documentation come from it.
+The type describes the file: fields are the keys, annotations their limits, docstrings after the
+fields their help. Messages and tables of the documentation are made from it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from flasher.files import parse_file, read_toml
 
 Kind = TypeVar("Kind")
 Location = tuple[str | int, ...]
-"""Where something is in a document: keys, and positions in lists."""
+"""Place in a document: keys, and indexes of lists."""
 Detail = tuple[str, Location, str]
-"""What the library says of a fault: its kind, where, and a text."""
+"""Error of the library: type, place, and text."""
 CONFIG: Final = ConfigDict(
     extra="forbid",
     frozen=True,
-    strict=True,  # no number becomes a text, nor the reverse
+    strict=True,  # no conversion between numbers and texts
     allow_inf_nan=False,
     use_attribute_docstrings=True,
 )
@@ -37,35 +37,35 @@ _UNKNOWN: Final = frozenset({"extra_forbidden", "unexpected_keyword_argument"})
 _NO_TABLE: Final = frozenset({"dataclass_type", "model_type", "dict_type"})
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 _HEXADECIMAL: Final = frozenset({0x7FF, 0xFFFF, 0xFFFF_FFFF})
-"""Limits that are shown so."""
+"""Limits shown in hexadecimal."""
 
 
 class Table(BaseModel):
-    """A table of a file."""
+    """Table of a file."""
 
     model_config = CONFIG
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a file."""
+    """Key of a file."""
 
     path: str
-    """With the tables that it is in, as `limits.erase_s`."""
+    """With its tables, as `limits.erase_s`."""
     default: Any
     allowed: str
-    """The allowed values in words."""
+    """Allowed values in words."""
     choices: tuple[str, ...]
-    """The words, where it is a choice."""
+    """Allowed words of a choice."""
     text: str
-    """What it is for."""
+    """Its purpose."""
 
 
 class Reader(Generic[Kind]):
-    """Reads files of one kind; messages call it `what`.
+    """Reads files of one kind, which messages call `what`.
 
-    `beside` are fields of the type that do not stand in the file, `also` are keys of the file that
-    are no fields of the type. `remedy` is added to what each message says is to be done.
+    `beside` are fields of the type that are not in the file; `also` are keys of the file that are
+    not fields of the type. `remedy` is appended to the remedy of each message.
     """
 
     def __init__(
@@ -93,25 +93,25 @@ class Reader(Generic[Kind]):
 
     @cached_property
     def keys(self) -> dict[str, Key]:
-        """Every key that has one place in the file, by its path."""
+        """Every key with one place in the file, by its path."""
         found = self._root.keys(())
         return {key.path: key for key in found if key.path not in self._beside}
 
     def load(
         self, path: str | os.PathLike[str], *, if_missing: str = "Correct the name.", **beside: Any
     ) -> Kind:
-        """What a file holds. Raises UsageError when there is none, and `error` with all faults."""
+        """Read a file. Raises UsageError if it does not exist, and `error` with all problems."""
         document = read_toml(path, what=self._what, error=self._error, if_missing=if_missing)
         return self.read(document, path, **beside)
 
     def parse(self, raw: bytes, path: str | os.PathLike[str], **beside: Any) -> Kind:
-        """What the bytes of a file hold. Raises `error` with all faults."""
+        """Read the bytes of a file. Raises `error` with all problems."""
         return self.read(parse_file(raw, path, what=self._what, error=self._error), path, **beside)
 
     def read(
         self, document: Mapping[str, Any], path: str | os.PathLike[str], **beside: Any
     ) -> Kind:
-        """What is in a document. Raises `error` with all faults."""
+        """Read a document. Raises `error` with all problems."""
         value, faults = self.check(document, **beside)
         if value is None or faults:
             raise self.refusal(path, faults)
@@ -125,8 +125,8 @@ class Reader(Generic[Kind]):
         is_whole: bool = True,
         **beside: Any,
     ) -> tuple[Kind | None, list[Fault]]:
-        """What is in a document, or in the table `prefix` of one; and everything that is wrong.
-        Nothing is missed in what is not the whole.
+        """Read a document, or the table `prefix` of one; return the value and all problems. Missing
+        keys are only a problem of a whole document.
         """
         odd: list[Location] = []
         plain = _for_json(dict(document), (), odd)
@@ -134,8 +134,8 @@ class Reader(Generic[Kind]):
         details: list[Detail] = [("odd", at, "") for at in odd]
         details += [("extra_forbidden", (name,), "") for name in document if name in self._beside]
         try:
-            # As JSON, in which strict means what a file may hold: a list for a tuple, a word for
-            # an enumeration, but no text for a number.
+            # As JSON, in which `strict` allows what a file may contain: a list for a tuple, a word
+            # for an enumeration, but no text for a number.
             text = to_json(plain | beside, inf_nan_mode="constants")
             value = self._adapter.validate_json(text)
         except ValidationError as error:
@@ -147,7 +147,7 @@ class Reader(Generic[Kind]):
         return value, self._faults(document, details, prefix)
 
     def refusal(self, path: str | os.PathLike[str], faults: Sequence[Fault]) -> FlasherError:
-        """The error for a file with these faults."""
+        """Create the error for a file with these faults."""
         shown = printable(os.fspath(path))
         if len(faults) == 1:
             (fault,) = faults
@@ -175,7 +175,7 @@ class Reader(Generic[Kind]):
         places = [location for kind, location, _ in details if kind != "too_short"]
         for kind, location, said in details:
             if kind == "too_short" and any(each[: len(location)] == location for each in places):
-                continue  # what is wrong in a list is not counted
+                continue  # the length of a list with errors is not reported
             at, value = _found(document, location)
             if kind == "missing":
                 missing.setdefault(location[:-1], []).append(str(location[-1]))
@@ -188,12 +188,12 @@ class Reader(Generic[Kind]):
             self.fault((*prefix, *at), f"has no {' and no '.join(names)}.")
             for at, names in missing.items()
         ]
-        # An unknown key first: it may be why another one is missing.
+        # Unknown keys first: one may be a misspelled missing key.
         strange = [each for at, keys in unknown.items() for each in self._unknown(at, keys, prefix)]
         return [*strange, *lacking, *wrong.values()]
 
     def _unknown(self, location: Location, keys: list[str], prefix: Location) -> Iterator[Fault]:
-        """Unknown keys of one table; those that it knows are told with the first of them."""
+        """Yield the unknown keys of one table; the first one lists the known keys."""
         table = (*prefix, *location)
         names = [
             *(() if table else self._also),
@@ -228,21 +228,21 @@ class Reader(Generic[Kind]):
         return self.fault((*prefix, *location), f"cannot be {value!a:.60}.", remedy)
 
     def fault(self, location: Location, what: str, remedy: str = "") -> Fault:
-        """A fault in words that begin with a verb: the place, or the file, is their subject."""
+        """Create a fault; `what` begins with a verb, whose subject is the place or the file."""
         place = place_of(location)
         return Fault(place, f"{place or f'The {self._what}'} {what}", remedy)
 
 
 @dataclass(frozen=True)
 class _Schema:
-    """A part of a JSON Schema."""
+    """Part of a JSON Schema."""
 
     node: Mapping[str, Any]
     definitions: Mapping[str, Any]
 
     @cached_property
     def kinds(self) -> tuple[_Schema, ...]:
-        """What it may be one of, without null and with references followed."""
+        """Alternatives without null, with references resolved."""
         node = self.node
         if "$ref" in node:
             node = self.definitions[node["$ref"].rpartition("/")[2]]
@@ -252,7 +252,7 @@ class _Schema:
         return tuple(each for part in parts for each in part.kinds if each.node != _NULL)
 
     def at(self, location: Location) -> _Schema:
-        """What is at this place; empty where nothing is known of it."""
+        """Schema at this place; empty if unknown."""
         if not location:
             return self
         part = location[0]
@@ -267,7 +267,7 @@ class _Schema:
         return _Schema({}, {})
 
     def keys(self, table: Location) -> Iterator[Key]:
-        """The keys in it and in its tables."""
+        """Keys of the table and of its tables."""
         for name in self.kinds[0].node.get("properties", {}):
             place, found = (*table, name), self.at((name,))
             if "properties" in found.kinds[0].node:
@@ -279,32 +279,32 @@ class _Schema:
 
     @property
     def names(self) -> list[str]:
-        """The keys of a table."""
+        """Keys of a table."""
         node = self.kinds[0].node
         names = node.get("propertyNames", {})
         return list(node.get("properties", _Schema(names, self.definitions).choices))
 
     @property
     def choices(self) -> list[str]:
-        """The words of a choice."""
+        """Words of a choice."""
         return [str(word) for each in self.kinds for word in each.node.get("enum", ())]
 
     @property
     def has_words(self) -> bool:
-        """True when its type says in words what it is."""
+        """True if its type describes itself in words."""
         return any("words" in each.node for each in self.kinds)
 
     @property
     def text(self) -> str:
-        """What it is for."""
+        """Its purpose."""
         return " ".join(str(self.node.get("description", "")).split())
 
     def allowed(self, name: str) -> str:
-        """The allowed values in words; `name` is the key, which may end with a unit."""
+        """Allowed values in words; `name` is the key, which may end with a unit."""
         return " or ".join(dict.fromkeys(each.words(name) for each in self.kinds))
 
     def words(self, name: str) -> str:
-        """As `allowed`, for one kind of value."""
+        """Same as `allowed`, for one kind of value."""
         match self.node:
             case {"words": str() as words}:
                 return words
@@ -349,7 +349,7 @@ _NULL: Final = {"type": "null"}
 
 
 def place_of(location: Location) -> str:
-    """A place as people write it: `target[0].base`."""
+    """Format a place as people write it: `target[0].base`."""
     place = ""
     for part in location:
         name = f"[{part}]" if isinstance(part, int) else printable(part)[:60]
@@ -362,8 +362,8 @@ def _number(value: float) -> str:
 
 
 def _found(document: Any, location: Location) -> tuple[Location, object]:
-    """The part of a location that is there, without the names that the library adds to it, and
-    what is there.
+    """Return the part of a location that exists, without names added by the library, and its
+    value.
     """
     for at, part in enumerate(location):
         is_there = (isinstance(document, dict) and part in document) or (
@@ -376,8 +376,8 @@ def _found(document: Any, location: Location) -> tuple[Location, object]:
 
 
 def _for_json(value: Any, at: Location, odd: list[Location]) -> Any:
-    """What JSON can hold. Adds to `odd` the places of what it cannot, which no setting is either:
-    dates, and texts from a command line that are no text.
+    """Convert to what JSON can hold. Adds to `odd` the places of values that are not valid settings
+    either: dates, and command-line texts that are not Unicode.
     """
     match value:
         case dict():

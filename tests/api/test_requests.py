@@ -244,7 +244,7 @@ def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing(
 
 def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
     battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
-    with pytest.raises(BusError, match="Another tool speaks on this bus"):
+    with pytest.raises(BusError, match="Another tool sends on this bus"):
         wire_to(battery, tool).device().identify()
     assert battery.received == []
 

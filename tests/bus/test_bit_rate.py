@@ -102,12 +102,12 @@ def test_on_socketcan_the_kernels_holds_and_is_compared(monkeypatch: pytest.Monk
 
 @each("value", [0, -250_000, 1, 4_999, 1_000_001, 10**30, "fast", 2.5, True])
 def test_what_is_no_bit_rate_is_wrong_usage(value: Any) -> None:
-    with pytest.raises(UsageError, match="is no bit rate"):
+    with pytest.raises(UsageError, match="is not a bit rate"):
         api.bit_rate(**PCAN, bitrate=value)
 
 
 def test_a_variable_that_is_no_bit_rate_is_wrong_usage(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAN_BITRATE", "250k")
-    with pytest.raises(UsageError, match="250k is no bit rate") as caught:
+    with pytest.raises(UsageError, match="250k is not a bit rate") as caught:
         api.bit_rate(**PCAN)
     assert caught.value.where == "CAN_BITRATE"

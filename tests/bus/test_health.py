@@ -121,7 +121,7 @@ def test_frames_sent_and_nothing_received_but_that_evidence_is_no_acknowledgemen
     error = health.error("socketcan can0")
     assert error is not None
     assert error.exit_code == ExitCode.BUS
-    assert "Nobody on the bus acknowledges: 2 frames" in error.what
+    assert "No node on the bus acknowledges: 2 frames" in error.what
     assert "the adapter reports" in error.cause
     assert error.where == "socketcan can0"
 

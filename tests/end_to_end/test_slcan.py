@@ -152,7 +152,7 @@ def test_an_adapter_whose_serial_speed_is_another_is_named_as_the_cause(adapter:
     timings = replace(HASTY.timings, boot_version_timeout_s=0.3, command_timeout_s=0.3)
     flashed = Flashed(adapter, replace(HASTY, timings=timings, attempts=1))
     assert flashed.error is not None
-    assert "Nothing that the adapter delivers can be read" in flashed.error.what
+    assert "The adapter delivers unreadable data" in flashed.error.what
     assert not flashed.error.needs_rescue
 
 

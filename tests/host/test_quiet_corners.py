@@ -136,5 +136,5 @@ def test_a_memory_check_that_is_cancelled_between_two_pieces_asks_no_more() -> N
 
 def test_a_version_check_needs_somebody_to_ask() -> None:
     other = plan(Image.from_bytes(bytes(10)), WMC, WELLING.bitrate_bps)
-    with pytest.raises(ValueError, match="nobody knows"):
+    with pytest.raises(ValueError, match="no version query"):
         version_check(other, UpgradeOptions()).tick(0.0)

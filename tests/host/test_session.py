@@ -241,7 +241,7 @@ def test_a_memory_check_that_is_cancelled_in_a_question_says_so() -> None:
 
 
 def test_there_is_no_other_verification() -> None:
-    with pytest.raises(UsageError, match="'hash'; there are none, version, memory"):
+    with pytest.raises(UsageError, match="'hash'; the levels are none, version, memory"):
         as_level("hash")
 
 

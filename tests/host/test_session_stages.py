@@ -529,7 +529,7 @@ def test_nobody_who_acknowledges_is_told_from_a_device_that_is_silent() -> None:
     alone.bus.nobody_acknowledges = True
     silent.cut_power()
     silent.bus.attach(Speaker(Frame(0x100, b"\1"), every_s=0.1))
-    with pytest.raises(BusError, match="Nobody on the bus acknowledges"):
+    with pytest.raises(BusError, match="No node on the bus acknowledges"):
         alone.flash()
     assert silent.flash().exit_code == ExitCode.NO_ANSWER
 

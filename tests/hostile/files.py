@@ -149,14 +149,14 @@ def with_manifest(make: Callable[[Path], object]) -> Callable[[Path], object]:
 
 
 IMAGES = (
-    Row("pipe.hex", os.mkfifo, "image-info FILE", USAGE, "no regular file"),
-    Row("socket.bin", bound_socket, "image-info FILE", USAGE, "no regular file"),
-    Row("zero.bin", link("/dev/zero"), "image-info FILE", USAGE, "no regular file"),
-    Row("terminal.bin", link("/dev/tty"), "image-info FILE", USAGE, "no regular file"),
+    Row("pipe.hex", os.mkfifo, "image-info FILE", USAGE, "not a regular file"),
+    Row("socket.bin", bound_socket, "image-info FILE", USAGE, "not a regular file"),
+    Row("zero.bin", link("/dev/zero"), "image-info FILE", USAGE, "not a regular file"),
+    Row("terminal.bin", link("/dev/tty"), "image-info FILE", USAGE, "not a regular file"),
     Row("folder.bin", Path.mkdir, "image-info FILE", USAGE, "is a directory"),
     Row("loop.bin", link("loop.bin"), "image-info FILE", IMAGE, "symbolic links"),
     Row("nowhere.bin", link("none"), "image-info FILE", USAGE, "no file of this name"),
-    Row("proc.bin", link("/proc/self/environ"), "image-info FILE", USAGE, "no regular file"),
+    Row("proc.bin", link("/proc/self/environ"), "image-info FILE", USAGE, "not a regular file"),
     Row("memory.bin", link("/proc/self/mem"), "image-info FILE", IMAGE, "cannot be read"),
     Row("blank.hex", repeated(b"\n", 100 * MEGA), "image-info FILE", IMAGE, "1,100,000 lines"),
     Row("blank.s19", repeated(b"\r\n", 4 * MEGA), "image-info FILE", IMAGE, "1,100,000 lines"),
@@ -248,14 +248,14 @@ IMAGES = (
         with_manifest(os.mkfifo),
         "flash FILE -t bms --mock --dry-run",
         USAGE,
-        "no regular file",
+        "not a regular file",
     ),
     Row(
         "b.bin",
         with_manifest(link("/dev/zero")),
         "flash FILE -t bms --mock --dry-run",
         USAGE,
-        "no regular file",
+        "not a regular file",
     ),
     Row(
         "c.bin",
@@ -270,7 +270,7 @@ IMAGES = (
 # -- settings -------------------------------------------------------------------------------------
 
 TOML = (
-    ("pipe", os.mkfifo, "no regular file"),
+    ("pipe", os.mkfifo, "not a regular file"),
     ("folder", Path.mkdir, "is a directory"),
     ("terabyte", sparse(1 << 40, b"a = 1\n"), "too large"),
     ("digits", content(b"attempts = " + b"9" * 5000), "no TOML file"),
@@ -332,8 +332,8 @@ SCANS = tuple(
         said,
     )
     for name, make, said in (
-        ("pipe.txt", os.mkfifo, "no regular file"),
-        ("zero.txt", link("/dev/zero"), "no regular file"),
+        ("pipe.txt", os.mkfifo, "not a regular file"),
+        ("zero.txt", link("/dev/zero"), "not a regular file"),
         ("terabyte.txt", sparse(1 << 40), "too large"),
         ("utf_16.txt", content("BAT2620-0001\n".encode("utf-16")), "no text"),
     )
@@ -355,7 +355,7 @@ def report_with(number: str) -> bytes:
 REPORTS = tuple(
     Row(name, make, "conformance diff FILE FILE", USAGE, said)
     for name, make, said in (
-        ("pipe.json", os.mkfifo, "no regular file"),
+        ("pipe.json", os.mkfifo, "not a regular file"),
         ("terabyte.json", sparse(1 << 40), "too large"),
         ("deep.json", content(b"[" * 100_000), "no JSON"),
         (
@@ -433,10 +433,10 @@ def several(*lines: str) -> bytes:
 TRACES = tuple(
     Row(name, make, "explain FILE", code, said)
     for name, make, code, said in (
-        ("pipe.asc", os.mkfifo, USAGE, "no regular file"),
-        ("zero.log", link("/dev/zero"), USAGE, "no regular file"),
+        ("pipe.asc", os.mkfifo, USAGE, "not a regular file"),
+        ("zero.log", link("/dev/zero"), USAGE, "not a regular file"),
         ("loop.log", link("loop.log"), USAGE, "symbolic links"),
-        ("proc.log", link("/proc/self/environ"), USAGE, "no regular file"),
+        ("proc.log", link("/proc/self/environ"), USAGE, "not a regular file"),
         ("none.db", link("none"), USAGE, "no file of this name"),
         ("terabyte.log", sparse(1 << 40), USAGE, "too large"),
         ("nothing.log", sparse(500 * MEGA), USAGE, "longer than"),
@@ -600,7 +600,7 @@ TRACES = tuple(
 )
 
 MONITOR = (
-    Row("pipe.log", os.mkfifo, "monitor FILE", USAGE, "no regular file"),
+    Row("pipe.log", os.mkfifo, "monitor FILE", USAGE, "not a regular file"),
     Row("inf.log", content(several(FRAME, "(inf) can0 1#00")), "monitor FILE", USAGE, "time inf"),
     Row("far.log", content(several(FRAME, "(1e10) can0 1#00")), "monitor FILE", 0, "2 frames"),
 )

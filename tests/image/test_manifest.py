@@ -94,7 +94,7 @@ def test_the_manifest_lies_beside_its_image(tmp_path: Path) -> None:
 # -- refusals -------------------------------------------------------------------------------------
 
 WRONG: list[tuple[str, str, str]] = [
-    ("", "does not say its format", "no manifest"),
+    ("", "does not state its format", "no manifest"),
     (LEAST.replace("format = 1", "format = 2\nunheard_of = 5"), "has the format 2", "newer"),
     (LEAST.replace("format = 1", "format = true"), "has the format True", "no manifest"),
     (LEAST.replace("format = 1", 'format = "1"'), "has the format '1'", "format = 1"),
@@ -116,9 +116,9 @@ WRONG: list[tuple[str, str, str]] = [
     ("format = 1\nprevious_except = [1]", "previous_except[0] cannot be 1", "a text of printable"),
     ('format = 1\nhardware_versions = ["\\u001b[2J"]', "hardware_versions[0] cannot", "\\x1b"),
     ("format = 1\nnotes = 1979-05-27", "notes cannot be datetime", "a text"),
-    ("format = ", "is no TOML file", "quotes"),
-    (f"format = {'9' * 5000}", "is no TOML file", "quotes"),
-    (f"format = {'[' * 5000}", "is no TOML file", "quotes"),
+    ("format = ", "is not a readable TOML file", "quotes"),
+    (f"format = {'9' * 5000}", "is not a readable TOML file", "quotes"),
+    (f"format = {'[' * 5000}", "is not a readable TOML file", "quotes"),
 ]
 
 
@@ -137,7 +137,7 @@ def test_what_breaks_the_rules_is_refused_by_name(
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match="is no TOML file"):
+    with pytest.raises(ImageError, match="is not a readable TOML file"):
         read_release(written(tmp_path, b"\xff\xfe\x00"))
 
 
@@ -152,7 +152,7 @@ def test_what_is_no_file_is_refused_and_never_waited_for(tmp_path: Path) -> None
         read_release(tmp_path)
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(UsageError, match="no regular file"):
+        with pytest.raises(UsageError, match="not a regular file"):
             read_release(tmp_path / "pipe")
 
 

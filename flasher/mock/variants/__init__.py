@@ -1,7 +1,7 @@
-"""Deliberately wrong bootloaders: each violates one clause and is right in everything else.
+"""Deliberately wrong bootloaders: each violates one clause and is otherwise correct.
 
-They show what a conformance suite is worth: every case has one that fails it. `make` builds one as
-`MockDevice` itself is built; `VARIANTS` has them all by name.
+They measure a conformance suite: every case has one that fails it. `make` creates one like a
+`MockDevice`; `VARIANTS` has all by name.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ VARIANTS: Final[Mapping[str, Variant]] = MappingProxyType(
         for variant in sorted(DECLARED, key=lambda one: (_GROUPS.index(one.clause[:2]), one.clause))
     }
 )
-"""All of them by name, in the order of the clauses."""
+"""By name, in the order of the clauses."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 
 
 def find(name: str) -> Variant:
-    """The variant of that name. Raises UsageError, naming the one probably meant."""
+    """Find a variant by name. Raises UsageError with the closest name."""
     if name in VARIANTS:
         return VARIANTS[name]
     hint = did_you_mean(name, VARIANTS)
@@ -58,8 +58,8 @@ def make(
     timings: Timings = DEFAULT_TIMINGS,
     **others: Any,
 ) -> MockDevice:
-    """A wrong device, with the keywords of `MockDevice`. The variant's own choices and timings
-    replace those given. Raises UsageError for an unknown name and as `MockDevice` does.
+    """Create a wrong device, with the keywords of `MockDevice`. The variant's own choices and
+    timings override the given ones. Raises UsageError for an unknown name and as `MockDevice` does.
     """
     chosen = find(variant) if isinstance(variant, str) else variant
     choices: dict[str, Any] = dict(chosen.profile)

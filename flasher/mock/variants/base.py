@@ -1,4 +1,4 @@
-"""What a deliberately wrong bootloader is, and what several of them are made of."""
+"""Base classes of deliberately wrong bootloaders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WrongT = TypeVar("_WrongT", bound=type[object])
 
 
 def bad_write(row: AnyRow, command: Command) -> Message | None:
-    """A write of that command which is no row of the upgrade; None for anything else."""
+    """Return a malformed write of this command; None for anything else."""
     if not isinstance(row, Malformed):
         return None
     message = row.message
@@ -46,34 +46,34 @@ class Variant:
     # What it does wrong is part of their stimulus too. Where no upgrade works, any case that needs
     # a transfer may fail as well.
     everywhere: bool = False
-    """True when every transfer meets the fault, so that any case that has one may fail."""
+    """Every transfer triggers the fault, so that any case with one may fail."""
     unseen: str = ""
-    """Why no case sees it on a bench."""
+    """Why no case detects it on a bench."""
     upgrade_works: bool = True
     """False when not even an undisturbed upgrade to an ordinary image ends well."""
     # Ordinary: of some 1000 bytes, no multiple of 128. Well: with that image running.
     profile: Mapping[str, object] = field(default_factory=dict)
-    """Choices of the device profile with which it shows; they are set when it is made."""
+    """Choices of the device profile that show the fault; set when it is created."""
     timings: Mapping[str, float] = field(default_factory=dict)
-    """Timings that are its fault."""
+    """Timings that are the fault."""
 
 
 DECLARED: Final[list[Variant]] = []
-"""All that the modules of this package declare."""
+"""All variants declared in this package."""
 
 
 def variant(name: str, clause: str, *, also: str = "", **more: Any) -> Callable[[_WrongT], _WrongT]:
-    """Declares a class as what is wrong with a `Variant`: a device, or one of the parts that it is
-    made of; the first sentence of its docstring is the summary. The cases in `also` are parted by
-    blanks; "*" stands for `everywhere`; `more` are further fields of the variant.
+    """Declare a class as the fault of a `Variant`: a device, or one of its parts. The first
+    sentence of its docstring is the summary. The cases in `also` are separated by spaces; "*" means
+    `everywhere`; `more` are further fields of the variant.
     """
 
     def declare(wrong: _WrongT) -> _WrongT:
         device_type = wrong if issubclass(wrong, MockDevice) else _device_with(wrong)
         is_any = also == _ANY
         others = () if is_any else tuple(also.split())
-        told = _SENTENCE_END.split(" ".join((wrong.__doc__ or "").split()))[0].rstrip(".")
-        summary = told[:1].lower() + told[1:]
+        sentence = _SENTENCE_END.split(" ".join((wrong.__doc__ or "").split()))[0].rstrip(".")
+        summary = sentence[:1].lower() + sentence[1:]
         DECLARED.append(Variant(name, clause, summary, device_type, others, is_any, **more))
         return wrong
 
@@ -81,15 +81,15 @@ def variant(name: str, clause: str, *, also: str = "", **more: Any) -> Callable[
 
 
 def _device_with(part: type[object]) -> type[MockDevice]:
-    """A device that is made with this part, and is right in everything else."""
+    """Create a device class with this part."""
     for attribute in ("reassembler_type", "store_type", "transfer_type"):
         if issubclass(part, getattr(MockDevice, attribute)):
             return type(part.__name__, (MockDevice,), {attribute: part})
-    raise TypeError(f"{part.__name__} is no part of a device")
+    raise TypeError(f"{part.__name__} is not a part of a device")
 
 
 class HangingDevice(MockDevice):
-    """A device that can hang: deaf and dumb until its power is cut."""
+    """Device that can hang: it neither receives nor sends until its power is cut."""
 
     hangs = False
     in_ram: ClassVar[tuple[str, ...]] = ("hangs",)
@@ -100,7 +100,7 @@ class HangingDevice(MockDevice):
             self._is_deaf, self._runs_application = True, False
 
     def _hang(self) -> str:
-        """Nothing is heard, said or due from now on; what waited to be sent is lost."""
+        """Stop receiving and sending; unsent messages are lost."""
         self._lose_memory()
         self.hangs = self._is_deaf = True
         self._runs_application = False
@@ -109,8 +109,8 @@ class HangingDevice(MockDevice):
 
 
 class PlainFlash(Flash):
-    """Flash that does not refuse: programmed again, bits that are 0 stay 0, as in plain NOR parts;
-    programming outside of it goes nowhere.
+    """Flash without checks: programming again can only clear bits, as in plain NOR parts;
+    programming outside has no effect.
     """
 
     def program(self, address: int, data: bytes) -> None:
@@ -128,6 +128,6 @@ class PlainFlash(Flash):
 
 
 class PlainStore(ApplicationStore):
-    """The application on a flash that does not refuse."""
+    """Application on a flash without checks."""
 
     flash_type = PlainFlash

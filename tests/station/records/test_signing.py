@@ -256,9 +256,9 @@ def test_records_on_media_that_nobody_can_write_are_read(
 
 def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
-    with pytest.raises(UsageError, match="no regular file"):
+    with pytest.raises(UsageError, match="not a regular file"):
         HeadsFile(tmp_path / "pipe").last()
-    with pytest.raises(UsageError, match="no regular file"):
+    with pytest.raises(UsageError, match="not a regular file"):
         SigningKey.load(tmp_path / "pipe")
 
 
