@@ -364,7 +364,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
     assert error.what == f"The profile {path} has 5 faults."
     for fault in (
         "frame_gap_s cannot be -1. It is seconds from 0 to 1: Silence between the frames",
-        "timings.packet_tries cannot be 0. It is a whole number from 1 to 1000: How often",
+        "timings.packet_tries cannot be 0. It is a whole number from 1 to 1000: Maximum number",
         "wmc.cpu cannot be 'cortex'. Did you mean cortex-m? It is cortex-m, other: The device's",
         "wmc.timings.ack_timeout_s cannot be datetime.date(1979, 5, 27). It is seconds above 0",
         "atempts: unknown key. Did you mean attempts? Known are: wmc, bms, obc, bus, has_upgrade",

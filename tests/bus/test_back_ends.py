@@ -454,7 +454,7 @@ def test_an_adapter_of_which_nothing_at_all_was_read_is_named_as_the_cause(bus: 
     assert link.receive(AT_ONCE) is None
     error = link.health().error("here")
     assert error is not None
-    assert "can be read, 2 times so far: bad line" in error.what
+    assert "unreadable data, 2 times so far: bad line" in error.what
     bus.inbox.append(message())
     link.receive(AT_ONCE)
     assert link.health().error() is None

@@ -277,5 +277,5 @@ def test_cancelling_ends_all_members() -> None:
 
 
 def test_what_cannot_be_upgraded_is_no_target() -> None:
-    with pytest.raises(TypeError, match="no device that can be upgraded"):
+    with pytest.raises(TypeError, match="cannot be upgraded"):
         System(MOTINOVA, Target(Node.HMI, "HMI_UPD", "HMI", has_version_query=False))

@@ -854,7 +854,7 @@ def test_what_hangs_says_nothing_until_its_power_is_cut() -> None:
 
 
 def test_what_is_no_part_of_a_device_is_no_variant() -> None:
-    with pytest.raises(TypeError, match="no part of a device"):
+    with pytest.raises(TypeError, match="not a part of a device"):
         variant("a name", "RS-01")(int)
 
 
