@@ -92,20 +92,20 @@ class Outcome:
     device_left: DeviceLeft
     target: Target
     total_packets: int
-    # The packet that was in work, 1-based; None outside of the transfer.
+    # Current packet, from 1; None outside the transfer.
     packet: int | None
-    # Name and version as the bootloader announced them, escaped; None when it never did.
+    # Announced name and version of the bootloader, escaped.
     boot_version: str | None
-    # What the application answered, escaped; None when it was not asked or did not answer.
+    # Version answered by the application, escaped; None if not asked or not answered.
     running_version: str | None
     statistics: Statistics
-    # What was seen, where the ending alone does not say it.
+    # Observation that the ending alone does not convey.
     detail: str = ""
     waiver: str = ""
     """Refusing check, if it can be waived and the ending does not imply it."""
     sent_into_silence: bool = False
-    """The device answered nothing, and got an update command: it might sit in a session that an
-    earlier upgrade had left open (R26)."""
+    """The device answered nothing, and got an update command: it might be in a session that an
+    earlier upgrade left open (R26)."""
 
     @property
     def ok(self) -> bool:

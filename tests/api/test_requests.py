@@ -9,6 +9,7 @@ import pytest
 
 from flasher.errors import (
     BusError,
+    ErrorCode,
     InterruptedByUserError,
     NoAnswerError,
     UsageError,
