@@ -131,7 +131,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
     monkeypatch.setattr(mock_command, "_QUIET_S", 0.3)
     monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)
     monkeypatch.setattr("flasher.host.identify.LISTEN_FIRST_S", 0.0)
-    monkeypatch.setattr("flasher.host.runner.LISTENS_ON_S", 0.0)
+    monkeypatch.setattr("flasher.host.runner.SECOND_DEVICE_WAIT_S", 0.0)
     yield beside
     if beside._thread.ident is not None:
         beside.join()

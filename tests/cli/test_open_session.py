@@ -304,7 +304,7 @@ def test_one_that_ended_badly_names_its_command_unless_the_image_was_refused(
 
 def test_one_that_was_killed_before_it_erased_says_so(flasher: Flasher) -> None:
     kept()
-    assert "device   as far as is known it was not told to erase" in flasher("history").out
+    assert "device   as far as is known it received no update" in flasher("history").out
 
 
 def test_what_is_kept_to_type_again_is_what_was_typed(
