@@ -259,7 +259,7 @@ def test_doctor_says_that_it_is_in_effect_and_what_it_names(
         ("[bus]\ninterface = 'pcan'\nbitrate = 1", "It is a whole number from 5000 to 1000000"),
         ("[bus]\ninterface = 'pcan'\nbitrate = '250k'", "bus.bitrate cannot be '250k'"),
         ("[bus]\ninterface = 'pcan'\n[bus.bus_kwargs]\ntseg1 = 5", "tseg1 decides the bit rate"),
-        ("[bus]\ninterface = 'pcan'\n[bus.bus_kwargs]\nchannel = 5", "channel belongs directly in [bus]"),
+        ("[bus]\ninterface = 'pcan'\n[bus.bus_kwargs]\nchannel = 5", "belongs directly in [bus]"),
         ("[bus]\ninterface = 'pcan'\n[bus.bus_kwargs]\nx = [1]", "bus.bus_kwargs.x cannot be"),
     ],
 )
