@@ -14,7 +14,7 @@ from flasher.station.events import SocketState
 from flasher.station.records.model import StepName
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.stories import Story
-from tests.campaigns.line_world.world import HAND_S, Bay, World, last_look
+from tests.campaigns.line_world.world import HAND_S, Bay, World, label_of, last_look
 
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
@@ -30,7 +30,7 @@ def setup_of(chance: random.Random) -> Story:
     sockets = chance.choice((1, 2, 2, 2, 3))
     bare = chance.choice((0.1, 0.1, 0.5))
     units = []
-    for label in range(1, sockets + chance.choice((1, 2)) + 1):
+    for label in range(1, sockets + chance.choice((1, 2, 3)) + 1):
         number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 0.5))[0]
         firmware = "new" if chance.random() < 0.5 else "old"
         units.append(
@@ -90,6 +90,28 @@ class Teller:
 
     def _on_table(self) -> list[int]:
         return [each for each in self.world.units if self.world.where(each) is None]
+
+    def _fresh(self) -> list[Bay]:
+        """Sockets with a unit that nobody has scanned."""
+        return [
+            bay
+            for bay in self._bays(full=True, working=False)
+            if bay.shown is not None
+            and (bay.shown.state, bay.shown.serial) == (SocketState.SCAN, "")
+            and label_of(self._number(bay)) not in self.world.passed
+        ]
+
+    def _bring(self, count: int) -> Generator[Step, None, list[Bay]]:
+        """Have so many units in sockets that nobody has scanned, as far as there are."""
+        units = [each for each in self._on_table() if label_of(each) not in self.world.passed]
+        empty = self._bays(full=False)
+        for unit, bay in list(zip(units, empty, strict=False))[
+            : max(0, count - len(self._fresh()))
+        ]:
+            yield self._pause(), stories.Put(unit=unit, socket=bay.name)
+        yield 0.5, None
+        fresh = self._fresh()
+        return self.chance.sample(fresh, min(count, len(fresh)))
 
     def _number(self, bay: Bay) -> int:
         return next(n for n, unit in self.world.units.items() if unit is bay.unit)
@@ -235,9 +257,7 @@ class Teller:
 
     def _take_out_again(self, name: str) -> Iterator[Step]:
         """Scan a unit, and take it out as its run begins."""
-        bays = self._bays(full=True, working=False)
-        if bays:
-            bay = self.chance.choice(bays)
+        for bay in (yield from self._bring(1)):
             unit = self._number(bay)
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
@@ -246,28 +266,26 @@ class Teller:
 
     def _scan_at_once(self, name: str) -> Iterator[Step]:
         """Two people at one page scan at once, each a unit of their own."""
-        bays, people = self._bays(full=True, working=False), self.world.people
+        people = self.world.people
         others = [
             each.name
             for each in people.values()
             if each.name != name and each.source == people[name].source
         ]
-        if len(bays) > 1 and others and people[name].source != "mounted":
-            both = list(zip((name, self.chance.choice(others)), self._two_of(bays), strict=True))
+        if len(self.world.bays) > 1 and others and people[name].source != "mounted":
+            units = [self._number(each) for each in (yield from self._bring(2))]
+            both = list(zip((name, self.chance.choice(others)), units, strict=False))
             for scan in (stories.Card, stories.Label):
                 for by, unit in both:
                     yield self.chance.uniform(0.0, 1.0), scan(by=by, unit=unit)
 
-    def _two_of(self, bays: list[Bay]) -> list[int]:
-        return [self._number(each) for each in self.chance.sample(bays, 2)]
-
     def _be_interrupted(self, name: str) -> Iterator[Step]:
         """The socket of a card that waits works no more for a moment, and its unit is exchanged."""
-        bays = self._bays(full=True, working=False)
+        bays = yield from self._bring(1)
         others = self._on_table()
         if not (bays and others):
             return
-        bay, other = self.chance.choice(bays), self.chance.choice(others)
+        bay, other = bays[0], self.chance.choice(others)
         unit = self._number(bay)
         yield self._pause(), stories.Card(by=name, unit=unit)
         if self.chance.random() < 0.6:
