@@ -27,7 +27,7 @@ _IN_HAND: Final = (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
 
 def setup_of(chance: random.Random) -> Story:
     """What there is."""
-    sockets = chance.choice((1, 2, 2, 2, 3))
+    sockets = chance.choice((1, 1, 2, 2, 3))
     bare = chance.choice((0.1, 0.1, 0.5))
     units = []
     for label in range(1, sockets + chance.choice((1, 2, 3)) + 1):
@@ -42,8 +42,8 @@ def setup_of(chance: random.Random) -> Story:
                 answers=chance.random() > 0.04,
             )
         )
-    people, pages = [], chance.choice((4, 4, 12))
-    for name in ("jo", "al", "mo")[: chance.choice((1, 1, 2, 2, 3))]:
+    people, pages = [], chance.choice((4, 12, 12))
+    for name in ("jo", "al", "mo")[: chance.choice((1, 2, 2, 2, 3))]:
         source = chance.choices(("page", name, "mounted"), (pages, 4, 1))[0]
         people.append(stories.Person(name=name, source=source))
     recipe = chance.choices(list(_RECIPES), list(_RECIPES.values()))[0]
@@ -135,7 +135,7 @@ class Teller:
             self._clear: 5.0,
             self._take_out_again: 1.5,
             self._scan_at_once: 2.0,
-            self._be_interrupted: 1.0,
+            self._be_interrupted: 2.0,
             self._cancel: 0.6,
             self._free: 0.4,
             self._abort: 0.3,
@@ -280,7 +280,7 @@ class Teller:
                     yield self.chance.uniform(0.0, 1.0), scan(by=by, unit=unit)
 
     def _be_interrupted(self, name: str) -> Iterator[Step]:
-        """The socket of a card that waits works no more for a moment, and its unit is exchanged."""
+        """Exchange the unit of a card that waits, also while its socket does not work."""
         bays = yield from self._bring(1)
         others = self._on_table()
         if not (bays and others):
@@ -288,13 +288,13 @@ class Teller:
         bay, other = bays[0], self.chance.choice(others)
         unit = self._number(bay)
         yield self._pause(), stories.Card(by=name, unit=unit)
-        if self.chance.random() < 0.6:
-            yield self._pause(), stories.KillWorker(socket=bay.name)
-        else:
-            yield self._pause(), stories.Unplug(socket=bay.name, seconds=2.0)
+        kill = stories.KillWorker(socket=bay.name)
+        way = self.chance.choice((None, kill, stories.Unplug(socket=bay.name, seconds=2.0)))
+        yield self._pause(), way
         yield self.chance.uniform(0.0, 0.3), stories.Pull(unit=unit)
         yield self.chance.choice((HAND_S, 0.3, 0.5)), stories.Put(unit=other, socket=bay.name)
-        yield self.chance.uniform(0.1, 3.0), stories.Label(by=name, unit=unit)
+        wait = self.chance.uniform(0.1, 3.0) if way is not None else self.chance.uniform(0.1, 0.9)
+        yield wait, stories.Label(by=name, unit=unit)
 
     def _setup(self, number: int) -> stories.UnitSetup:
         return next(each for each in self.world.setup.units if each.label == number)
