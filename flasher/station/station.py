@@ -543,6 +543,8 @@ class Station:
         )
         self.tell(ended)
         self.line.feed(socket, ended, self._now)
+        if code is codes.TRACE_NOT_SAVED:  # the next ones would not be judged either
+            self.line.stop(code.name, text, code.action)
         with suppress(RecordError):
             self.tell(FiguresChanged(self.figures))
         if result.outcome is RunState.PASS:

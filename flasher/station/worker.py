@@ -335,7 +335,9 @@ class Worker:
             with suppress(OSError):
                 result = replace(result, trace_sha256=pack(claim.trace))
         if result.trace_sha256 is None and result.outcome is RunState.PASS:
-            result = _error_result(codes.TRACE_NOT_SAVED, "The trace of the bus is not complete.")
+            why = "" if recorder is None or recorder.failure is None else f": {recorder.failure}"
+            words = f"The trace of the bus is not complete{why}."
+            result = _error_result(codes.TRACE_NOT_SAVED, words)
         self._pipe.send(result)
         if self._virtual is not None:
             self._virtual.run_ended()

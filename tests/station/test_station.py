@@ -718,6 +718,19 @@ def test_an_unplugged_adapter_is_shown_and_comes_back(line: LineBench) -> None:
     assert line.state("A") is SocketState.EMPTY
 
 
+def test_a_trace_that_is_not_saved_stops_the_line(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.work("A")
+    line.end("A", RunState.ERROR, "TRACE_NOT_SAVED")
+    assert line.last(LineStopped).code == "TRACE_NOT_SAVED"
+    assert line.state("A") is SocketState.RECHECK
+    line.scan("W2605003")
+    assert line.last(ScanRefused).code == "LINE_STOPPED"
+    line.scan("RESUME")
+    assert line.of(LineResumed)
+
+
 def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBench) -> None:
     line.make("A", SERIAL)
     line.ports["A"].is_gone = True
