@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import click
 import rich_click
@@ -131,11 +131,14 @@ def argument(name: str, **more: Any) -> Decorator:
     return click.argument(name, cls=Argument, **more)
 
 
-def option_set(name: str, gather: Callable[..., object], *options: Decorator) -> Decorator:
+def option_set(name: str, gather: type[Any], *options: Decorator) -> Decorator:
     """Options that belong together: the command receives `gather(...)` of them as one argument.
-    `gather` is a dataclass with a field for each option.
+    `gather` is a dataclass with a field for each of `options` and for those that fields are
+    annotated with: `limit: Annotated[int, option("--limit", ...)]`.
     """
-    own = [each.name for each in fields(gather)]  # type: ignore[arg-type]
+    own = [each.name for each in fields(gather)]
+    hints = get_type_hints(gather, include_extras=True)
+    options += tuple(each for key in own for each in getattr(hints[key], "__metadata__", ()))
 
     def decorate(function: Callable[..., int]) -> Callable[..., int]:
         @functools.wraps(function)

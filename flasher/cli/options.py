@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import click
 
@@ -57,12 +57,31 @@ profile_option: Final = option(
 class ImageOptions:
     """An image file, and what decides which of its bytes are sent."""
 
-    image: str
-    format: str | None
-    base: int | None
-    range_: tuple[int, int] | None
-    fill_gaps_up_to: int
-    allow_outside_vector: bool
+    image: Annotated[str, argument(
+        "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
+        help="Intel HEX, S-record, ELF or raw binary",
+    )]  # fmt: skip
+    format: Annotated[str | None, option(
+        "--format", type=click.Choice(FORMATS), panel="image",
+        help="read IMAGE as this, do not detect",
+    )]  # fmt: skip
+    base: Annotated[int | None, option(
+        "--base", type=values.number, metavar="ADDRESS", panel="image", brief=True,
+        help="address of a raw binary's first byte",
+    )]  # fmt: skip
+    range_: Annotated[tuple[int, int] | None, option(
+        "--range", "range_", type=values.address_range, metavar="START:END", panel="image",
+        help="send only these addresses, END exclusive",
+    )]  # fmt: skip
+    fill_gaps_up_to: Annotated[int, option(
+        "--fill-gaps-up-to", type=values.number, default=str(DEFAULT_FILL_GAPS_UP_TO),
+        metavar="BYTES", panel="image",
+        help="fill gaps between segments with FF up to this size; larger ones are refused",
+    )]  # fmt: skip
+    allow_outside_vector: Annotated[bool, option(
+        "--allow-outside-vector", is_flag=True, panel="image",
+        help=f"send {WAIVERS[OUTSIDE_VECTOR].lets_through}",
+    )]  # fmt: skip
 
     def load(self, *, force: bool = False) -> Image:
         """The image. Raises ImageError, UsageError."""
@@ -76,35 +95,7 @@ class ImageOptions:
         )
 
 
-image_options: Final = option_set(
-    "image",
-    ImageOptions,
-    argument(
-        "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
-        help="Intel HEX, S-record, ELF or raw binary",
-    ),
-    option(
-        "--format", type=click.Choice(FORMATS), panel="image",
-        help="read IMAGE as this, do not detect",
-    ),
-    option(
-        "--base", type=values.number, metavar="ADDRESS", panel="image", brief=True,
-        help="address of a raw binary's first byte",
-    ),
-    option(
-        "--range", "range_", type=values.address_range, metavar="START:END", panel="image",
-        help="send only these addresses, END exclusive",
-    ),
-    option(
-        "--fill-gaps-up-to", type=values.number, default=str(DEFAULT_FILL_GAPS_UP_TO),
-        metavar="BYTES", panel="image",
-        help="fill gaps between segments with FF up to this size; larger ones are refused",
-    ),
-    option(
-        "--allow-outside-vector", is_flag=True, panel="image",
-        help=f"send {WAIVERS[OUTSIDE_VECTOR].lets_through}",
-    ),
-)  # fmt: skip
+image_options: Final = option_set("image", ImageOptions)
 
 
 def allow_implausible_option(panel: str | None = None) -> Decorator:
@@ -169,14 +160,42 @@ class Bus:
     dialect_name: str = WELLING.name
     mock: bool = False
     mock_speed: float = 1.0
-    interface: str | None = None
-    channel: str | None = None
-    bitrate: int | None = None
-    fd: bool | None = None
-    data_bitrate: int | None = None
-    timing: tuple[tuple[str, str], ...] = ()
-    can_filters: tuple[dict[str, int], ...] = ()
-    bus_kwargs: tuple[tuple[str, str], ...] = ()
+    interface: Annotated[str | None, option(
+        "-i", "--interface", type=values.interface, metavar="BACKEND", panel="bus", brief=True,
+        shell_complete=values.offers(values.interface_names),
+        help="python-can's back end for the adapter: socketcan, pcan, kvaser, vector, slcan, ...",
+    )] = None  # fmt: skip
+    channel: Annotated[str | None, option(
+        "-c", "--channel", metavar="CHANNEL", panel="bus", brief=True,
+        shell_complete=values.offers(values.channels),
+        help="which adapter or port: can0, PCAN_USBBUS1, 0, COM3, ...",
+    )] = None  # fmt: skip
+    bitrate: Annotated[int | None, option(
+        "-b", "--bitrate", type=int, metavar="BPS", panel="bus",
+        help="bits per second (default: the dialect's)",
+    )] = None  # fmt: skip
+    fd: Annotated[bool | None, option(
+        "--fd", is_flag=True,
+        default=None, panel="bus",
+        help="open the adapter for CAN FD; the protocol itself uses classical frames",
+    )] = None  # fmt: skip
+    data_bitrate: Annotated[int | None, option(
+        "--data-bitrate", type=int, metavar="BPS", panel="bus",
+        help="bits per second of the data phase of CAN FD",
+    )] = None  # fmt: skip
+    timing: Annotated[tuple[tuple[str, str], ...], option(
+        "--timing", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
+        help="bit timing: f_clock, brp, tseg1, tseg2, sjw, ..., each by an option of its own",
+    )] = ()  # fmt: skip
+    can_filters: Annotated[tuple[dict[str, int], ...], option(
+        "--filter", "can_filters", type=can_filter, multiple=True, metavar="ID:MASK", panel="bus",
+        help="a filter of the adapter, in hexadecimal; ID~MASK for all others; may be repeated. At "
+        "least the device's answers must pass: 725:7FF and 720:7FF for the BMS",
+    )] = ()  # fmt: skip
+    bus_kwargs: Annotated[tuple[tuple[str, str], ...], option(
+        "--bus-kwargs", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
+        help="one more argument for the back end, such as app_name=CANalyzer; may be repeated",
+    )] = ()  # fmt: skip
     settings: str | None = None
     """A file that may name the adapter, as --profile names one."""
     found: Found | None = None
@@ -249,46 +268,6 @@ def holder() -> str:
     return " ".join(click.get_current_context().command_path.split()[:2])
 
 
-_ADAPTER: Final = (
-    option(
-        "-i", "--interface", type=values.interface, metavar="BACKEND", panel="bus", brief=True,
-        shell_complete=values.offers(values.interface_names),
-        help="python-can's back end for the adapter: socketcan, pcan, kvaser, vector, slcan, ...",
-    ),
-    option(
-        "-c", "--channel", metavar="CHANNEL", panel="bus", brief=True,
-        shell_complete=values.offers(values.channels),
-        help="which adapter or port: can0, PCAN_USBBUS1, 0, COM3, ...",
-    ),
-    option(
-        "-b", "--bitrate", type=int, metavar="BPS", panel="bus",
-        help="bits per second (default: the dialect's)",
-    ),
-    option(
-        "--fd", is_flag=True,
-        default=None, panel="bus",
-        help="open the adapter for CAN FD; the protocol itself uses classical frames",
-    ),
-    option(
-        "--data-bitrate", type=int, metavar="BPS", panel="bus",
-        help="bits per second of the data phase of CAN FD",
-    ),
-    option(
-        "--timing", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
-        help="bit timing: f_clock, brp, tseg1, tseg2, sjw, ..., each by an option of its own",
-    ),
-    option(
-        "--filter", "can_filters", type=can_filter, multiple=True, metavar="ID:MASK", panel="bus",
-        help="a filter of the adapter, in hexadecimal; ID~MASK for all others; may be repeated. At "
-        "least the device's answers must pass: 725:7FF and 720:7FF for the BMS",
-    ),
-    option(
-        "--bus-kwargs", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
-        help="one more argument for the back end, such as app_name=CANalyzer; may be repeated",
-    ),
-)  # fmt: skip
-
-
 def mock_options(
     what: str, speed: Callable[[str], float] = values.seconds
 ) -> tuple[Decorator, ...]:
@@ -302,7 +281,7 @@ def mock_options(
     )  # fmt: skip
 
 
-adapter_options: Final = option_set("bus", Bus, *_ADAPTER)
+adapter_options: Final = option_set("bus", Bus)
 """The bus of a command that has neither a dialect nor a mock in place of the adapter."""
 
 
@@ -313,4 +292,4 @@ def bus_options(
 ) -> Decorator:
     """The bus of a command: dialect, adapter, and the mock in its place unless that is None."""
     in_its_place = () if mock is None else mock_options(mock, speed)
-    return option_set("bus", Bus, dialect_option, *in_its_place, *_ADAPTER)
+    return option_set("bus", Bus, dialect_option, *in_its_place)

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from platformdirs import user_state_path
 
@@ -56,26 +56,22 @@ _BUNDLES_KEPT: Final = 50
 class RecordingOptions:
     """What a command that talks on a bus leaves of it."""
 
-    trace_file: str | None = None
-    bundle_dir: Path | None = None
-    no_bundle: bool = False
-
-
-recording_options: Final = option_set(
-    "recorded",
-    RecordingOptions,
-    option(
+    trace_file: Annotated[str | None, option(
         "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
         brief=True, help="record all frames; format by suffix (.asc .blf ...)",
-    ),
-    option(
+    )] = None  # fmt: skip
+    bundle_dir: Annotated[Path | None, option(
         "--bundle-dir", metavar="DIR", type=FolderPath(), panel="recording",
         help="where a failure leaves its bundle: last frames, transcript, report "
         f"(default: ${BUNDLE_FOLDER}, else the user's own state folder, the last {_BUNDLES_KEPT}; "
         "flasher explain --last reads the latest)",
-    ),
-    option("--no-bundle", is_flag=True, panel="recording", help="leave none"),
-)  # fmt: skip
+    )] = None  # fmt: skip
+    no_bundle: Annotated[bool, option(
+        "--no-bundle", is_flag=True, panel="recording", help="leave none",
+    )] = False  # fmt: skip
+
+
+recording_options: Final = option_set("recorded", RecordingOptions)
 
 
 def bundle_folder(chosen: Path | None = None) -> Path:

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import click
 
@@ -162,27 +162,71 @@ DOCUMENTS: Final = (
 # -- a run -----------------------------------------------------------------------------------------
 
 
+_what = partial(option, panel="what is run, and how")
+_report = partial(option, metavar="FILE", type=values.FilePath(gives=Path), panel="reports")
+
+
 @dataclass(frozen=True)
 class Choices:
     """What is run, and the files that are written."""
 
-    is_list: bool
-    cases: tuple[str, ...]
-    groups: tuple[str, ...]
-    excluded: tuple[str, ...]
-    quick: bool
-    seed: str
-    repeat: int
-    timeout: float | None
-    strict: bool
-    upgrades: int | None
-    yes: bool
-    junit: Path | None
-    json_report: Path | None
-    html: Path | None
-    badge: Path | None
-    summary: Path | None
-    trace_dir: Path | None
+    is_list: Annotated[bool, _what(
+        "--list", "is_list", is_flag=True, brief=True, help="list the cases, and end",
+    )]  # fmt: skip
+    cases: Annotated[tuple[str, ...], _what(
+        "--case", "cases", multiple=True, type=str.upper, metavar="ID", brief=True,
+        help="run this case only, as TX-03; may be repeated",
+    )]  # fmt: skip
+    groups: Annotated[tuple[str, ...], _what(
+        "--group", "groups", multiple=True, type=str.upper, metavar="G", brief=True,
+        help=f"run this group only: {' '.join(GROUPS)}; may be repeated. SO and SP wear the device "
+        "and run only when they are named",
+    )]  # fmt: skip
+    excluded: Annotated[tuple[str, ...], _what(
+        "--exclude", "excluded", multiple=True, type=str.upper, metavar="ID|G",
+        help="run all but this case or group; may be repeated",
+    )]  # fmt: skip
+    quick: Annotated[bool, _what(
+        "--quick", is_flag=True, brief=True,
+        help="some of every group, in under a minute on a real bus",
+    )]  # fmt: skip
+    seed: Annotated[str, _what(
+        "--seed", default="1", metavar="SEED", help="decides all that is left to chance",
+    )]  # fmt: skip
+    repeat: Annotated[int, _what(
+        "--repeat", type=values.count, default="1", metavar="N", help="run every case N times",
+    )]  # fmt: skip
+    timeout: Annotated[float | None, _what(
+        "--timeout", type=values.seconds, metavar="SECONDS",
+        help="end the run after this time (default: every case has its own limit)",
+    )]  # fmt: skip
+    strict: Annotated[bool, _what(
+        "--strict", is_flag=True,
+        help="a pass in part fails the run, and a deviation of the profile that is none any more",
+    )]  # fmt: skip
+    upgrades: Annotated[int | None, _what(
+        "--upgrades", type=values.count, metavar="N",
+        help="how often each case of SO and SP has the device upgraded (default: "
+        + ", ".join(f"{case_id} {count}" for case_id, count in WEAR.items()) + ")",
+    )]  # fmt: skip
+    yes: Annotated[bool, _what(
+        "-y", "--yes", is_flag=True, help="do not ask before SO and SP wear a device on a bus",
+    )]  # fmt: skip
+    junit: Annotated[Path | None, _report("--junit", help="JUnit XML, for CI servers")]
+    json_report: Annotated[Path | None, _report(
+        "--json-report", help="the report as JSON, for `flasher conformance diff`",
+    )]  # fmt: skip
+    html: Annotated[Path | None, _report("--html", help="the report as one self-contained page")]
+    badge: Annotated[Path | None, _report(
+        "--badge", help="a drawing (SVG) that says how the run ended",
+    )]  # fmt: skip
+    summary: Annotated[Path | None, _report(
+        "--summary", help="the run on one page (HTML) to be printed, for a release",
+    )]  # fmt: skip
+    trace_dir: Annotated[Path | None, option(
+        _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
+        help="folder for a trace file (candump) of each case that does not pass",
+    )]  # fmt: skip
 
     @property
     def selection(self) -> Selection:
@@ -190,55 +234,7 @@ class Choices:
         return Selection(self.cases, self.groups, quick=self.quick, excluded=self.excluded)
 
 
-_what = partial(option, panel="what is run, and how")
-_report = partial(option, metavar="FILE", type=values.FilePath(gives=Path), panel="reports")
-_choices = option_set(
-    "chosen",
-    Choices,
-    _what("--list", "is_list", is_flag=True, brief=True, help="list the cases, and end"),
-    _what(
-        "--case", "cases", multiple=True, type=str.upper, metavar="ID", brief=True,
-        help="run this case only, as TX-03; may be repeated",
-    ),
-    _what(
-        "--group", "groups", multiple=True, type=str.upper, metavar="G", brief=True,
-        help=f"run this group only: {' '.join(GROUPS)}; may be repeated. SO and SP wear the device "
-        "and run only when they are named",
-    ),
-    _what(
-        "--exclude", "excluded", multiple=True, type=str.upper, metavar="ID|G",
-        help="run all but this case or group; may be repeated",
-    ),
-    _what(
-        "--quick", is_flag=True, brief=True,
-        help="some of every group, in under a minute on a real bus",
-    ),
-    _what("--seed", default="1", metavar="SEED", help="decides all that is left to chance"),
-    _what("--repeat", type=values.count, default="1", metavar="N", help="run every case N times"),
-    _what(
-        "--timeout", type=values.seconds, metavar="SECONDS",
-        help="end the run after this time (default: every case has its own limit)",
-    ),
-    _what(
-        "--strict", is_flag=True,
-        help="a pass in part fails the run, and a deviation of the profile that is none any more",
-    ),
-    _what(
-        "--upgrades", type=values.count, metavar="N",
-        help="how often each case of SO and SP has the device upgraded (default: "
-        + ", ".join(f"{case_id} {count}" for case_id, count in WEAR.items()) + ")",
-    ),
-    _what("-y", "--yes", is_flag=True, help="do not ask before SO and SP wear a device on a bus"),
-    _report("--junit", help="JUnit XML, for CI servers"),
-    _report("--json-report", help="the report as JSON, for `flasher conformance diff`"),
-    _report("--html", help="the report as one self-contained page"),
-    _report("--badge", help="a drawing (SVG) that says how the run ended"),
-    _report("--summary", help="the run on one page (HTML) to be printed, for a release"),
-    option(
-        _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
-        help="folder for a trace file (candump) of each case that does not pass",
-    ),
-)  # fmt: skip
+_choices = option_set("chosen", Choices)
 
 
 @group(

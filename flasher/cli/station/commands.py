@@ -8,7 +8,7 @@ import importlib
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import click
 
@@ -96,37 +96,31 @@ def _path_option(*names: str, **more: Any) -> Decorator:
 class RecordsOptions:
     """Where the records are."""
 
-    database: str | None
-    files: Path | None
-    keys: Path | None
-    heads: tuple[str, ...]
-    sockets: Path | None
-
-
-_records_options: Final = option_set(
-    "records",
-    RecordsOptions,
-    option(
+    database: Annotated[str | None, option(
         "--database", metavar="FILE|URL", panel="records", brief=True,
         help="the records: an SQLite file or postgresql://USER@HOST/NAME (default: of --sockets, "
         f"else {DEFAULT_RECORDS} here)",
-    ),
-    _path_option(
+    )]  # fmt: skip
+    files: Annotated[Path | None, _path_option(
         "--files", metavar="DIR", panel="records",
         help="the folder of traces (default: beside the file)",
-    ),
-    _path_option(
+    )]  # fmt: skip
+    keys: Annotated[Path | None, _path_option(
         "--keys", metavar="DIR", panel="records",
         help="the folder of the signing key (default: of --sockets, else a place of this user)",
-    ),
-    option(
+    )]  # fmt: skip
+    heads: Annotated[tuple[str, ...], option(
         "--heads", metavar="DIR|URL", multiple=True, panel="records",
         help="another place than beside the key where the signed heads of the audit trails are "
         "kept: a folder, best on another computer, or postgresql://USER@HOST/NAME; may be repeated "
         "(default: of --sockets)",
-    ),
-    _path_option("--sockets", panel="records", brief=True, help="the station's file (TOML)"),
-)  # fmt: skip
+    )]  # fmt: skip
+    sockets: Annotated[Path | None, _path_option(
+        "--sockets", panel="records", brief=True, help="the station's file (TOML)",
+    )]  # fmt: skip
+
+
+_records_options: Final = option_set("records", RecordsOptions)
 
 
 _operator_option: Final = option(
@@ -181,34 +175,28 @@ _WRITTEN: Final = "what is written"
 class PagesOptions:
     """Who may see the pages, and in which language."""
 
-    web_password: Path | None
-    web_certificate: Path | None
-    web_key: Path | None
-    web_insecure: bool
-    language: str | None
-
-
-_pages_options: Final = option_set(
-    "pages",
-    PagesOptions,
-    _path_option(
+    web_password: Annotated[Path | None, _path_option(
         "--web-password", panel=_PAGES,
         help="a file whose first line is the password of the pages",
-    ),
-    _path_option(
+    )]  # fmt: skip
+    web_certificate: Annotated[Path | None, _path_option(
         "--web-certificate", panel=_PAGES,
         help="serve them by TLS with this certificate (PEM)",
-    ),
-    _path_option("--web-key", panel=_PAGES, help="the key of the certificate (PEM)"),
-    option(
+    )]  # fmt: skip
+    web_key: Annotated[Path | None, _path_option(
+        "--web-key", panel=_PAGES, help="the key of the certificate (PEM)",
+    )]  # fmt: skip
+    web_insecure: Annotated[bool, option(
         "--web-insecure", is_flag=True, panel=_PAGES,
         help="let other computers in without TLS: whoever listens on the network can read along",
-    ),
-    option(
+    )]  # fmt: skip
+    language: Annotated[str | None, option(
         "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
         help="of the pages (default: the browser's)",
-    ),
-)  # fmt: skip
+    )]  # fmt: skip
+
+
+_pages_options: Final = option_set("pages", PagesOptions)
 
 
 @station.action("check")
@@ -223,74 +211,69 @@ def check(output: Output, recipe: Path, sockets: Path | None) -> int:
 class RunOptions:
     """How a station is run."""
 
-    recipe: Path
-    operator: str | None
-    lot: str
-    badges: Path | None
-    scans: Path | None
-    lines: bool
-    web: Address | None
-    mix_virtual: bool
-    mock_sockets: int | None
-    units: int | None
-    scan_by_hand: bool
-    mock_bad: float
-    mock_slow: float
-    mock_dead: float
-    mock_exchanged: float
-    mock_mislabelled: float
-    mock_seed: int
-    mock_speed: float
-
-
-@station.action("run", epilog=_RUN_NOTES)
-@option_set(
-    "options",
-    RunOptions,
-    _path_option("--recipe", required=True, help="what is done to each unit"),
-    option("--operator", metavar="NAME", brief=True, help="who works here (default: the login)"),
-    option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units"),
-    _path_option(
+    recipe: Annotated[Path, _path_option(
+        "--recipe", required=True, help="what is done to each unit",
+    )]  # fmt: skip
+    operator: Annotated[str | None, option(
+        "--operator", metavar="NAME", brief=True, help="who works here (default: the login)",
+    )]  # fmt: skip
+    lot: Annotated[str, option(
+        "--lot", default="", metavar="NAME", show_default=False, help="the lot of the units",
+    )]  # fmt: skip
+    badges: Annotated[Path | None, _path_option(
         "--badges", help="the table of the badges: who may work here (default: of --sockets)"
-    ),
-    _path_option("--scans", help="labels in the order of the units; it ends behind the last"),
-    option("--lines", is_flag=True, help="a line for each happening, on a terminal too"),
-    option(
+    )]  # fmt: skip
+    scans: Annotated[Path | None, _path_option(
+        "--scans", help="labels in the order of the units; it ends behind the last",
+    )]  # fmt: skip
+    lines: Annotated[bool, option(
+        "--lines", is_flag=True, help="a line for each happening, on a terminal too",
+    )]  # fmt: skip
+    web: Annotated[Address | None, option(
         "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
         panel=_PAGES, brief=True, show_default=False,
         help="serve the pages of the operator and the supervisor (alone: on this computer only, "
         f"port {DEFAULT_WEB})",
-    ),
-    option(
+    )]  # fmt: skip
+    mix_virtual: Annotated[bool, option(
         "--mix-virtual", is_flag=True, panel="records",
         help="let real and virtual units share the records (no serial number is both)",
-    ),
-    option(
+    )]  # fmt: skip
+    mock_sockets: Annotated[int | None, option(
         "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
         help="N sockets with virtual units",
-    ),
-    option(
+    )]  # fmt: skip
+    units: Annotated[int | None, option(
         "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
         help="end after N virtual units",
-    ),
-    option(
+    )]  # fmt: skip
+    scan_by_hand: Annotated[bool, option(
         "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
         help="their labels are shown, and have to be typed",
-    ),
-    _mock_share_option("bad", 0.15, "refuse the image, or have the wrong hardware"),
-    _mock_share_option("slow", 0.1, "take longer"),
-    _mock_share_option("dead", 0.05, "never answer"),
-    _mock_share_option("exchanged", 0.0, "are exchanged for the next one while they are flashed"),
-    _mock_share_option("mislabelled", 0.0, "bear the label of another unit"),
-    option(
+    )]  # fmt: skip
+    mock_bad: Annotated[float, _mock_share_option(
+        "bad", 0.15, "refuse the image, or have the wrong hardware",
+    )]  # fmt: skip
+    mock_slow: Annotated[float, _mock_share_option("slow", 0.1, "take longer")]
+    mock_dead: Annotated[float, _mock_share_option("dead", 0.05, "never answer")]
+    mock_exchanged: Annotated[float, _mock_share_option(
+        "exchanged", 0.0, "are exchanged for the next one while they are flashed",
+    )]  # fmt: skip
+    mock_mislabelled: Annotated[float, _mock_share_option(
+        "mislabelled", 0.0, "bear the label of another unit",
+    )]  # fmt: skip
+    mock_seed: Annotated[int, option(
         "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL,
         help="other ones",
-    ),
-    option(
+    )]  # fmt: skip
+    mock_speed: Annotated[float, option(
         "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
         help="times as fast as a real bus; 0 takes no time",
-    ),
-)  # fmt: skip
+    )]  # fmt: skip
+
+
+@station.action("run", epilog=_RUN_NOTES)
+@option_set("options", RunOptions)
 @_pages_options
 @_records_options
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
@@ -325,38 +308,39 @@ def pin(output: Output) -> int:
 class ReportOptions:
     """Which runs are reported, and what is written."""
 
-    lot: str | None
-    recipe: str | None
-    part: str | None
-    serial: str | None
-    since: str | None
-    until: str | None
-    csv: Path | None
-    json_report: Path | None
-    junit: Path | None
-    certificates: Path | None
+    lot: Annotated[str | None, option(
+        "--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot",
+    )]  # fmt: skip
+    recipe: Annotated[str | None, option(
+        "--recipe", metavar="NAME", panel=_WHICH, help="by the recipe of this name",
+    )]  # fmt: skip
+    part: Annotated[str | None, option("--part", metavar="NAME", panel=_WHICH, help="of this part")]
+    serial: Annotated[str | None, option(
+        "--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number",
+    )]  # fmt: skip
+    since: Annotated[str | None, option(
+        "--since", metavar="TIME", panel=_WHICH, brief=True,
+        help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
+    )]  # fmt: skip
+    until: Annotated[str | None, option(
+        "--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before",
+    )]  # fmt: skip
+    csv: Annotated[Path | None, _path_option(
+        "--csv", panel=_WRITTEN, brief=True, help="one row a run",
+    )]  # fmt: skip
+    json_report: Annotated[Path | None, _path_option(
+        "--json-report", panel=_WRITTEN, help="figures and runs",
+    )]  # fmt: skip
+    junit: Annotated[Path | None, _path_option(
+        "--junit", panel=_WRITTEN, help="one test case a run",
+    )]  # fmt: skip
+    certificates: Annotated[Path | None, _path_option(
+        "--certificates", metavar="DIR", panel=_WRITTEN, help="a page to print for each unit (HTML)"
+    )]  # fmt: skip
 
 
 @station.action("report")
-@option_set(
-    "options",
-    ReportOptions,
-    option("--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot"),
-    option("--recipe", metavar="NAME", panel=_WHICH, help="by the recipe of this name"),
-    option("--part", metavar="NAME", panel=_WHICH, help="of this part"),
-    option("--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number"),
-    option(
-        "--since", metavar="TIME", panel=_WHICH, brief=True,
-        help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
-    ),
-    option("--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before"),
-    _path_option("--csv", panel=_WRITTEN, brief=True, help="one row a run"),
-    _path_option("--json-report", panel=_WRITTEN, help="figures and runs"),
-    _path_option("--junit", panel=_WRITTEN, help="one test case a run"),
-    _path_option(
-        "--certificates", metavar="DIR", panel=_WRITTEN, help="a page to print for each unit (HTML)"
-    ),
-)  # fmt: skip
+@option_set("options", ReportOptions)
 @_records_options
 def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
     """Show units, yield, failures and times; write them to files; make certificates."""

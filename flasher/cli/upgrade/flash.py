@@ -6,14 +6,14 @@ import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
 import click
 
 from flasher import api
 from flasher.cli import values
 from flasher.cli.adapters import check_heard, choose_adapter
-from flasher.cli.framework import command, option, option_set, rebuild_command_line
+from flasher.cli.framework import Decorator, command, option, option_set, rebuild_command_line
 from flasher.cli.options import (
     Bus,
     ImageOptions,
@@ -86,31 +86,76 @@ _EXIT_CODES: Final = (
 # -- what the user chooses -------------------------------------------------------------------------
 
 
+def _waiver_option(name: str) -> Decorator:
+    return option(
+        f"--allow-{name}", is_flag=True, panel="checks before the first write",
+        help=f"let through {OF_DEVICE[name].lets_through}",
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class UpgradeChoices:
     """How the upgrade goes, and which checks are waived."""
 
-    manifest: str | None
-    profile: str | None
-    dry_run: bool
-    verify: str | None
-    retries: int | None
-    attempts: int | None
-    timeout: float | None
-    adapter_wait: float | None
-    frame_gap: float | None
+    manifest: Annotated[str | None, option(
+        "--manifest", metavar="FILE", type=values.FilePath("toml"), panel="image",
+        help="the image's release manifest (default: IMAGE.toml beside the image, if there is one)",
+    )]  # fmt: skip
+    profile: Annotated[str | None, profile_option]
+    dry_run: Annotated[bool, option(
+        "-n", "--dry-run", is_flag=True, panel="upgrade", brief=True,
+        help="show the plan and stop",
+    )]  # fmt: skip
+    verify: Annotated[str | None, option(
+        "--verify", type=click.Choice([level.value for level in Level]), panel="upgrade",
+        help="after the upgrade: ask the new application for its version, or read the whole image "
+        "back as well (default: version where the target has a query for it, else none)",
+    )]  # fmt: skip
+    retries: Annotated[int | None, option(
+        "--retries", type=values.count, metavar="N", panel="upgrade",
+        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries}, and "
+        f"{PATIENT_TRIES} once the device has no application)",
+    )]  # fmt: skip
+    attempts: Annotated[int | None, option(
+        "--attempts", type=values.count, metavar="N", panel="upgrade",
+        help="begin the upgrade up to N times: when the device restarts, a packet is lost for good "
+        f"or the adapter comes back (default {DEFAULT_ATTEMPTS}, and until the overall deadline "
+        "once the device has no application)",
+    )]  # fmt: skip
+    timeout: Annotated[float | None, option(
+        "--timeout", type=values.seconds, metavar="S", panel="upgrade",
+        help="overall deadline in seconds, of all attempts together (default: computed from the "
+        "plan)",
+    )]  # fmt: skip
+    adapter_wait: Annotated[float | None, option(
+        "--adapter-wait", type=values.seconds, metavar="S", panel="upgrade",
+        help="seconds that a lost adapter may take to come back, once anything was sent "
+        f"(default {UpgradeOptions.adapter_return_s:g})",
+    )]  # fmt: skip
+    frame_gap: Annotated[float | None, gap_options]
     packet_gap: float | None
-    nak_next_is_ack: bool
-    in_session: bool
-    allow_implausible: bool
-    allow_other_target: bool
-    allow_hardware: bool
-    allow_downgrade: bool
-    allow_previous_version: bool
-    allow_in_use: bool
-    allow_boot_name: bool
-    allow_boot_version: bool
-    force: bool
+    nak_next_is_ack: Annotated[bool, option(
+        "--nak-next-is-ack", is_flag=True, panel="upgrade",
+        help="for bootloaders that answer a repeated packet n with NAK n+1",
+    )]  # fmt: skip
+    in_session: Annotated[bool, option(
+        "--in-session", is_flag=True, panel="upgrade",
+        help="an upgrade of this device was broken off, and it may still wait in it: when it "
+        "answers nothing, send it an update command",
+    )]  # fmt: skip
+    allow_implausible: Annotated[bool, _waiver_option("implausible")]
+    allow_other_target: Annotated[bool, _waiver_option("other-target")]
+    allow_hardware: Annotated[bool, _waiver_option("hardware")]
+    allow_downgrade: Annotated[bool, _waiver_option("downgrade")]
+    allow_previous_version: Annotated[bool, _waiver_option("previous-version")]
+    allow_in_use: Annotated[bool, _waiver_option("in-use")]
+    allow_boot_name: Annotated[bool, _waiver_option("boot-name")]
+    allow_boot_version: Annotated[bool, _waiver_option("boot-version")]
+    force: Annotated[bool, option(
+        "-f", "--force", is_flag=True, panel="checks before the first write",
+        help="the same as every --allow-... together; neither a damaged file nor a second tool is "
+        "waived by any",
+    )]  # fmt: skip
 
     def allows(self, name: str) -> bool:
         """True when --allow-NAME or --force was given."""
@@ -138,67 +183,7 @@ class UpgradeChoices:
         )
 
 
-_upgrade_options: Final = option_set(
-    "choices",
-    UpgradeChoices,
-    option(
-        "--manifest", metavar="FILE", type=values.FilePath("toml"), panel="image",
-        help="the image's release manifest (default: IMAGE.toml beside the image, if there is one)",
-    ),
-    profile_option,
-    option(
-        "-n", "--dry-run", is_flag=True, panel="upgrade", brief=True,
-        help="show the plan and stop",
-    ),
-    option(
-        "--verify", type=click.Choice([level.value for level in Level]), panel="upgrade",
-        help="after the upgrade: ask the new application for its version, or read the whole image "
-        "back as well (default: version where the target has a query for it, else none)",
-    ),
-    option(
-        "--retries", type=values.count, metavar="N", panel="upgrade",
-        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries}, and "
-        f"{PATIENT_TRIES} once the device has no application)",
-    ),
-    option(
-        "--attempts", type=values.count, metavar="N", panel="upgrade",
-        help="begin the upgrade up to N times: when the device restarts, a packet is lost for good "
-        f"or the adapter comes back (default {DEFAULT_ATTEMPTS}, and until the overall deadline "
-        "once the device has no application)",
-    ),
-    option(
-        "--timeout", type=values.seconds, metavar="S", panel="upgrade",
-        help="overall deadline in seconds, of all attempts together (default: computed from the "
-        "plan)",
-    ),
-    option(
-        "--adapter-wait", type=values.seconds, metavar="S", panel="upgrade",
-        help="seconds that a lost adapter may take to come back, once anything was sent "
-        f"(default {UpgradeOptions.adapter_return_s:g})",
-    ),
-    gap_options,
-    option(
-        "--nak-next-is-ack", is_flag=True, panel="upgrade",
-        help="for bootloaders that answer a repeated packet n with NAK n+1",
-    ),
-    option(
-        "--in-session", is_flag=True, panel="upgrade",
-        help="an upgrade of this device was broken off, and it may still wait in it: when it "
-        "answers nothing, send it an update command",
-    ),
-    *(
-        option(
-            f"--allow-{name}", is_flag=True, panel="checks before the first write",
-            help=f"let through {waiver.lets_through}",
-        )
-        for name, waiver in OF_DEVICE.items()
-    ),
-    option(
-        "-f", "--force", is_flag=True, panel="checks before the first write",
-        help="the same as every --allow-... together; neither a damaged file nor a second tool is "
-        "waived by any",
-    ),
-)  # fmt: skip
+_upgrade_options: Final = option_set("choices", UpgradeChoices)
 
 
 # -- the commands ----------------------------------------------------------------------------------
