@@ -434,6 +434,16 @@ UNDETECTABLE = {
             " @58.8 pull unit=2 ; @59.1 put unit=4 socket=B"
         ),
     ),
+    "starts in place of the unit with the label, which comes then": (
+        COMPLETE,
+        (
+            "line sockets=1 recipe=plain ; unit label=1 number=own application=new ;"
+            " unit label=3 application=none ; person name=jo source=jo ;"
+            " @3.0 dip socket=A seconds=4.0 ; @6.28 put unit=1 socket=A ;"
+            " @6.8 card by=jo unit=1 ; @6.81 pull unit=1 ; @7.1 put unit=3 socket=A ;"
+            " @7.2 label by=jo unit=1 ; @8.6 pull unit=3 ; @10.0 put unit=1 socket=A"
+        ),
+    ),
     "without power": (
         SILENT,
         (

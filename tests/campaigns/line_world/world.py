@@ -425,7 +425,8 @@ class World:
         if self.setup.line.tells:
             known = self.promises.numbers_known(bay.name, bay.step if bay.is_working else None)
             number = _stored(unit).number
-            is_alike = number in known if known else not number.startswith("W")
+            is_other = number.startswith("W") and number != bay.run
+            is_alike = number in known if known else not is_other
             self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new, is_alike=is_alike)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.spoke_at = float("-inf")
