@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final
 
-from flasher.conformance.judge import Judge, Times
+from flasher.conformance.judge import Judge, TimeName
 from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
@@ -116,10 +116,10 @@ class Bench:
             sent = self.send(self.encoder.reset())
             reply = self.wait_for(Reply.FEEDBACK, Reply.BOOT_VERSION, within_s=within_s)
         if reply is not None and reply.kind is Reply.FEEDBACK:
-            self.measure(Times.FEEDBACK, reply.at - sent.left_at)
+            self.measure(TimeName.FEEDBACK, reply.at - sent.left_at)
             reply = self.wait_for(Reply.BOOT_VERSION, within_s=within_s)
         found = self.require_received(reply, Reply.BOOT_VERSION.value, within_s)
-        self.measure(Times.FIRST, found.at - sent.left_at)
+        self.measure(TimeName.FIRST, found.at - sent.left_at)
         return found
 
     def wait_until_listening(self) -> None:
@@ -160,7 +160,7 @@ class Bench:
         if reply is not None and reply.kind is not Reply.REQUEST:
             reply = None
         found = self.require_received(reply, Reply.REQUEST.value, limit_s)
-        self.measure(Times.REQUEST, found.at - sent.left_at)
+        self.measure(TimeName.REQUEST, found.at - sent.left_at)
         return found
 
     def start_transfer(self, size_bytes: int) -> None:
@@ -174,7 +174,7 @@ class Bench:
         """Send a packet of `image` and require its ACK."""
         sent = self.send_packet(image, number)
         reply = self.expect(Reply.ACK, number=number)
-        self.measure(Times.ANSWER, reply.at - sent.left_at)
+        self.measure(TimeName.ANSWER, reply.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
         """Send packets `first` to `last` (default: the last of the image) and require each ACK."""
@@ -234,7 +234,7 @@ class Bench:
         """Send end of transfer and require complete."""
         sent = self.send(self.encoder.end())
         reply = self.expect(Reply.COMPLETE)
-        self.measure(Times.COMPLETE, reply.at - sent.left_at)
+        self.measure(TimeName.COMPLETE, reply.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
         """Send the packets from `first` on and the end of transfer; check that the image runs."""

@@ -83,7 +83,7 @@ class Difference:
 
 
 def read_report(path: Path) -> RunReport:
-    """Read a report. Raises UsageError for a file that cannot be read or is no report."""
+    """Read a report. Raises UsageError for a file that cannot be read or is not a report."""
     from pydantic import ValidationError  # noqa: PLC0415  slow
 
     raw = read(path, JSON_MAX_SIZE, what="report")
@@ -171,7 +171,7 @@ def _judged(report: RunReport) -> dict[str, CaseVerdict]:
 
 
 def reasons_of(report: RunReport) -> dict[str, str]:
-    """What the first result of each case says that has something to say."""
+    """The first non-empty reason of each case."""
     found: dict[str, str] = {}
     for result in report.results:
         reason = result.note
@@ -185,7 +185,7 @@ def reasons_of(report: RunReport) -> dict[str, str]:
 
 
 def _changed_times(old: RunReport, new: RunReport, threshold_percent: float) -> list[TimeChange]:
-    """Times of both runs whose median or 95th percentile is another one."""
+    """Times whose median or 95th percentile changed by more than the threshold."""
     found = []
     by_name = {times.name: times for times in old.times}
     for after in new.times:

@@ -85,7 +85,6 @@ class TimesView(NamedTuple):
 
 
 def html_page(report: RunReport) -> str:
-    """The page of a run."""
     groups = {
         f"{group} {group_title(group)}": [_case(text, result) for text, result in members]
         for group, members in report.by_group().items()

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 @cache
 def adapter() -> TypeAdapter[RunReport]:
-    """Reads and writes a report. Raises pydantic.ValidationError for what is none."""
+    """Reads and writes reports. Raises pydantic.ValidationError for invalid data."""
     from pydantic import TypeAdapter  # noqa: PLC0415  slow
 
     return TypeAdapter(RunReport)
 
 
 def to_json(report: RunReport) -> dict[str, Any]:
-    """The report in JSON's types."""
+    """Convert the report to plain JSON types."""
     plain: dict[str, Any] = adapter().dump_python(report, mode="json", by_alias=True)
     return plain
 
 
 def to_bytes(report: RunReport) -> bytes:
-    """The report as a file, a key a line, so that two of them can be compared as text too."""
+    """Encode the report with one key per line, so that files can be compared as text."""
     return (json.dumps(to_json(report), indent=1) + "\n").encode("ascii")

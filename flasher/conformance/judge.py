@@ -16,7 +16,7 @@ from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Received, Reply, describe
 
 
-class Times:
+class TimeName:
     """Names of measured times that several cases or questions use."""
 
     FEEDBACK: Final = "reset to general feedback"

@@ -46,7 +46,7 @@ broke off is an error, so that a CI server does not show green.
 
 BINS: Final = 20
 ByResult = Mapping[tuple[str, int], str]
-"""A text for results, by case id and repeat."""
+"""A text for each result, by case id and repeat."""
 _NONE: Final[ByResult] = {}
 
 
@@ -66,8 +66,8 @@ def distribution(measurements: Iterable[Measurement]) -> Distribution:
 def completed(
     report: RunReport, *, started_at: str, replays: ByResult = _NONE, trace_files: ByResult = _NONE
 ) -> RunReport:
-    """The report as it is printed and written: with the ISO time of its start, how its times are
-    spread, and by case id and repeat the commands and the files of its results.
+    """Complete a report for output: start time (ISO), distribution of times, and by case id and
+    repeat the replay commands and trace files of its results.
     """
     return replace(
         report,
@@ -108,7 +108,7 @@ def _histogram(values_s: Sequence[float]) -> Histogram:
 
 
 def junit_report(report: RunReport) -> bytes:
-    """The report as JUnit XML, a suite a group."""
+    """JUnit XML with one suite per group."""
     properties = {
         "subject": report.subject,
         "target": report.target,
@@ -176,7 +176,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport) -> JUnitC
 
 
 def failure_details(text: CaseText, result: CaseResult) -> str:
-    """What a case asks for, what failed, and how to run it again, line by line."""
+    """Clauses, stimulus, failed checks, seed and replay command of a case, line by line."""
     failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
     lines = [f"clause: {label}: {content}" for label, content in text.clauses.items()]
     lines.append(f"stimulus: {text.stimulus}")

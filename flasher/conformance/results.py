@@ -1,4 +1,4 @@
-"""The results of a run as data: checks, measurements, verdicts, and the report that holds them."""
+"""Results of a run as data: checks, measurements, verdicts, and the report that contains them."""
 
 from __future__ import annotations
 
@@ -14,40 +14,39 @@ from flasher.validation import json_keys
 
 FINAL_IMAGE_OK: Final = "verified"
 SCHEMA_VERSION: Final = 2
-"""Of a report in JSON: counts up when a field changes its meaning or goes away; not for a new
-one."""
+"""Version of the JSON report; incremented when a field changes its meaning or is removed."""
 CHECKS_KEPT: Final = 50
-"""Checks of one case that JSON has, those that did not pass; all are counted."""
+"""Largest number of failed checks of a case in JSON; all are counted."""
 
 
 class CaseVerdict(Enum):
-    """The verdict on a case; the members are in order of gravity, the best first."""
+    """Verdict on a case; the members are ordered from best to worst."""
 
     PASS = "pass"  # noqa: S105  no password
     PASS_IN_PART = "pass_in_part"  # noqa: S105
-    """What was tried passes, but a part was not tried: it is told which, and why."""
+    """The tried parts pass; reports list the parts that were not tried, with reasons."""
     INFO = "info"
-    """Nothing to judge, only measured or observed."""
+    """Only measured or observed, nothing to judge."""
     UNSUPPORTED = "unsupported"
-    """Cannot be judged on this bench, for the reason in the note."""
+    """This bench cannot judge it; the note gives the reason."""
     DEVIATION = "deviation"
-    """Failed, as the profile says that it does."""
+    """Failed in the way that the profile documents."""
     INCONCLUSIVE = "inconclusive"
-    """The uncertainty of the measurement is greater than the margin."""
+    """The uncertainty of a measurement exceeds the margin."""
     NOT_RUN = "not_run"
-    """The run stopped before it."""
+    """The run ended before it."""
     ERROR = "error"
-    """The case itself went wrong: the suite or the adapter, not the device."""
+    """The case itself failed: an error of the suite or the adapter, not of the device."""
     FAIL = "fail"
 
     @property
     def text(self) -> str:
-        """As reports name it."""
+        """Name in reports."""
         return self.value.replace("_", " ")
 
 
 class CheckOutcome(Enum):
-    """How one check of a case ended."""
+    """Result of one check."""
 
     PASS = "pass"  # noqa: S105  no password
     FAIL = "fail"
@@ -57,14 +56,13 @@ class CheckOutcome(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One check: the step of the case, what was expected and what was got."""
+    """One check: the step of the case, the expected and the actual result."""
 
     step: str
     outcome: CheckOutcome
     expected: str
     got: str
     at_s: float
-    """Seconds since the case began."""
 
     def __str__(self) -> str:
         step = f"{self.step}: " if self.step else ""
@@ -73,7 +71,7 @@ class Check:
 
 @dataclass(frozen=True)
 class CheckCounts:
-    """How many checks of a case ended how."""
+    """Number of checks of a case by outcome."""
 
     passed: int
     failed: int
@@ -83,7 +81,7 @@ class CheckCounts:
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured time; the name says from what to what ("packet to ACK")."""
+    """One measured time; its name states both ends ("packet to ACK")."""
 
     name: str
     value_s: float
@@ -92,7 +90,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Histogram:
-    """How often values fell into bins of one width: as many counts as edges, less one."""
+    """Histogram with bins of equal width: one count less than edges."""
 
     edges_s: Sequence[float]
     counts: Sequence[int]
@@ -100,7 +98,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Times:
-    """How the times of one name are spread. Percentiles are values that were measured."""
+    """Distribution of the times of one name. Percentiles are measured values."""
 
     name: str
     count: int
@@ -110,12 +108,12 @@ class Times:
     p99_s: float
     maximum_s: float
     uncertainty_s: float
-    """How far a single value may be off: the greatest of them."""
+    """Largest uncertainty of a single value."""
     histogram: Histogram
 
 
 class TraceEntry(NamedTuple):
-    """One frame of a case, in seconds since the case began; `sent` by the suite or received."""
+    """One frame of a case, in seconds since its start; `sent` by the suite or received."""
 
     at_s: float
     sent: bool
@@ -124,23 +122,23 @@ class TraceEntry(NamedTuple):
 
 @dataclass(frozen=True)
 class CaseText:
-    """What a report says about a case beside its result."""
+    """Texts of a case for reports."""
 
     id: str
     group: str
     title: str
-    """For a case that cannot be run, the reason."""
+    """The reason, for a case that cannot be run."""
     clause: str = ""
-    """What it is judged by, as the documents number it, parted by "; "."""
+    """Labels of its clauses, separated by "; "."""
     clauses: Mapping[str, str] = field(default_factory=dict)
-    """Each of these with its content."""
+    """Label to text of each clause."""
     stimulus: str = ""
     expectation: str = ""
     requires: tuple[str, ...] = ()
     choices: Mapping[str, str] = field(default_factory=dict)
-    """Keys of the profile that the case was judged by, with their values."""
+    """Profile keys that decided the verdict, with their values."""
     deviation: str = ""
-    """The reason in the profile why the device may differ."""
+    """Reason from the profile why the product may differ."""
 
 
 @json_keys(
@@ -149,7 +147,7 @@ class CaseText:
 )
 @dataclass(frozen=True)
 class CaseResult:
-    """What came of one run of a case."""
+    """Result of one run of a case."""
 
     case_id: str
     verdict: CaseVerdict
@@ -162,17 +160,16 @@ class CaseResult:
     duration_s: float = 0.0
     trace: tuple[TraceEntry, ...] = ()
     trace_dropped: int = 0
-    """Frames that were not kept, as there were too many; the newest ones are kept."""
+    """Number of older frames that were dropped from the trace."""
     deviation_resolved: bool = False
-    """The profile documents a deviation, but the case passes."""
+    """The case passes although the profile documents a deviation."""
     replay: str = ""
-    """The command that runs this case alone, with its seed; empty where there is none."""
+    """Command that runs this case alone with its seed; empty without one."""
     trace_file: str = ""
-    """Name of the file with its frames; empty without one."""
+    """Name of its trace file; empty without one."""
 
     @property
     def key(self) -> tuple[str, int]:
-        """Case id and repeat."""
         return self.case_id, self.repeat
 
     @cached_property
@@ -182,19 +179,19 @@ class CaseResult:
 
     @cached_property
     def findings(self) -> tuple[Check, ...]:
-        """The checks that did not pass, the first ones of many."""
+        """The checks that did not pass, up to a maximum number."""
         bad = (check for check in self.checks if check.outcome is not CheckOutcome.PASS)
         return tuple(islice(bad, CHECKS_KEPT))
 
     @cached_property
     def not_tried(self) -> tuple[str, ...]:
-        """The parts that this bench could not try, each with the reason."""
+        """Distinct parts that this bench could not try, with reasons."""
         found = (one for one in self.checks if one.outcome is CheckOutcome.UNSUPPORTED)
         return tuple(dict.fromkeys(f"{one.expected} ({one.got})" for one in found))
 
     @property
     def first_failure(self) -> Check | None:
-        """The first check that failed, else the first that was inconclusive; None without any."""
+        """The first failed check, else the first inconclusive one, else None."""
         for outcome in (CheckOutcome.FAIL, CheckOutcome.INCONCLUSIVE):
             for check in self.checks:
                 if check.outcome is outcome:
@@ -203,9 +200,7 @@ class CaseResult:
 
     @property
     def reason(self) -> str:
-        """Why the verdict is what it is, in one line: the first failure, what was not tried, or the
-        note.
-        """
+        """Reason of the verdict in one line: the first failure, the untried parts, or the note."""
         if self.verdict is CaseVerdict.PASS_IN_PART:
             return f"not tried: {'; '.join(self.not_tried)}"
         return str(self.first_failure or self.note)
@@ -213,19 +208,19 @@ class CaseResult:
 
 @dataclass(frozen=True)
 class Gap:
-    """What a bench lacks, and what it cannot judge for that."""
+    """Something the bench lacks, and the cases that it therefore cannot judge."""
 
     requirement: str
     lacks: str
     remedy: str
-    """What adds it: an option, or another kind of device under test."""
+    """How to add it: an option, or another kind of device under test."""
     unsupported: tuple[str, ...]
     """Cases that cannot be run."""
     in_part: tuple[str, ...]
-    """Cases that are judged in part."""
+    """Cases that are judged only in part."""
 
     def __str__(self) -> str:
-        """In one line, without the names of the cases."""
+        """One line without the names of the cases."""
         costs = {"cannot be run": len(self.unsupported), "judged in part": len(self.in_part)}
         said = ", ".join(f"{count} {what}" for what, count in costs.items() if count)
         return f"without {self.lacks}: {said} (it takes {self.remedy})"
@@ -233,7 +228,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Rescue:
-    """A case after which only power brought the device back."""
+    """A case after which only a power cycle restored the device."""
 
     id: str
     how: str
@@ -249,8 +244,8 @@ class Rescue:
 class RunReport:
     """A run of the conformance suite."""
 
-    # Times are in seconds, on the bench's clock. What the clock of the computer tells, `times`,
-    # and where each result is repeated and traced are added by `reports.completed`.
+    # Times are in seconds on the bench's clock. `reports.completed` adds the start time, the
+    # distribution of times, replay commands and trace files.
     subject: str
     target: str
     bitrate_bps: int
@@ -263,25 +258,24 @@ class RunReport:
     cases: tuple[CaseText, ...]  # those of `results`, each once, in the order of the catalogue
     results: tuple[CaseResult, ...]
     gaps: tuple[Gap, ...] = ()
-    """What this bench could not judge of the selected cases, by what it lacks."""
+    """Selected cases that this bench could not judge, by what it lacks."""
     not_selected: tuple[str, ...] = ()  # cases that the selection left out
     host_cases: tuple[str, ...] = ()
-    """Cases of the catalogue about the tool, which are no part of this suite."""
+    """Cases of the catalogue that concern the tool and are not part of this suite."""
     stopped: str = ""
-    """Why the run ended before its planned end; empty for a whole one."""
-    # True when the adapter, or a command for power or readback, is what `stopped` is about.
+    """Why the run ended early; empty for a complete run."""
+    # True when `stopped` is a failure of the adapter, or of a power or readback command.
     adapter_failed: bool = False
     not_upgradable: str = ""
     """Why the good image could not be flashed at first; empty when it could."""
-    # The cases were run all the same, as the bootloader could be reached, and those that need an
-    # application have none.
+    # The cases ran anyway, as the bootloader was reachable, but without an application.
     killed_by: str = ""
-    """The case after which the device could not be brought back; empty for none."""
+    """The case after which the device could not be restored; empty for none."""
     rescues: tuple[Rescue, ...] = ()
     final_image: str = ""
-    """"verified", or what came of the good image at the end."""
+    """"verified", or what is wrong with the good image at the end."""
     final_image_seen_by: tuple[str, ...] = ()  # "version", "readback", "memory over the bus"
-    """By what it was verified: version, readback; with neither, some application answers."""
+    """How it was verified: version, readback; with neither, some application answers."""
     duration_s: float = 0.0
     started_at: str = ""
     """In UTC."""
@@ -289,7 +283,7 @@ class RunReport:
 
     @cached_property
     def report_schema(self) -> int:
-        """Version of this part."""
+        """Version of this report format."""
         return SCHEMA_VERSION
 
     @cached_property
@@ -303,11 +297,10 @@ class RunReport:
 
     @cached_property
     def counts(self) -> dict[str, int]:
-        """How many results have each status."""
+        """Number of results by status."""
         return {verdict.value: self.count(verdict) for verdict in CaseVerdict}
 
     def count(self, verdict: CaseVerdict) -> int:
-        """How many results have that verdict."""
         return sum(result.verdict is verdict for result in self.results)
 
     @property
@@ -317,10 +310,10 @@ class RunReport:
 
     @cached_property
     def ok(self) -> bool:
-        """True when nothing failed, nothing was left out by an early end, and the good image is
-        back on the device.
+        """True when nothing failed, the run was not stopped early, and the good image is back on
+        the device.
         """
-        # A strict run has no pass in part, and no deviation that is none any more.
+        # A strict run also fails on a pass in part and on a resolved deviation.
         if self.stopped or self.final_image != FINAL_IMAGE_OK:
             return False
         if self.strict and (self.resolved_deviations or self.count(CaseVerdict.PASS_IN_PART)):
@@ -335,13 +328,13 @@ class RunReport:
 
     @property
     def in_full(self) -> str:
-        """How many of the passes were judged in full; "" without any pass."""
+        """How many passes were judged in full; "" without any pass."""
         full = f"{self.passes_in_full} of {self.passes} passes were judged in full"
         return full if self.passes else ""
 
     @property
     def final_image_text(self) -> str:
-        """What is known of the good image at the end, as people read it."""
+        """State of the good image at the end, as text."""
         if self.final_image != FINAL_IMAGE_OK:
             return self.final_image or "not flashed: no case was run"
         if not self.final_image_seen_by:
@@ -360,7 +353,7 @@ class RunReport:
         return {why: list(case_ids) for why, case_ids in found.items()}
 
     def by_case(self) -> list[tuple[CaseText, CaseResult]]:
-        """Every result with its case, in the order of the catalogue."""
+        """Every result with its case, in catalogue order."""
         return [
             (text, result)
             for text in self.cases
@@ -369,14 +362,13 @@ class RunReport:
         ]
 
     def by_group(self) -> dict[str, list[tuple[CaseText, CaseResult]]]:
-        """The same, by group."""
         found: dict[str, list[tuple[CaseText, CaseResult]]] = {}
         for text, result in self.by_case():
             found.setdefault(text.group, []).append((text, result))
         return found
 
     def measured(self) -> dict[str, list[Measurement]]:
-        """All measurements by name, in the order in which the names came first."""
+        """All measurements by name, in order of first occurrence."""
         found: dict[str, list[Measurement]] = {}
         for result in self.results:
             for measurement in result.measurements:
@@ -384,7 +376,7 @@ class RunReport:
         return found
 
     def remarks(self) -> list[str]:
-        """Remarks about the run itself, such as an early end; empty for a regular one."""
+        """Remarks about the run itself, such as an early end; empty for a normal run."""
         lines = []
         if self.stopped:
             lines.append(f"the run ended early: {self.stopped}")
@@ -405,12 +397,12 @@ class RunReport:
 
 
 def worst(verdicts: Iterable[CaseVerdict]) -> CaseVerdict:
-    """The gravest of some verdicts. Raises ValueError for none."""
+    """The worst verdict. Raises ValueError for none."""
     return max(verdicts, key=list(CaseVerdict).index)
 
 
 def count_text(results: Iterable[CaseResult]) -> str:
-    """How many results have each verdict, from the best to the worst; "" for none."""
+    """Count results by verdict, from best to worst; "" for none."""
     verdicts = [result.verdict for result in results]
     return ", ".join(
         f"{verdicts.count(verdict)} {verdict.text}"
@@ -427,7 +419,7 @@ class CaseEnded(Exception):  # noqa: N818  most of them are no errors
 
 
 class CaseStopped(CaseEnded):
-    """A check failed that the rest of the case depends on; the check is recorded."""
+    """A check failed that the rest of the case depends on; it is recorded."""
 
 
 class Unsupported(CaseEnded):
@@ -435,11 +427,11 @@ class Unsupported(CaseEnded):
 
 
 class CaseLimitReached(CaseEnded):
-    """The case took longer than it may."""
+    """The case exceeded its time limit."""
 
 
 class DeviceCrashed(CaseEnded):
-    """The device model stopped at something that a real part does not allow."""
+    """The device model was used in a way that real hardware does not allow."""
 
 
 class RunStopped(CaseEnded):
@@ -449,13 +441,13 @@ class RunStopped(CaseEnded):
 @json_keys("rule text steps first_steps replay")
 @dataclass(frozen=True)
 class WalkFinding:
-    """What a walk found."""
+    """A violation found by a walk."""
 
     rule: str
-    """Which rule was broken: short, and the same from version to version."""
+    """The violated rule: a short name that is stable between versions."""
     text: str
     steps: tuple[str, ...]
-    """The shortest walk that finds it."""
+    """The shortest walk that reproduces it."""
     first_steps: tuple[str, ...]  # those of the walk that found it first
     trace: tuple[TraceEntry, ...] = ()
     replay: str = ""  # the command that takes `steps` again
@@ -473,7 +465,7 @@ class StepCoverage:
 @json_keys("subject seed walks steps finding stopped coverage")
 @dataclass(frozen=True)
 class ExploreResult:
-    """What came of the walks."""
+    """Result of a series of walks."""
 
     subject: str
     seed: str
@@ -482,9 +474,9 @@ class ExploreResult:
     coverage: tuple[StepCoverage, ...]  # every pair of phase and step that a walk may meet
     finding: WalkFinding | None = None
     stopped: str = ""
-    """Why it ended before its number of steps; empty when it did not."""
+    """Why it ended early; empty when it did not."""
 
     @property
     def not_covered(self) -> list[tuple[str, str]]:
-        """Pairs of phase and step that no walk met."""
+        """Pairs of phase and step that no walk reached."""
         return [(each.phase, each.step) for each in self.coverage if not each.count]

@@ -84,7 +84,7 @@ class SideBySide:
 
 
 def side_by_side(paths: Sequence[Path], reports: Sequence[RunReport]) -> SideBySide:
-    """The reports, which were read from `paths`, as columns."""
+    """Arrange the reports, which were read from `paths`, in columns."""
     columns = [
         RunColumn(
             printable(path.name),

@@ -23,7 +23,7 @@ _WRONG: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE)
 
 
 def badge(report: RunReport) -> str:
-    """A drawing (SVG) that says how the run ended, for a web page."""
+    """Render the result as an SVG badge."""
     full = report.passes_in_full
     in_part = report.passes - full
     bad = sum(map(report.count, (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN)))
@@ -41,7 +41,7 @@ def badge(report: RunReport) -> str:
 
 
 def summary_page(report: RunReport) -> str:
-    """The run on one page."""
+    """Render the one-page summary."""
     by_case = report.by_case()
     columns = [verdict for verdict in CaseVerdict if report.count(verdict)]
     return render_page(

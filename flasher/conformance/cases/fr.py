@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import ACCEPTED, EITHER, REJECTED, Probe, complies
 from flasher.conformance.catalogue import DESTRUCTIVE, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import choice_words
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
@@ -266,7 +266,7 @@ def padded(bench: Bench) -> None:
         if reply is None:
             bench.end_transfer()
         else:
-            bench.measure(Times.COMPLETE, reply.at - sent.left_at)
+            bench.measure(TimeName.COMPLETE, reply.at - sent.left_at)
         bench.check_image(image)
 
 

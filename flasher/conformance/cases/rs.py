@@ -6,7 +6,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, POWER, TIMING, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import (
     READ,
     REPORT,
@@ -51,9 +51,9 @@ def reset(bench: Bench) -> None:
     with bench.tester.collecting_feedback():
         sent = bench.send(bench.encoder.reset())
         feedback = bench.expect(Reply.FEEDBACK)
-    bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
+    bench.measure(TimeName.FEEDBACK, feedback.at - sent.left_at)
     first = bench.expect(Reply.BOOT_VERSION)
-    bench.measure(Times.FIRST, first.at - sent.left_at)
+    bench.measure(TimeName.FIRST, first.at - sent.left_at)
     _check_burst(bench, first)
 
 
@@ -165,7 +165,7 @@ def power_up(bench: Bench) -> None:
     bench.power_cycle()
     on_at = bench.now
     first = bench.expect(Reply.BOOT_VERSION)
-    bench.measure(Times.POWERED, first.at - on_at)
+    bench.measure(TimeName.POWERED, first.at - on_at)
     _check_burst(bench, first)
 
 
@@ -177,7 +177,7 @@ def _check_burst(bench: Bench, first: Received) -> None:
     for _ in range(count - 1):
         burst.append(bench.next_version())
         bench.check_time(
-            Times.SPACING,
+            TimeName.SPACING,
             burst[-1].at - burst[-2].at,
             low_s=spacing_s - tolerance_s,
             high_s=spacing_s + tolerance_s,

@@ -9,7 +9,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tm import check_times, measure_burst, measure_end, measure_packets
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import Reply, reported_version
 
 _START_AGAIN: Final = "window's end to an application that answers"
@@ -50,9 +50,9 @@ def answer_times(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.update(len(image))
             measure_packets(bench, image)
-            _measure_start(bench, Times.START, measure_end(bench).at, is_asked=tells)
+            _measure_start(bench, TimeName.START, measure_end(bench).at, is_asked=tells)
     check_times(bench)
-    for name in (Times.START, _START_AGAIN) if tells else ():
+    for name in (TimeName.START, _START_AGAIN) if tells else ():
         bench.judge.check_measured(name, high_s=bench.limit("start_s"))
     bench.info(f"flash wear: the application was erased and written {bench.upgrades} times")
 

@@ -8,7 +8,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import ACCEPTED, EITHER, Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import PACKET_FRAMES, Received, Reply, packet_count
 
 _SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
@@ -91,12 +91,12 @@ def check_times(bench: Bench) -> None:
     """Compare all measured times with the profile's limits."""
     check, limit = bench.judge.check_measured, bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
-    check(Times.FIRST, high_s=limit("first_version_s"))
+    check(TimeName.FIRST, high_s=limit("first_version_s"))
     if bench.number("versions") > 1:
-        check(Times.SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s)
-    check(Times.REQUEST, high_s=limit("erase_s"))
-    check(Times.ANSWER, high_s=limit("ack_s"))
-    check(Times.COMPLETE, high_s=limit("complete_s"))
+        check(TimeName.SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s)
+    check(TimeName.REQUEST, high_s=limit("erase_s"))
+    check(TimeName.ANSWER, high_s=limit("ack_s"))
+    check(TimeName.COMPLETE, high_s=limit("complete_s"))
 
 
 def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
@@ -107,7 +107,7 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
         reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
         if reply is None:
             break
-        bench.measure(Times.SPACING, reply.at - last.at)
+        bench.measure(TimeName.SPACING, reply.at - last.at)
         last = reply
     if wait:
         bench.collect(bench.host.burst_s)
@@ -120,7 +120,7 @@ def measure_packets(bench: Bench, image: bytes) -> None:
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
         reply = bench.expect(Reply.ACK, within_s=limit_s, number=number)
-        bench.measure(Times.ANSWER, reply.at - sent.left_at)
+        bench.measure(TimeName.ANSWER, reply.at - sent.left_at)
 
 
 def measure_end(bench: Bench) -> Received:
@@ -128,5 +128,5 @@ def measure_end(bench: Bench) -> Received:
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")
     reply = bench.await_message(Reply.COMPLETE, within_s=within_s)
-    bench.measure(Times.COMPLETE, reply.at - sent.left_at)
+    bench.measure(TimeName.COMPLETE, reply.at - sent.left_at)
     return reply

@@ -10,7 +10,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.patient_host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
@@ -323,7 +323,7 @@ def _send_all(bench: Bench, image: bytes) -> bool:
         if reply is None or (reply.kind, reply.number) != (Reply.ACK, number):
             bench.fail(f"ACK {number}", reply or "nothing")
             return False
-        bench.measure(Times.ANSWER, reply.at - sent.left_at)
+        bench.measure(TimeName.ANSWER, reply.at - sent.left_at)
     bench.succeed(f"ACK 1 to {total}", "all of them")
     return True
 

@@ -6,7 +6,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import (
     PACKET_BYTES,
     READ,
@@ -275,7 +275,7 @@ def _finish_requested(bench: Bench, choice: str) -> None:
             bench.require(more <= 1, "request transfer at most twice", f"{more + 1} times")
     bench.require(acknowledged.number == 1, "ACK 1", acknowledged)
     if copies == 1:
-        bench.measure(Times.ANSWER, acknowledged.at - sent.left_at)
+        bench.measure(TimeName.ANSWER, acknowledged.at - sent.left_at)
     else:  # each of them may be answered (R10)
         late = bench.collect(_SOON_S)
         bench.check_only(late, Reply.ACK, Reply.NAK, why="answers to packet 1")

@@ -14,7 +14,7 @@ from typing import Final
 from flasher.conformance.init import entry_questions, transfer_questions
 from flasher.conformance.init.answers import Findings, KeyAnswer, Trial, decide, limit_answer
 from flasher.conformance.init.session import InitSession
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
 from flasher.conformance.restore import restore
 from flasher.conformance.results import CaseEnded, RunStopped
@@ -62,15 +62,15 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
 )
 """Questions in order, with the keys that each one answers; later ones use earlier answers."""
 LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
-    "limits.feedback_s": (0.2, (Times.FEEDBACK,)),
+    "limits.feedback_s": (0.2, (TimeName.FEEDBACK,)),
     "limits.first_version_s": (
         0.5,
-        (Times.FIRST, Times.POWERED, Times.GAP, Times.LATE, Times.RESTARTED),
+        (TimeName.FIRST, TimeName.POWERED, TimeName.GAP, TimeName.LATE, TimeName.RESTARTED),
     ),
-    "limits.start_s": (1.0, (Times.START, Times.START_AGAIN)),
-    "limits.erase_s": (0.5, (Times.REQUEST,)),
-    "limits.ack_s": (0.1, (Times.ANSWER,)),
-    "limits.complete_s": (0.5, (Times.COMPLETE,)),
+    "limits.start_s": (1.0, (TimeName.START, TimeName.START_AGAIN)),
+    "limits.erase_s": (0.5, (TimeName.REQUEST,)),
+    "limits.ack_s": (0.1, (TimeName.ANSWER,)),
+    "limits.complete_s": (0.5, (TimeName.COMPLETE,)),
 }
 """Smallest value of a limit in seconds, and the measured times that determine it."""
 NOT_ASKED: Final = {

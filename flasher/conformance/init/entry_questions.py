@@ -9,7 +9,7 @@ from typing import Final
 
 from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
 from flasher.conformance.init.session import REPEATS, InitSession, answer_text
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import IMAGE_BYTES_MAX, WRITE, RawFrame, Received, Reply, packet_count
@@ -39,7 +39,7 @@ def burst(session: InitSession) -> Findings:
             bench.power_cycle()
             on_at = bench.now
             first = bench.await_message(Reply.BOOT_VERSION)
-            bench.measure(Times.POWERED, first.at - on_at)
+            bench.measure(TimeName.POWERED, first.at - on_at)
         else:
             first = session.enter()
         versions = [first, *session.more_versions()]
@@ -87,13 +87,13 @@ def upgrade(session: InitSession) -> Findings:
         complete_at = bench.now
         reply = _first_sign(session)
         if reply is not None and reply.kind is Reply.BOOT_VERSION:
-            bench.measure(Times.RESTARTED, reply.at - complete_at)
+            bench.measure(TimeName.RESTARTED, reply.at - complete_at)
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
             yield Trial("starts", "no boot version", "complete", "after")
-        session.await_application(Times.START, complete_at)
+        session.await_application(TimeName.START, complete_at)
         last = session.enter(bench.number("versions"))
-        session.await_application(Times.START_AGAIN, last.at)
+        session.await_application(TimeName.START_AGAIN, last.at)
 
 
 def _first_sign(session: InitSession) -> Received | None:
@@ -193,7 +193,7 @@ def _offer_at(session: InitSession, offset_s: float) -> tuple[float, bool]:
     if reply is None:
         session.await_application()
     else:
-        bench.measure(Times.REQUEST, reply.at - sent.left_at)
+        bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
         session.stored = 0
         session.finish()
     return sent.left_at - last.at, reply is not None
@@ -329,7 +329,7 @@ def without_application(session: InitSession) -> Findings:
             reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_SILENT_S)
             if reply is None:
                 break
-            bench.measure(Times.GAP, reply.at - last_at)
+            bench.measure(TimeName.GAP, reply.at - last_at)
             more, last_at = more + 1, reply.at
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
@@ -350,7 +350,7 @@ def largest_image(session: InitSession) -> Findings:
     session.begin()
     if not restarts_at_once:
         bench.leave_transfer()
-    erase_s = max(one.value_s for one in bench.judge.measurements if one.name == Times.REQUEST)
+    erase_s = max(one.value_s for one in bench.judge.measurements if one.name == TimeName.REQUEST)
 
     def is_taken(size_bytes: int) -> bool:
         share = packet_count(size_bytes) / session.total
@@ -390,7 +390,7 @@ def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float
         if reply is None or reply.kind is Reply.NAK:
             break
         if reply.kind is Reply.REQUEST:
-            bench.measure(Times.REQUEST, reply.at - sent.left_at)
+            bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
             return True
         versions += reply.at > sent.left_at + UPDATE_SPACING_S
     return False

@@ -9,7 +9,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import PacketTransfer
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
@@ -92,7 +92,7 @@ class InitSession(PacketTransfer):
         sent = bench.send(frames)
         reply = bench.wait_for(Reply.REQUEST)
         if reply is not None:
-            bench.measure(Times.REQUEST, reply.at - sent.left_at)
+            bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
             self.stored = 0
         return reply is not None
 

@@ -9,7 +9,7 @@ from typing import Final
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
 from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
 from flasher.conformance.init.session import REPEATS, InitSession, answer_text
-from flasher.conformance.judge import Times
+from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import choice_words
 from flasher.conformance.wire import (
     PACKET_BYTES,
@@ -226,7 +226,7 @@ def padded(session: InitSession) -> Findings:
             bench.forget()
             bench.end_transfer()
         else:
-            bench.measure(Times.COMPLETE, reply.at - sent.left_at)
+            bench.measure(TimeName.COMPLETE, reply.at - sent.left_at)
         session.await_application()
 
 
@@ -299,7 +299,7 @@ def pause(session: InitSession) -> Findings:
     digit = 10 if min(found_s) >= 1 else 100
     shortest_s = floor(min(found_s) * digit + 1e-6) / digit
     for one_s in found_s:
-        bench.measure(Times.LATE, one_s - shortest_s)
+        bench.measure(TimeName.LATE, one_s - shortest_s)
     seen = f"a boot version after pauses of {min(found_s):.3f} to {max(found_s):.3f} s"
     yield KeyAnswer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
 
