@@ -299,17 +299,17 @@ class Bench:
         expected = "the flash holds the image"
         try:
             differs_at = self.difference(image, runs=runs)
-        except Unsupported as lacking:
-            tells = reported_version(self.subject.target, self.good_image) is not None
-            why = "" if tells else ", and the device does not tell which application runs"
-            self.unsupported(expected, f"{lacking}{why}")
+        except Unsupported as missing:
+            reports = reported_version(self.subject.target, self.good_image) is not None
+            why = "" if reports else ", and the device does not report which application runs"
+            self.unsupported(expected, f"{missing}{why}")
             return
         got = "the image"
         if differs_at is not None:
-            got = f"other bytes from offset {differs_at} on"
+            got = f"different bytes from offset {differs_at}"
         elif not self.subject.has_readback:
             total = packet_count(len(image))
-            got = f"{min(total, _PIECES)} of {total} pieces of it, read over the bus"
+            got = f"{min(total, _PIECES)} of {total} pieces, read over the bus"
         self.check(differs_at is None, expected, got)
 
     def difference(self, image: bytes, *, runs: bool = False) -> int | None:
@@ -325,7 +325,7 @@ class Bench:
             at = next((at for at, (one, other) in pairs if one != other), len(stored))
             return None if at == len(image) else at
         if not runs:
-            raise Unsupported("only a running application tells the memory over the bus")
+            raise Unsupported("only a running application answers memory queries")
         # Of a large image, read only some pieces, chosen by the seed.
         total = packet_count(len(image))
         numbers = list(range(total))
@@ -334,10 +334,10 @@ class Bench:
         for number in numbers:
             offset = number * MEMORY_BYTES
             part = image[offset : offset + MEMORY_BYTES]
-            told = self.host.read_memory(self.number("application_address") + offset, len(part))
-            if told is None:
-                raise Unsupported("the application tells no memory")
-            if told != part:
+            memory = self.host.read_memory(self.number("application_address") + offset, len(part))
+            if memory is None:
+                raise Unsupported("the application answers no memory query")
+            if memory != part:
                 return offset
         return None
 

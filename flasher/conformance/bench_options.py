@@ -85,9 +85,9 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     good, second = (None if image is None else image.data for image in images)
     if second is not None and good is not None and len(second) >= len(good):
         raise UsageError(
-            f"The second image is not smaller than the good one: {len(second):,} bytes, "
-            f"and {len(good):,}.",
-            remedy="Exchange the two, or name another one.",
+            f"The second image has to be smaller than the good image ({len(good):,} bytes), but "
+            f"has {len(second):,} bytes.",
+            remedy="Swap the two images, or choose a smaller second one.",
         )
     if options.is_mock:
         subject, profile = _mock(options, profile, good, second)
@@ -152,19 +152,19 @@ def _image(path: str | None, options: BenchOptions) -> Image | None:
 def check_bench(options: BenchOptions) -> None:
     """Raise UsageError for options that contradict each other."""
     if options.is_mock and options.subject is not None:
-        raise UsageError("The mock is no bootloader under test: choose one of the two.")
+        raise UsageError("--mock and --subject exclude each other: choose one.")
     if options.is_simulated and not (options.power is None and options.readback is None):
-        what = "The mock" if options.is_mock else "A bootloader on the computer"
-        raise UsageError(f"{what} has power control and readback of its own.")
+        what = "The mock" if options.is_mock else "A bootloader on this computer"
+        raise UsageError(f"{what} has its own power control and readback.")
     if not options.is_mock and (options.variant is not None or options.choices):
-        raise UsageError("Variants and choices of the device model are for the mock only.")
+        raise UsageError("Variants and choices of the device model need --mock.")
     if options.is_simulated:
         return
     if options.good_image is None:
         raise UsageError(
             "A good image is required.",
-            cause="the device is erased and written many times, and has to run again in the end",
-            remedy="Name an image that is known to run on the device, or use the mock.",
+            cause="the suite erases the device many times and has to restore it",
+            remedy="Give an image that is known to run on the device, or use the mock.",
         )
 
 
@@ -180,8 +180,8 @@ def _check_size(good: bytes, profile: ConformanceProfile) -> None:
     limit = profile.number("largest_image_bytes")
     if len(good) > limit:
         raise UsageError(
-            f"The good image has {len(good):,} bytes, and the profile allows {limit:,}.",
-            remedy="Correct device.largest_image_bytes in the profile, or name a smaller image.",
+            f"The good image has {len(good):,} bytes, but the profile allows {limit:,}.",
+            remedy="Correct device.largest_image_bytes in the profile, or give a smaller image.",
         )
 
 

@@ -42,7 +42,7 @@ GROUPS: Final = {
 WEAR: Final = {"SO-01": 1000, "SP-01": 50, "SP-02": 60}
 """Cases that run only when they or their groups are named, with the default number of upgrades."""
 NOT_IMPLEMENTED: Final[dict[str, str]] = {
-    "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line"
+    "BU-07": "frames with equal ids that start in the same bit time: needs an injector on the line"
 }
 """Bootloader cases that software cannot run, with the reason; reported as unsupported."""
 HOST_CASES: Final = (
@@ -137,7 +137,7 @@ def case(
 
     def register(run: CaseScript) -> CaseScript:
         if case_id in CASES:
-            raise ValueError(f"there are two cases {case_id}")
+            raise ValueError(f"duplicate case {case_id}")
         clause_texts(clause)
         needs = frozenset(requires)
         CASES[case_id] = Case(case_id, title, clause, run=run, requires=needs, **more)
@@ -236,10 +236,10 @@ class Selection:
 _SIMULATED: Final = "--mock, or --subject"
 MISSING_ON_BARE_BENCH: Final = {
     Requirement.POWER: ("power control", "--power-cmd"),
-    Requirement.READBACK: ("readback of the flash past the protocol", "--readback-cmd"),
+    Requirement.READBACK: ("readback of the flash", "--readback-cmd"),
     Requirement.IMAGE_READBACK: (
-        "any readback of the image that runs",
-        "--readback-cmd; of a BMS that tells its memory, device.application_address in the profile",
+        "readback of the running image",
+        "--readback-cmd; for a BMS with memory queries, device.application_address in the profile",
     ),
     Requirement.SECOND_IMAGE: ("a second good image", "--second-image"),
     Requirement.BUS_OFF: ("a way to make the device go bus-off", _SIMULATED),
@@ -250,12 +250,12 @@ MISSING_ON_BARE_BENCH: Final = {
 _LACKS: Final = {
     **MISSING_ON_BARE_BENCH,
     Requirement.CHECKSUM: (
-        "images with a checksum of their own",
-        "a product that has one, and en_04 in the profile",
+        "images with their own checksum",
+        "a product that has one and en_04 in the profile",
     ),
     Requirement.VERSION: (
-        "an application that tells its version",
-        "a BMS, with an image that holds one version",
+        "an application that reports its version",
+        "a BMS, and an image that contains one version",
     ),
 }
 FULL_BENCH: Final = (

@@ -299,5 +299,5 @@ def clause_texts(clause: str) -> dict[str, str]:
     named = clause.split("; ")
     unknown = [label for label in named if label not in CLAUSES]
     if unknown:
-        raise ValueError(f"there is no clause {', '.join(map(repr, unknown))}")
+        raise ValueError(f"unknown clause {', '.join(map(repr, unknown))}")
     return {label: CLAUSES[label] for label in named}

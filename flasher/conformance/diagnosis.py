@@ -38,7 +38,7 @@ class _Crc(NamedTuple):
         """Differences from the document, as text."""
         differs = {
             "a start value of 0": self.start == 0,
-            "one step of the table a byte, in the place of four": not self.is_widened,
+            "one table step per byte instead of four": not self.is_widened,
             "the header 55 AA left out": not self.has_header,
             "the CAN id left out": self.id_order == "none",
             "the CAN id low byte first": self.id_order == "little",
@@ -75,8 +75,8 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
     if not frames:
         errors = f"{len(replies)} error frames and " if replies else ""
         parts = "the device's power, the wiring and its termination, the bit rate, the channel"
-        why = f": check {parts}, and whether the device is a {encoder.target}" if has_wires else ""
-        return [f"{errors}no frame at all was received{why}"]
+        why = f": check {parts}, and that the device is a {encoder.target}" if has_wires else ""
+        return [f"{errors}no frame was received{why}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
         return [_diagnose_senders(frames, encoder)]
     decoder = DeviceDecoder(encoder)
@@ -86,7 +86,7 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
     if damaged:
         return [_diagnose_framing(damaged, own)]
     return _diagnose_protocol(to_tool, own, encoder) or [
-        f"{own} speaks, and its messages are right: {_with_counts(map(str, to_tool))}"
+        f"{own} sends correct messages: {_with_counts(map(str, to_tool))}"
     ]
 
 
@@ -101,38 +101,42 @@ def _diagnose_senders(frames: Sequence[RawFrame], encoder: Encoder) -> str:
     own = f"{encoder.to_tool:03X}"
     extended = [frame.can_id for frame in frames if frame.is_extended]
     if any(encoder.to_tool in (can_id, can_id >> 18) for can_id in extended):
-        return f"{own} comes as an extended id of 29 bits: the document has ids of 11 bits"
+        return f"{own} is sent as an extended 29-bit id: the document uses 11-bit ids"
     for other in encoder.others():
         if any(frame.can_id == other.to_tool and frame.is_payload for frame in frames):
             return (
-                f"{other.to_tool:03X} speaks, and {own} does not: the device is another one, and "
-                f"-t {other.target} fits it"
+                f"{other.to_tool:03X} sends messages and {own} does not: it is another device, "
+                f"which -t {other.target} selects"
             )
     ids = _with_counts(f"{frame.can_id:03X}" for frame in frames)
-    return f"nothing was received from {own}; heard were the ids {ids}"
+    return f"nothing was received from {own}, only from the ids {ids}"
 
 
 def _diagnose_framing(damaged: Sequence[Received], own: str) -> str:
     """Damaged messages arrived: find a framing or CRC variant that fits all of them."""
     raws = [message.raw for message in damaged]
     if any(raw.startswith(_OTHER_HEADER) for raw in raws):
-        return f"{own} speaks; its messages begin with AA 55, in the place of 55 AA"
+        return f"{own} sends messages that begin with AA 55 instead of 55 AA"
     whole = [raw for raw in raws if raw.startswith(b"\x55\xaa") and len(raw) == 9 + raw[3]]
     if not whole:
         shown = raws[0].hex(" ").upper()
-        return f"{own} speaks, but in no whole messages: the first one is {shown}"
+        return f"{own} sends only incomplete messages: the first one is {shown}"
     if any(raw[-1] != 0xF0 for raw in whole):
-        return f"{own} speaks; its messages end with {whole[0][-1]:02X}, in the place of F0"
+        return f"{own} sends messages that end with {whole[0][-1]:02X} instead of F0"
     if all(raw[5] != raw[3] - 2 for raw in whole):
         fits = all(raw[4] == raw[3] - 2 for raw in whole)
-        why = "its command is sent low byte first" if fits else "length and command do not agree"
-        return f"{own} speaks; {why}: {whole[0].hex(' ').upper()}"
+        why = (
+            "the command is sent low byte first"
+            if fits
+            else "length and command contradict each other"
+        )
+        return f"{own} sends messages, but {why}: {whole[0].hex(' ').upper()}"
     can_id = damaged[0].can_id
     for way in _CRCS:
         if all(way.of(can_id, raw[2:-5]) == raw[_CRC_AT] for raw in whole):
-            return f"{own} speaks; its CRCs fit {' and '.join(way.differences)}"
+            return f"{own} sends messages whose CRC fits {' and '.join(way.differences)}"
     return (
-        f"{own} speaks; its CRCs fit nothing that is known: {whole[0].hex(' ').upper()} has "
+        f"{own} sends messages whose CRC fits no known variant: {whole[0].hex(' ').upper()} has "
         f"{whole[0][_CRC_AT].hex().upper()}, and {_Crc().of(can_id, whole[0][2:-5]).hex().upper()} "
         "is right"
     )
@@ -147,8 +151,8 @@ def _diagnose_protocol(messages: Sequence[Received], own: str, encoder: Encoder)
     numbers = {one.number for one in messages if one.kind in (Reply.ACK, Reply.NAK)}
     if numbers and all(number and not number & 0xFF for number in numbers):
         shown = ", ".join(str(number) for number in sorted(numbers)[:_SHOWN])
-        return [f"{own} speaks; the numbers of its ACK and NAK are sent high byte first: {shown}"]
+        return [f"{own} sends the numbers of ACK and NAK high byte first: {shown}"]
     if names and not any(one.kind is Reply.REQUEST for one in messages):
-        why = "does it check another CRC, or listen elsewhere (up_04_burst in the profile)?"
-        return [f"{own} announces itself, and answers no update command: {why}"]
+        why = "check its CRC and when it listens (up_04_burst in the profile)"
+        return [f"{own} announces itself but answers no update command: {why}"]
     return []

@@ -90,22 +90,22 @@ def read_report(path: Path) -> RunReport:
     try:
         document = parse_json(raw)
     except ValueError as error:
-        why = f"it is no JSON that can be read ({printable(str(error))})"
+        why = f"it is not valid JSON ({printable(str(error))})"
         raise _not_a_report(path, why) from error
     if isinstance(document, dict) and isinstance(document.get("report"), dict):
         document = document["report"]  # what --json prints
     if not isinstance(document, dict) or "report_schema" not in document:
-        raise _not_a_report(path, "it holds no conformance report")
+        raise _not_a_report(path, "it contains no conformance report")
     if document["report_schema"] != SCHEMA_VERSION:
         found = printable(str(document["report_schema"])[:20])
-        why = f"its schema is version {found}, and this program reads {SCHEMA_VERSION}"
-        raise _not_a_report(path, why, "Run the suite again, and compare what one version wrote.")
+        why = f"its schema version is {found}, and this program reads {SCHEMA_VERSION}"
+        raise _not_a_report(path, why, "Run the suite again, and compare reports of one version.")
     try:
         return adapter().validate_python(document)
     except ValidationError as error:
         wrong = error.errors()[0]
         place = ".".join(map(str, wrong["loc"]))
-        why = f"a part of it is missing or wrong ({printable(place)[:80]}: {wrong['msg']})"
+        why = f"a part is missing or invalid ({printable(place)[:80]}: {wrong['msg']})"
         raise _not_a_report(path, why) from error
 
 
@@ -115,7 +115,7 @@ def _not_a_report(
     remedy: str = "Compare files that `flasher conformance --json-report FILE` wrote.",
 ) -> UsageError:
     return UsageError(
-        f"{printable(str(path))} is no report of the conformance suite: {why}.", remedy=remedy
+        f"{printable(str(path))} is not a report of the conformance suite: {why}.", remedy=remedy
     )
 
 

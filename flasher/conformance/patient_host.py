@@ -213,7 +213,7 @@ class PatientHost:
                 return UpgradeResult(ok=True)
             refusals += reply is not None
             if refusals == 2:
-                return UpgradeResult(ok=False, reason="the image was refused")
+                return UpgradeResult(ok=False, reason="the image was rejected")
         wanted = reported_version(self._encoder.target, image)
         if wanted is None or self.application_version(self._profile.limit("start_s")) != wanted:
             return UpgradeResult(ok=False, reason="no final answer")

@@ -143,21 +143,24 @@ class PluginRun:
             self._traces[result.key] = trace_file_name(result)
             self._write("trace_dir", lambda: candump(result.trace), self._traces[result.key])
         _report(node, result)
-        said = f"{result.verdict.text}: {result.reason}"
+        verdict = f"{result.verdict.text}: {result.reason}"
         text = case_text(case.id, self.profile)
         details = failure_details(text, replace(result, replay=self._replay(case.id)))
         match result.verdict:
             case CaseVerdict.PASS_IN_PART if self._is_strict:
-                pytest.fail(said, pytrace=False)
+                pytest.fail(verdict, pytrace=False)
             case CaseVerdict.PASS | CaseVerdict.PASS_IN_PART | CaseVerdict.INFO:
                 if self._is_strict and result.deviation_resolved:
-                    pytest.fail(f"passes, but the profile says: {text.deviation}", pytrace=False)
+                    pytest.fail(
+                        f"passes, but the profile documents a deviation: {text.deviation}",
+                        pytrace=False,
+                    )
             case CaseVerdict.UNSUPPORTED | CaseVerdict.INCONCLUSIVE:
-                pytest.skip(said)
+                pytest.skip(verdict)
             case CaseVerdict.DEVIATION:
                 pytest.xfail(f"documented deviation: {result.note}; {result.reason}")
             case _:
-                pytest.fail(f"{said}\n{details}", pytrace=False)
+                pytest.fail(f"{verdict}\n{details}", pytrace=False)
 
     def report(self) -> RunReport:
         """Report of the suite's cases so far."""
@@ -317,7 +320,7 @@ class Hooks:
                 why = "one device cannot be tested by several processes"
                 raise pytest.UsageError(f"{why}: give -n 0")
             if config.getoption("btl_json_report") or config.getoption("btl_html"):
-                raise pytest.UsageError("one report has one process that writes it: give -n 0")
+                raise pytest.UsageError("a report needs a single process: give -n 0")
         self._run: PluginRun | None = None
 
     @pytest.hookimpl(tryfirst=True)
@@ -364,7 +367,7 @@ class Hooks:
             terminalreporter.write_line(printable(line))
         if not measurements.times:
             return
-        terminalreporter.section("times in ms: count, least, median, p95, most")
+        terminalreporter.section("times in ms: count, min, median, p95, max")
         width = max(map(len, measurements.times))
         for name in measurements.times:
             found = measurements.of(name)

@@ -47,11 +47,13 @@ def _check_deviations(deviations: dict[str, str]) -> dict[str, str]:
     for case_id, reason in deviations.items():
         if not _CASE_ID.fullmatch(case_id):
             raise ValueError(
-                f'{case_id!a:.60} is no case; write the id of a case and a reason, as "TX-03" = '
+                f'{case_id!a:.60} is not a case; write the id of a case and a reason, as "TX-03" = '
                 '"why"'
             )
         if not reason.strip():
-            raise ValueError(f"{case_id} has no reason; say in a text why the product differs")
+            raise ValueError(
+                f"{case_id} has no reason; write a text that explains why the product differs"
+            )
     return deviations
 
 
@@ -120,7 +122,7 @@ class DeviceFacts(Table):
             raise ValueError("largest_image_bytes is more than device.application_bytes holds")
         if len(self.reset_data) != self.reset_command & 0xFF:
             raise ValueError(
-                "reset_data does not have the size that reset_command says (its second byte)"
+                "reset_data must have as many bytes as the second byte of reset_command says"
             )
         return self
 
@@ -292,11 +294,11 @@ def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile
         why = content.get("rationale", "")
         if set(content) - {"value", "rationale"} or "value" not in content:
             remedy = f'Write {path.rpartition(".")[2]} = {{ value = ..., rationale = "why" }}.'
-            said = f"{path} is a value, or a table of value and rationale."
+            said = f"{path} must be a value, or a table of value and rationale."
             faults.append(Fault(path, said, remedy))
             return _READER.keys[path].default
         if not isinstance(why, str):
-            faults.append(Fault(f"{path}.rationale", f"The rationale of {path} is a text."))
+            faults.append(Fault(f"{path}.rationale", f"The rationale of {path} must be a text."))
         elif why:
             rationales[path] = why
         return content["value"]
@@ -324,7 +326,7 @@ def check_deviations(profile: ConformanceProfile, known: Collection[str]) -> Non
     faults = [
         Fault(
             f"{DEVIATIONS}.{case_id}",
-            f"[{DEVIATIONS}] names {case_id}, which is no case of the suite.",
+            f"[{DEVIATIONS}] names {case_id}, which is not a case of the suite.",
             did_you_mean(case_id, known).rstrip(),
         )
         for case_id in profile.deviations

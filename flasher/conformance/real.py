@@ -59,7 +59,7 @@ class RealPort:
         self._clock = clock
         self._stamps = link if isinstance(link, StampingLink) and link.stamp_source else None
         source = "host" if self._stamps is None else self._stamps.stamp_source
-        self.timestamp_source = f"{source}, own frames by their echo" if echoes else source
+        self.timestamp_source = f"{source}, sent frames by echo" if echoes else source
         self._last_at = clock.now()
         self._own: deque[Frame] = deque(maxlen=_OWN_FRAMES)
 
@@ -80,7 +80,7 @@ class RealPort:
             # Times never go back.
             at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
             self._last_at = at
-            frame = Frame(*frame[:5])  # whose it is, is judged here, and not by the link
+            frame = Frame(*frame[:5])  # ownership is decided here, not by the link
             is_own = self._take_own(frame)
             if self.echoes or not is_own:
                 return Arrival(RawFrame(*frame[:5]), at, is_own)
@@ -136,10 +136,10 @@ class RealSubject:
         return self._readback()
 
     def bus_off(self, for_s: float) -> None:
-        raise Unsupported("a real device cannot be made to go bus-off")
+        raise Unsupported("a real device cannot be forced into bus-off")
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
-        raise Unsupported("nobody sees from outside when a flash operation is under way")
+        raise Unsupported("the start of a flash operation is not visible from outside")
 
     def take_cut(self) -> bool:
         return False
@@ -154,8 +154,8 @@ class DevicePowerCommand:
     def __init__(self, template: str, limit_s: float = 10.0) -> None:
         if not _SWITCH.search(template):
             raise UsageError(
-                f"The power command {template!a} does not say what is on and what is off.",
-                remedy="Write both in braces, as `relay 3 {on|off}`.",
+                f"The power command {template!a} does not define on and off.",
+                remedy="Write both in braces, like `relay 3 {on|off}`.",
             )
         self._template = _split(template, "power")
         self._limit_s = limit_s
@@ -174,8 +174,8 @@ class ReadbackCommand:
     def __init__(self, template: str, limit_s: float = 60.0) -> None:
         if _FILE not in template:
             raise UsageError(
-                f"The readback command {template!a} names no file.",
-                remedy="Write {file} where its output file belongs.",
+                f"The readback command {template!a} has no {{file}}.",
+                remedy="Write {file} in place of the output file.",
             )
         self._template = _split(template, "readback")
         self._limit_s = limit_s
@@ -189,16 +189,14 @@ class ReadbackCommand:
             try:
                 return read(path, _READBACK_MAX_SIZE)
             except UsageError as error:
-                raise _failed(
-                    "readback", "wrote no file that can be read", words, error.what
-                ) from error
+                raise _failed("readback", "wrote no readable file", words, error.what) from error
 
 
 def _split(template: str, what: str) -> Sequence[str]:
     try:
         words = shlex.split(template)
     except ValueError as error:
-        raise UsageError(f"The {what} command {template!a} makes no sense: {error}.") from error
+        raise UsageError(f"The {what} command {template!a} is invalid: {error}.") from error
     return words
 
 

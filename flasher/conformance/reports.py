@@ -155,14 +155,14 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport) -> JUnitC
         details = failure_details(text, result)
     elif report.strict and result.deviation_resolved:
         ended, kind = JUnitResult.FAILURE, "resolved deviation"
-        message = f"the profile says that it deviates ({text.deviation}), but it passes"
+        message = f"the profile documents a deviation ({text.deviation}), but it passes"
     elif report.strict and result.verdict is CaseVerdict.PASS_IN_PART:
         ended = JUnitResult.FAILURE
     is_deviation = result.verdict is CaseVerdict.DEVIATION
-    said = [f"deviation: {text.deviation}"] if is_deviation else []
+    output = [f"deviation: {text.deviation}"] if is_deviation else []
     if result.verdict is CaseVerdict.PASS_IN_PART:
-        said.append(word)
-    said += [f"not tried: {part}" for part in result.not_tried]
+        output.append(word)
+    output += [f"not tried: {part}" for part in result.not_tried]
     return JUnitCase(
         f"conformance.{text.group}",
         f"{text.id} {text.title}{repeat}",
@@ -171,7 +171,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport) -> JUnitC
         message,
         kind,
         details,
-        "\n".join([*said, *result.infos]),
+        "\n".join([*output, *result.infos]),
     )
 
 

@@ -76,7 +76,7 @@ def restore(
         except RunStopped:
             raise
         except CaseLimitReached:
-            reason = f"not at an end after {limit_s:g} s"
+            reason = f"not finished after {limit_s:g} s"
         except CaseEnded as ended:
             reason = str(ended)
             crashed = crashed or isinstance(ended, DeviceCrashed)

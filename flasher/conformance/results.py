@@ -223,7 +223,7 @@ class Gap:
         """One line without the names of the cases."""
         costs = {"cannot be run": len(self.unsupported), "judged in part": len(self.in_part)}
         said = ", ".join(f"{count} {what}" for what, count in costs.items() if count)
-        return f"without {self.lacks}: {said} (it takes {self.remedy})"
+        return f"without {self.lacks}: {said} (needs {self.remedy})"
 
 
 @dataclass(frozen=True)
@@ -338,7 +338,7 @@ class RunReport:
         if self.final_image != FINAL_IMAGE_OK:
             return self.final_image or "not flashed: no case was run"
         if not self.final_image_seen_by:
-            return "flashed, an application answers; nothing here tells which one it is"
+            return "flashed, an application answers, but its version is unknown"
         none = "; no readback was possible" if self.final_image_seen_by == ("version",) else ""
         return f"flashed and verified by {' and '.join(self.final_image_seen_by)}{none}"
 
@@ -381,7 +381,7 @@ class RunReport:
         if self.stopped:
             lines.append(f"the run ended early: {self.stopped}")
         if self.killed_by:
-            lines.append(f"{self.killed_by} left a device that could not be brought back")
+            lines.append(f"{self.killed_by} left a device that could not be restored")
         if self.not_upgradable:
             lines.append(
                 "the good image could not be flashed before the first case, so that cases about a "
@@ -389,10 +389,10 @@ class RunReport:
             )
         lines += [f"after {rescue.id}: {rescue.how}" for rescue in self.rescues]
         if self.strict and self.count(CaseVerdict.PASS_IN_PART):
-            lines.append("a pass in part is none, as the run is strict")
+            lines.append("the run is strict, so a pass in part fails it")
         if self.resolved_deviations:
             named = ", ".join(dict.fromkeys(self.resolved_deviations))
-            lines.append(f"deviations in the profile that are none any more: {named}")
+            lines.append(f"resolved deviations in the profile: {named}")
         return lines
 
 

@@ -130,13 +130,13 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     except RunStopped as ended:
         return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))
     except (CaseLimitReached, DeviceCrashed) as ended:
-        bench.fail("the case comes to its end", ended)
+        bench.fail("the case is completed", ended)
         return CaseEnd(CaseVerdict.FAIL, str(ended))
     except BusError as error:
         stop = f"the adapter failed in {case.id}: {error.what}"
         return CaseEnd(CaseVerdict.ERROR, error.what, stop)
     except Exception as error:  # noqa: BLE001  a bug of one case must not hide the others
-        why = f"the case itself failed: {type(error).__name__}: {error}"
+        why = f"error in the case: {type(error).__name__}: {error}"
         return CaseEnd(CaseVerdict.ERROR, why)
     verdict = bench.judge.verdict
     return CaseEnd(verdict, "the case judged nothing" if verdict is CaseVerdict.ERROR else "")
@@ -209,7 +209,7 @@ class SuiteRun:
     def run_case(self, case: Case, repeat: int = 1) -> CaseResult:
         """Run a case unless the run has ended."""
         if not self.stopped and self._subject.port.now() >= self._ends_at:
-            self.stopped = "the run's own time limit is over"
+            self.stopped = "the run's time limit is over"
         if not self.stopped and self._asked_to_stop():
             self.stopped = "the run was stopped"
         if case.id == BRING_UP and self._no_bring_up is not None:
@@ -268,7 +268,7 @@ class SuiteRun:
         Returns `FINAL_IMAGE_OK` or what failed.
         """
         if self._killed_by:
-            self._final_image = "not flashed: the device could not be brought back"
+            self._final_image = "not flashed: the device could not be restored"
             return self._final_image
         self._observer.preparing("at the end")
         try:
@@ -288,10 +288,10 @@ class SuiteRun:
         bench = Bench(subject, self._profile, limit_s=limit_s, seed=self._options.seed)
         try:
             if bench.difference(image, runs=True) is not None:
-                self._final_image = "the flash does not hold the good image"
+                self._final_image = "the flash differs from the good image"
                 return
             seen_by.append(readback_source(subject, self._profile))
-        except Unsupported:  # the report says that it was not
+        except Unsupported:  # final_image_text says that it was not
             pass
         self._final_image_seen_by = tuple(seen_by)
 
@@ -355,12 +355,12 @@ class SuiteRun:
             return ""
         if not done.ok:
             likely = "".join(f"; {each}" for each in done.diagnosis if not case_id)
-            self.stopped = f"{when}, the device could not be brought back: {done.reason}{likely}"
+            self.stopped = f"{when}, the device could not be restored: {done.reason}{likely}"
             self._killed_by = case_id
             return done.reason
         if case_id and done.how == BY_POWER and not may_need_power(self._profile):
             self._rescues.append(Rescue(case_id, done.how))
-            return "not by the protocol; a power cycle brought it back"
+            return "only a power cycle restored the device"
         return ""
 
     def _bring_back(self, *, flash: bool, at_first: bool) -> RestoreResult:

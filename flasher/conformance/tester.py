@@ -75,7 +75,7 @@ class LineFault:
 
     def __post_init__(self) -> None:
         if self.incoming and self.kind not in (FaultKind.DROP, FaultKind.DOUBLE):
-            raise ValueError(f"a frame that arrives cannot be {self.kind.value}")
+            raise ValueError(f"a received frame cannot be {self.kind.value}")
 
     def __str__(self) -> str:
         side = "received" if self.incoming else "sent"
@@ -266,7 +266,7 @@ class BusTester:
         now = self.port.now()
         if now >= self.ends_at:
             raise CaseLimitReached(
-                f"not at an end after {self.ends_at - self.began_at:g} s, the case's own limit"
+                f"not finished after {self.ends_at - self.began_at:g} s, the time limit of the case"
             )
         if self._stopped():
             raise RunStopped("the run was stopped")

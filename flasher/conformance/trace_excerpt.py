@@ -63,7 +63,7 @@ def excerpt(result: CaseResult, messages: int, frames: int) -> Excerpt:
         text = f"{'all' if whole else 'the first'} {len(rows)} messages"
         shown = list(result.trace[:frames])
     count = len(result.trace) + result.trace_dropped
-    return Excerpt(rows, shown, f"{text}; {count:,} frames in the whole case")
+    return Excerpt(rows, shown, f"{text}; {count:,} frames in the case")
 
 
 def frame_lines(frames: Sequence[TraceEntry]) -> Iterator[str]:

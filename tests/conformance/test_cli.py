@@ -247,7 +247,7 @@ def test_a_second_image_that_is_not_smaller_is_refused(flasher: Flasher) -> None
     image = str(SAMPLES / "bms.hex")
     run = flasher(*MOCK, "--good-image", image, "--second-image", image)
     assert run.code == 2
-    assert "not smaller" in run.err
+    assert "second image has to be smaller" in run.err
 
 
 def test_a_good_image_that_the_profile_does_not_allow_is_refused(

@@ -178,7 +178,7 @@ def test_the_command_prints_a_replay_that_finds_the_same(flasher: Flasher, tmp_p
         *("--trace-file", trace),
     )
     assert ran.code == 12
-    assert "FOUND complete: complete without all packets and a valid end" in ran.out
+    assert "FOUND complete: " in ran.out
     (replay,) = (line for line in ran.out.splitlines() if "replay: " in line)
     words = shlex.split(replay.partition("replay: ")[2])
     again = flasher(*words[1:], "--json")

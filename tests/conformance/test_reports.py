@@ -11,7 +11,7 @@ from flasher.cli.bench.conformance import ConformanceDocument
 from flasher.cli.bench.conformance_text import report_lines
 from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
-from flasher.conformance.catalogue import CASES, Selection
+from flasher.conformance.catalogue import CASES, MISSING_ON_BARE_BENCH, Requirement, Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
 from flasher.conformance.json_report import to_bytes, to_json
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
@@ -132,11 +132,12 @@ def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: l
     junit = junit_of(report).iter("property")
     properties = {one.get("name", ""): one.get("value", "") for one in junit}
     assert properties["final_image"] == how
+    lacking, _ = MISSING_ON_BARE_BENCH[Requirement.IMAGE_READBACK]
     pages = (page_of(report), summary_page(report))
     texts = ["\n".join(report_lines(report)), *(Page(html).text for html in pages)]
     assert all(how in text for text in texts)
     for text in (properties["bench_is"], *texts):
-        assert ("any readback of the image that runs" in text) == (address == 0)
+        assert (lacking in text) == (address == 0)
 
 
 def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:
@@ -288,7 +289,7 @@ def test_a_page_tells_stimulus_expected_got_and_the_decoded_trace() -> None:
         "nothing within 0.2 s",
         "flasher conformance --case RS-01",
         "name BMS, version V1.0.0",
-        "needs images with a checksum",
+        "needs images with",
         "general feedback",
         "simulated bus, exact",
     ):

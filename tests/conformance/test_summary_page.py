@@ -49,7 +49,7 @@ def test_a_run_writes_both(flasher: Flasher, tmp_path: Path) -> None:
         "BMS V1.0.0",
         "flashed and verified by version and readback",
         "RS-01 reset of the application: fail, expected general feedback",
-        "without images with a checksum of their own: 1 cannot be run",
+        "without images with their own checksum: 1 cannot be run",
         "cases that were not selected",
     ):
         assert text in page.text

@@ -291,7 +291,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         done = bench.host.deliver_end(image)
     if not done.ok:
         bench.info(f"{done.reason}: {'; '.join(names)}")
-    return "refused" not in done.reason
+    return "rejected" not in done.reason
 
 
 # -- another device -------------------------------------------------------------------------------

@@ -55,7 +55,7 @@ def transfer_image(bench: Bench) -> bytes:
     """The good image, for transfers with faults. Raises Unsupported when it is too small."""
     image = bench.good_image
     if packet_count(len(image)) < _PACKETS_MIN:
-        raise Unsupported(f"the good image has less than {_PACKETS_MIN} packets")
+        raise Unsupported(f"the good image has fewer than {_PACKETS_MIN} packets")
     return image
 
 
@@ -354,7 +354,7 @@ def other_filler(bench: Bench) -> None:
     images = (bench.good_image, bench.subject.second_image or b"")
     image = next((one for one in images if len(one) % PACKET_BYTES), b"")
     if not image:
-        raise Unsupported("every good image is a whole number of packets: there is no filler")
+        raise Unsupported("every good image fills its last packet, so there are no filler bytes")
     total = packet_count(len(image))
     rest = image[(total - 1) * PACKET_BYTES :]
     bench.start_transfer(len(image))

@@ -49,12 +49,12 @@ class Facts:
         if min(sizes) <= 0 or any(more % less for more, less in pairwise(sizes)):
             raise ValueError(
                 f"a flash of {self.flash_bytes} bytes, sectors of {self.sector_bytes} and units "
-                f"of {self.write_bytes}: each has to be a multiple of the next"
+                f"of {self.write_bytes}: each must be a multiple of the next"
             )
         if not 0 < self.application_bytes <= self.flash_bytes - self.application_offset:
             raise ValueError(
-                f"an application of {self.application_bytes} bytes from offset "
-                f"{self.application_offset} on does not lie in a flash of {self.flash_bytes} bytes"
+                f"an application of {self.application_bytes} bytes at offset "
+                f"{self.application_offset} exceeds a flash of {self.flash_bytes} bytes"
             )
 
 

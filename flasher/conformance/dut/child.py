@@ -109,7 +109,7 @@ class _Library:
         library.flasher_dut_tick.argtypes = [ctypes.c_uint64]
         about = library.flasher_dut_about()
         if not about:
-            raise SubjectError("flasher_dut_about gives NULL")
+            raise SubjectError("flasher_dut_about returns NULL")
         found = about.contents
         self.facts = pipes.unpack_facts(bytes(found.numbers) + (found.name or b""))
         self._table: _HostTable | None = None

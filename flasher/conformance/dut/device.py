@@ -220,8 +220,8 @@ class CompiledDevice(Machine):
     def _start_application(self, now: float) -> None:
         area = self.readback()
         if _is_incomplete(area):
-            self._restart(POWER_ON, inf)  # whatever it does, nobody can rely on it
-            raise FlasherError("the bootloader started an application that is not whole")
+            self._restart(POWER_ON, inf)  # its behaviour would be undefined
+            raise FlasherError("the bootloader started an incomplete application")
         self._restart(RESET, inf)
         self._runs_application = True
         self.application.start(find_firmware_version(area.rstrip(b"\xff")) or "unknown", now)
@@ -252,9 +252,9 @@ class CompiledDevice(Machine):
         except FlasherError as error:
             self._restart(RESET, now + _RESTART_S)
             if isinstance(error, BootloaderError) and self._log:
-                said = "; ".join(self._log)
+                lines = "; ".join(self._log)
                 raise BootloaderError(
-                    f"{error.what}; it had logged: {said}", cause=error.cause
+                    f"{error.what}; its last log lines: {lines}", cause=error.cause
                 ) from error
             raise
         if answer is None:

@@ -68,7 +68,7 @@ class Pipe:
             found = PipeMessage(kind)
         except ValueError:
             wrote = bytes(self._buffer[:16])
-            raise ValueError(f"it wrote {wrote!r}, which is no message") from None
+            raise ValueError(f"it wrote {wrote!r}, which is not a message") from None
         end = HEADER.size + size
         if len(self._buffer) < end:
             return None
@@ -106,10 +106,10 @@ def pack_facts(facts: Facts) -> bytes:
 def unpack_facts(data: bytes) -> Facts:
     """Raises ValueError for another ABI version or contradictory facts."""
     if len(data) < FACTS.size:
-        raise ValueError("the facts are cut off")
+        raise ValueError("the facts are truncated")
     abi, *numbers = FACTS.unpack_from(data)
     if abi != ABI:
-        raise ValueError(f"it was built with version {abi} of flasher_dut.h, and not {ABI}")
+        raise ValueError(f"it was built with version {abi} of flasher_dut.h instead of {ABI}")
     names = list(Facts.__dataclass_fields__)
     return Facts(
         **dict(zip(names, numbers, strict=False)), name=data[FACTS.size :].decode(errors="replace")

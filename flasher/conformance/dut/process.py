@@ -47,13 +47,13 @@ class BootloaderProcess:
         if not path.is_file() and ":" not in subject:
             raise UsageError(
                 f"There is no bootloader {printable(subject)}.",
-                cause="it is neither a file nor MODULE:FACTORY",
-                remedy="Name a program, a shared library, or a function that makes a bootloader, "
+                cause="it is not a file and not MODULE:FACTORY",
+                remedy="Give a program, a shared library, or a function that returns a bootloader, "
                 "as package.module:make.",
             )
         if self._is_program and not os.access(path, os.X_OK):
             raise UsageError(
-                f"{printable(subject)} is no program and no shared library.",
+                f"{printable(subject)} is not a program or shared library.",
                 remedy="Link it with flasher_dut_process.c, or as a shared library (.so).",
             )
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as this object
@@ -88,13 +88,11 @@ class BootloaderProcess:
         try:
             kind, data = self._next("flasher_dut_about")
             if kind is not PipeMessage.FACTS:
-                raise ValueError("its first message holds no facts")  # noqa: TRY301
+                raise ValueError("its first message contains no facts")  # noqa: TRY301
             return pipes.unpack_facts(data)
         except ValueError as error:
             self.kill()
-            raise self.unusable(
-                f"is no bootloader for the suite: {error}", self.output()
-            ) from error
+            raise self.unusable(f"cannot be tested: {error}", self.output()) from error
 
     def call(
         self, kind: PipeMessage, *parts: bytes, during: Callable[[PipeMessage, bytes], bytes | None]
@@ -144,7 +142,7 @@ class BootloaderProcess:
             cause=cause,
             remedy="Build it with the two files that `flasher conformance header` writes."
             if Path(self.subject).is_file()
-            else "Name a function without arguments that returns a bootloader: an object with "
+            else "Give a function without arguments that returns a bootloader: an object with "
             "`facts` and the methods of flasher.conformance.dut.Bootloader.",
         )
 
@@ -171,7 +169,7 @@ class BootloaderProcess:
                 os.dup2(read_fd, _STDIN)
                 os.dup2(write_fd, _STDOUT)
                 try:
-                    os.execv(self.subject, [self.subject])  # noqa: S606  what the user named
+                    os.execv(self.subject, [self.subject])  # noqa: S606  chosen by the user
                 except OSError as error:
                     raise SubjectError(f"this computer cannot run it: {error.strerror}") from error
             os.dup2(_STDERR, _STDOUT)  # what it prints is no message
@@ -190,8 +188,8 @@ class BootloaderProcess:
             if not self._poll.poll(WATCHDOG_S * 1000):
                 self.kill()
                 raise BootloaderError(
-                    f"the bootloader did not return from {doing} within {WATCHDOG_S:g} s of the "
-                    "computer's time, and was ended"
+                    f"the bootloader did not return from {doing} within {WATCHDOG_S:g} s of real "
+                    "time and was killed"
                 )
             if not self._pipe.fill():
                 raise self._died(doing)

@@ -113,7 +113,7 @@ class Explorer:
                 walk.check_application()
             trouble = self._restore()
             if trouble:
-                raise Violation("upgrade", f"no good upgrade afterwards: {trouble}")  # noqa: TRY301
+                raise Violation("upgrade", f"the upgrade afterwards failed: {trouble}")  # noqa: TRY301
             walk.check_stored(bench.good_image)
         except Unsupported:
             return None
@@ -131,7 +131,7 @@ class Explorer:
         if not done.ok:
             return "; ".join((done.reason, *(() if self._walks else done.diagnosis)))
         if done.how == BY_POWER and self._walks and not may_need_power(self._profile):
-            return "not by the protocol; a power cycle brought it back"
+            return "only a power cycle restored the device"
         return ""
 
     def _stop_reason(self) -> str:

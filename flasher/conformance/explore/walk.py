@@ -153,7 +153,7 @@ class Walk:
             if at is not None:
                 raise Violation("flash", f"the flash differs from the image from offset {at} on")
 
-    # -- what is heard -----------------------------------------------------------------------------
+    # -- received messages -------------------------------------------------------------------------
 
     def _apply_elapsed_time(self) -> None:
         """Update the state for the time that passed since the last step."""
@@ -207,7 +207,7 @@ class Walk:
         bench = self.bench
         broken_s = 2 * bench.limit("inter_frame_s")
         if self.phase is DevicePhase.ANNOUNCING:
-            self._listen(broken_s)  # and no longer: its window is short
+            self._listen(broken_s)  # no longer, as the window is short
             return
         self._listen(max(bench.limit("ack_s"), broken_s))
         self._naks_due = 0
@@ -229,25 +229,27 @@ class Walk:
                 self._judge_number(reply)
             case Reply.COMPLETE:
                 if not self._may_complete:
-                    raise Violation("complete", "complete without all packets and a valid end")
+                    raise Violation(
+                        "complete", "complete before all packets and a valid end of transfer"
+                    )
             case Reply.OTHER if reply.can_id in self._nodes_asked:
                 pass
             case Reply.DAMAGED if self._may_send_partial:
                 self._may_send_partial = False
             case Reply.OTHER | Reply.DAMAGED:
-                raise Violation("form", f"{reply}: no message that a device sends")
+                raise Violation("form", f"{reply}: not a message of a device")
 
     def _judge_number(self, reply: Received) -> None:
         if reply.kind is Reply.ACK:
             if not self._acks_due[reply.number]:
-                raise Violation("ack", f"{reply} without such a packet that is valid")
+                raise Violation("ack", f"{reply} without a valid packet of this number")
             self._acks_due[reply.number] -= 1
             if reply.number == self._stored + 1:
                 self._store()
             return
         allowed = self._nak_numbers
         if not self._naks_due or not (allowed is None or reply.number in allowed):
-            raise Violation("nak", f"{reply} without a message that has to be refused")
+            raise Violation("nak", f"{reply} without a message that has to be rejected")
         self._naks_due -= 1
 
     def _judge_version(self, reply: Received) -> None:
@@ -256,10 +258,10 @@ class Walk:
             return
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
-            raise Violation("restart", f"{reply} without a reset, a pause or power, in the phase: "
+            raise Violation("restart", f"{reply} without reset, pause or power cycle, phase: "
                             f"{self.phase.value}")  # fmt: skip
         if reply.boot_name != self.bench.encoder.boot_name or not reply.has_good_version_text:
-            raise Violation("form", f"{reply} is not of the form Vx.x.x of this device")
+            raise Violation("form", f"{reply} is not a valid boot version of this device")
         self.phase = DevicePhase.ANNOUNCING
         self._version_at = reply.at
         self._may_complete = False
@@ -454,7 +456,7 @@ class Walk:
         if choice == "starts_over":
             self._await(Reply.REQUEST, bench.limit("erase_s"), "an update command in a transfer")
             return
-        self._may_restart = True  # one that ignores it has a long pause now
+        self._may_restart = True  # to a device that ignores it this is a long pause
         if not self._listen(bench.limit("erase_s"), lambda one: one.kind is Reply.REQUEST):
             self.phase = DevicePhase.UNCLEAR
 
@@ -474,7 +476,7 @@ class Walk:
             bench.limit("erase_s"), lambda one: one.kind in (Reply.REQUEST, Reply.BOOT_VERSION)
         )
         if reply is None:
-            raise Violation("no request", "nothing after an update command and a reset behind it")
+            raise Violation("no request", "no answer to an update command followed by a reset")
         self.phase, self.has_application, self.update_accepted = DevicePhase.UNCLEAR, None, True
         self._may_restart = True
         self._listen_for_answers()
@@ -503,7 +505,7 @@ class Walk:
         within_s = bench.limit("erase_s") + bench.limit("first_version_s")
         ends = (Reply.BOOT_VERSION, Reply.REQUEST, Reply.COMPLETE)
         reply = self._listen(within_s, lambda one: one.kind in ends)
-        if not bench.subject.take_cut():  # it does less operations than that
+        if not bench.subject.take_cut():  # it performs fewer operations
             if reply is not None and reply.kind is Reply.COMPLETE:
                 self._completed()
             return
@@ -703,7 +705,7 @@ class Walk:
         self._may_restart = self._may_complete = False
         self.check_stored(self.running_image)
 
-    # -- what is refused, or no concern of the device ----------------------------------------------
+    # -- invalid messages -------------------------------------------------------------------------
 
     def _send_refused(self, name: str) -> None:
         if name in UPDATES:

@@ -74,12 +74,12 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
 }
 """Smallest value of a limit in seconds, and the measured times that determine it."""
 NOT_ASKED: Final = {
-    "en_04": "an image with a wrong checksum would have to be completed; say what the product has",
-    "limits.inter_frame_s": "it is what tm_02 was asked with (R12)",
-    "limits.refused_s": "an image would have to be refused",
-    "limits.silence_s": "it is how long the suite watches, not what the device does",
-    "device.application_address": "no message tells it",
-    "device.application_bytes": "no message tells it; it is not less than the largest image",
+    "en_04": "needs a transfer with a wrong checksum; enter what the product has",
+    "limits.inter_frame_s": "it is the input of the question about tm_02 (R12)",
+    "limits.refused_s": "needs an image that is rejected",
+    "limits.silence_s": "it is a setting of the suite, not of the device",
+    "device.application_address": "no message reports it",
+    "device.application_bytes": "no message reports it; it is at least the largest image",
 }
 """Keys that no question covers, with the reason."""
 _PATIENCE: Final[dict[str, Value]] = {
@@ -154,20 +154,20 @@ class _Interview:
                     break
                 progress(done, len(QUESTIONS))
                 self._ask(question, keys)
-                trouble = self._restore(f"after {keys[0]} was asked", flash=False)
+                trouble = self._restore(f"after the question about {keys[0]}", flash=False)
             if not trouble:
                 trouble = self._restore("at the end", flash=True)
         except RunStopped as ended:
             self._stopped = lambda: False
-            lost = self._restore("when it was stopped", flash=True)
+            lost = self._restore("after the stop", flash=True)
             return self._result(lost or str(ended))
         return self._result(trouble, was_brought_up=was_brought_up)
 
     def _ask(self, question: Question, keys: tuple[str, ...]) -> None:
         """Ask a question, and again after unexpected behaviour: a frame may have been late."""
         why = self._try(question, keys)
-        if why and not self._restore("before it was asked again", flash=False):
-            why = self._try(question, keys) or "nothing was seen"
+        if why and not self._restore("before the question was repeated", flash=False):
+            why = self._try(question, keys) or "no observation"
         for key in keys:
             self._answers.setdefault(key, KeyAnswer(key, None, why))
 
@@ -193,7 +193,7 @@ class _Interview:
             failed = [
                 check for check in session.bench.judge.checks if check.outcome.value == "fail"
             ]
-            why = f"the device did something else: {failed[-1]}" if failed else str(ended)
+            why = f"unexpected behaviour: {failed[-1]}" if failed else str(ended)
         if session.bench.is_off:
             session.bench.power_on()
         for one in session.bench.judge.measurements:
@@ -216,13 +216,13 @@ class _Interview:
         done = restore(self._subject, self._profile(), flash=flash, stopped=self._stopped)
         if done.ok:
             return ""
-        said = "; ".join((done.reason, *done.diagnosis))
-        return f"{when}, the device could not be brought back: {said}"
+        reasons = "; ".join((done.reason, *done.diagnosis))
+        return f"{when}, the device could not be restored: {reasons}"
 
     def _result(self, stopped: str, *, was_brought_up: bool = True) -> InitResult:
         self._answers |= {one.key: one for one in self._limits()}
         found = [
-            self._answers.get(key) or KeyAnswer(key, None, NOT_ASKED.get(key, "it was not asked"))
+            self._answers.get(key) or KeyAnswer(key, None, NOT_ASKED.get(key, "not determined"))
             for key in profile_keys()
         ]
         name, target = self._subject.name, self._subject.target

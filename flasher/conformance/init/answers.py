@@ -51,12 +51,12 @@ def decide(key: str, trials: Sequence[Trial]) -> KeyAnswer:
     seen, values = _summary(trials), {trial.value for trial in trials}
     allowed = profile_keys()[key].choices
     if not values <= set(allowed):
-        return KeyAnswer(key, None, f"no value describes this: {seen}")
+        return KeyAnswer(key, None, f"no value of the key describes this: {seen}")
     if len(values) == 1:
         return KeyAnswer(key, values.pop(), seen)
     if _EITHER in allowed:
         return KeyAnswer(key, _EITHER, seen)
-    return KeyAnswer(key, None, f"it differs: {seen}")
+    return KeyAnswer(key, None, f"the answers differ: {seen}")
 
 
 def _summary(trials: Sequence[Trial]) -> str:
@@ -64,7 +64,7 @@ def _summary(trials: Sequence[Trial]) -> str:
     total = Counter(trial.stimulus for trial in trials)
     counts = Counter((str(trial), trial.stimulus) for trial in trials)
     found = [
-        f"{said}, {count} of {total[stimulus]} times" for (said, stimulus), count in counts.items()
+        f"{text}, {count} of {total[stimulus]} times" for (text, stimulus), count in counts.items()
     ]
     more = len(found) - _SHOWN
     if more <= 0:
@@ -77,7 +77,7 @@ def _summary(trials: Sequence[Trial]) -> str:
 def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: float) -> KeyAnswer:
     """Derive a limit from measured times, with a margin."""
     if not values_s:
-        return KeyAnswer(key, None, "it was never measured")
+        return KeyAnswer(key, None, "never measured")
     longest_s = max(values_s)
     value = rounded_up(max(MARGIN * longest_s + 2 * unsure_s, least_s))
     times = "once" if len(values_s) == 1 else f"{len(values_s)} times"
@@ -85,7 +85,7 @@ def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: 
         key,
         value,
         f"measured {times}, at most {longest_s * 1000:.1f} ms; the limit is {MARGIN} times that, "
-        f"and {least_s:g} s at the least",
+        f"and at least {least_s:g} s",
     )
 
 

@@ -73,7 +73,7 @@ def burst(session: InitSession) -> Findings:
     yield KeyAnswer(
         "limits.version_spacing_tolerance_s",
         tolerance_s,
-        f"measured {seen}; twice the widest difference, {_TOLERANCE_S * 1000:g} ms at the least",
+        f"measured {seen}; twice the largest deviation, at least {_TOLERANCE_S * 1000:g} ms",
     )
 
 
@@ -118,7 +118,7 @@ def in_burst(session: InitSession) -> Findings:
     bench = session.bench
     count = bench.number("versions")
     if count < 2:
-        yield "the burst is a single boot version"
+        yield "the burst has only one boot version"
     for version in range(1, count):
         for _ in range(REPEATS):
             session.enter(version)
@@ -134,7 +134,7 @@ def window(session: InitSession) -> Findings:
     bench = session.bench
     at_s, taken = _offer_at(session, 0.0)
     if not taken:
-        yield "an update command at the last boot version is not taken"
+        yield "an update command at the last boot version is rejected"
         return
     low_s, high_s = at_s, max(0.1, 2 * at_s)
     while True:
@@ -144,14 +144,14 @@ def window(session: InitSession) -> Findings:
             break
         low_s, high_s = at_s, 2 * at_s
         if high_s > _WINDOW_MAX_S:
-            yield f"an update command is taken {low_s:.1f} s behind the last"
+            yield f"an update command is accepted {low_s:.1f} s after the last"
             return
     resolution_s = max(_RESOLUTION_S, bench.port.uncertainty_s)
     while high_s - low_s > resolution_s:
         at_s, taken = _offer_at(session, (low_s + high_s) / 2)
         if low_s < at_s < high_s:
             low_s, high_s = (at_s, high_s) if taken else (low_s, at_s)
-        else:  # the bus is not more exact
+        else:  # limited by the bus's resolution
             break
     inside = [_offer_at(session, low_s - resolution_s) for _ in range(REPEATS)]
     outside = [_offer_at(session, high_s + resolution_s) for _ in range(REPEATS)]
@@ -162,19 +162,17 @@ def window(session: InitSession) -> Findings:
     )
     window_s = round((low_s + high_s) / 2, 4)
     seen = (
-        f"update command taken up to {low_s * 1000:.1f} ms behind the last boot version, not from "
-        f"{high_s * 1000:.1f} ms on, by bisection"
+        f"update command accepted up to {low_s * 1000:.1f} ms after the last boot version, "
+        f"rejected from {high_s * 1000:.1f} ms on, by bisection"
     )
     yield KeyAnswer("limits.window_s", window_s, f"{seen}; the middle")
     half_s = _rounded_up(
         (high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2
     )
     yield KeyAnswer(
-        "limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure"
+        "limits.window_tolerance_s", half_s, f"{seen}; half of that plus the uncertainty"
     )
-    stimulus = (
-        f"update command {(high_s + resolution_s) * 1000:.0f} ms behind the last boot version"
-    )
+    stimulus = f"update command {(high_s + resolution_s) * 1000:.0f} ms after the last boot version"
     for _, taken in outside:
         answer = "request transfer" if taken else "no request transfer"
         yield Trial("accepted" if taken else "rejected", answer, stimulus)
@@ -213,7 +211,7 @@ def reset_in_bootloader(session: InitSession) -> Findings:
         more = len(session.more_versions())
         value = {count - place: "ignored", count: "restarts"}.get(more, "")
         stimulus = f"reset after boot version {place} of {count}"
-        yield Trial(value, f"{more} boot versions more", stimulus, "after")
+        yield Trial(value, f"{more} more boot versions", stimulus, "after")
         session.await_application()
 
 
@@ -304,12 +302,12 @@ def _choice_for(replies: list[Received]) -> str:
 def _why_no_exit(session: InitSession) -> str:
     """Why no transfer of this device can be ended early; "" when one can."""
     if needs_power(session.bench.profile) and not session.bench.subject.has_power:
-        return "only power would end a transfer, and none is controlled"
+        return "only a power cycle ends a transfer, and the bench cannot switch power"
     can_leave = (
         session.bench.choice("tx_13") == "restarts" or session.bench.choice("tx_12") == "announces"
     )
     if not (can_leave or session.bench.subject.has_power):
-        return "neither a reset nor a pause ends a transfer, and no power is controlled"
+        return "neither reset nor pause ends a transfer, and the bench cannot switch power"
     return ""
 
 
@@ -332,7 +330,7 @@ def without_application(session: InitSession) -> Findings:
             bench.measure(TimeName.GAP, reply.at - last_at)
             more, last_at = more + 1, reply.at
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
-        answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
+        answer = f"{more} more boot versions" + ("" if value == "announces" else ", then silence")
         stimulus = "the first one, without an application"
         yield Trial(value, answer, stimulus, "after")
         session.update()
@@ -372,9 +370,9 @@ def largest_image(session: InitSession) -> Findings:
         low, high = (size, high) if is_taken(size) else (low, size)
     session.update()
     session.finish()
-    said = f"update command for {low} bytes is taken"
+    said = f"update command for {low} bytes accepted"
     if high:
-        said += f", and for {high} bytes not, by bisection"
+        said += f", for {high} bytes rejected, by bisection"
     yield KeyAnswer("device.largest_image_bytes", low, said)
 
 

@@ -128,7 +128,7 @@ class InitSession(PacketTransfer):
         Raises Unsupported when the image is too small.
         """
         if self.total < stored + left:
-            raise Unsupported(f"the good image has less than {stored + left} packets")
+            raise Unsupported(f"the good image has fewer than {stored + left} packets")
         if self.total - self.stored < left:
             self.finish()
             self.begin()

@@ -83,7 +83,7 @@ def bad_packet(session: InitSession) -> Findings:
             after,
             encoder.damaged_packet_of(session.image, after),
         ),
-        f"packet {after} in the place of {wanted}": (after, session.packet(after)),
+        f"packet {after} instead of {wanted}": (after, session.packet(after)),
         f"packet {wanted} of {session.total + 1}": (
             wanted,
             encoder.packet(wanted, session.total + 1, payload),
@@ -143,7 +143,7 @@ def filler(session: InitSession) -> Findings:
     bench = session.bench
     rest = session.image[(session.total - 1) * PACKET_BYTES :]
     if len(rest) == PACKET_BYTES:
-        yield "the good image is a whole number of packets"
+        yield "the good image fills its last packet"
         return
     for _ in range(REPEATS):
         session.begin()
@@ -171,7 +171,7 @@ def splits(session: InitSession) -> Findings:
         update = joined(bench.encoder.update(len(session.image)))
         taken = session.offer_update(bench.encoder.frames(update, 5))
         yield _accepted_trial(taken, "update command in frames of 5 bytes")
-        if not taken:  # the window is over by now
+        if not taken:  # the window has ended
             session.await_application()
             session.begin()
         for form in forms(bench.encoder)["fr_01"]:
@@ -214,7 +214,7 @@ def padded(session: InitSession) -> Findings:
         )
         said = f"padded with {byte:02X}"
         yield _accepted_trial(taken, f"update command {said}", "ignored", "rejected")
-        if not taken:  # the window is over by now
+        if not taken:  # the window has ended
             session.await_application()
             session.begin()
         session.packets()
@@ -248,7 +248,7 @@ def _accepted_trial(
     yes: str = "accepted",
     no: str = "rejected",
 ) -> Trial:
-    return Trial(yes if taken else no, "taken" if taken else "not taken", stimulus, "")
+    return Trial(yes if taken else no, "accepted" if taken else "rejected", stimulus, "")
 
 
 # -- update command, pause and reset in a transfer ------------------------------------------------
@@ -293,7 +293,7 @@ def pause(session: InitSession) -> Findings:
             session.update()
         session.finish()
     if len(found_s) < len(places):
-        why = f"no boot version in a pause of {_PAUSE_WATCHED_S:g} s; the default stands"
+        why = f"no boot version in a pause of {_PAUSE_WATCHED_S:g} s; the default is kept"
         yield KeyAnswer("limits.pause_s", None, why)
         return
     digit = 10 if min(found_s) >= 1 else 100
@@ -363,4 +363,4 @@ def buffer(session: InitSession) -> Findings:
     # The last packet may still be being written when its ACK arrives (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
     seen = f"after ACK 1 to {count} at most {lacking} bytes were not in the flash"
-    yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may be on its way")
+    yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may still be being written")
