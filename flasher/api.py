@@ -38,7 +38,7 @@ from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
 from flasher.image.release import Release
-from flasher.procedures import DeviceInfo, EventHandler, Procedures, Watch, plan_for
+from flasher.procedures import CallOptions, DeviceInfo, EventHandler, Procedures, plan_for
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Dialect, Target, as_dialect, as_target
@@ -86,7 +86,7 @@ __all__ = [
     "Result",
     "UpgradeOptions",
     "Verification",
-    "Watch",
+    "CallOptions",
     "WriteResult",
 ]
 
@@ -123,7 +123,7 @@ class Connection:
         dialect: str | Dialect = "welling",
         profile: Profile | None = None,
         is_alone: bool = False,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> Device:
         """Create a device on this bus; nothing is sent yet.
 
@@ -141,20 +141,22 @@ class Connection:
         dialect: str | Dialect = "welling",
         profile: Profile | None = None,
         is_alone: bool = False,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> AsyncDevice:
         """Same as `device`, for a program with an event loop."""
         chosen = profile or _default_profile(target, dialect)
         return AsyncDevice(self, chosen, is_alone=is_alone, watch=watch)
 
-    def listen_first(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> None:
+    def listen_first(
+        self, dialect: str | Dialect = "welling", **watch: Unpack[CallOptions]
+    ) -> None:
         """Listen briefly for another tool, as every query does before it is sent. Raises BusError
         if one is detected.
         """
         with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
             steps.listen_first()
 
-    def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> Survey:
+    def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[CallOptions]) -> Survey:
         """Listen for a second, then ask the BMS for its version and state; return the traffic of
         all nodes. Raises BusError; InterruptedByUserError if cancelled.
         """
@@ -277,7 +279,7 @@ def bit_rate(
 class Device:
     """A device on a bus, for blocking programs; created by `Connection.device`.
 
-    Every method takes the keywords of `Watch`. It raises BusError if the adapter fails or another
+    Every method takes the keywords of `CallOptions`. It raises BusError if the adapter fails or another
     tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and UsageError while
     another call is running on the connection (in another thread, or around `on_event`).
     """
@@ -288,7 +290,7 @@ class Device:
         profile: Profile,
         *,
         is_alone: bool,
-        watch: Watch,
+        watch: CallOptions,
         awaits_turn: bool = False,
     ) -> None:
         self.connection = connection
@@ -305,7 +307,7 @@ class Device:
         """Plan an upgrade with this image. Raises ImageError and UsageError."""
         return self._steps({}).plan(image)
 
-    def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
+    def identify(self, **watch: Unpack[CallOptions]) -> DeviceInfo:
         """Send all documented queries; only listen if there are none.
 
         Silence is not an error: see `DeviceInfo.is_there`. Takes 12 s if a device sends but answers
@@ -314,14 +316,14 @@ class Device:
         with self._turn(watch) as steps:
             return steps.identify()
 
-    def is_heard(self, **watch: Unpack[Watch]) -> bool:
+    def is_present(self, **watch: Unpack[CallOptions]) -> bool:
         """True if it sends a message, or answers a version query; nothing else is sent to it. Takes
         5 s at most.
         """
         with self._turn(watch) as steps:
-            return steps.is_heard()
+            return steps.is_present()
 
-    def version(self, **watch: Unpack[Watch]) -> Content:
+    def version(self, **watch: Unpack[CallOptions]) -> Content:
         """Return the version information, or the answer to the product's own version query. Raises
         NoAnswerError if it does not answer or no query is known.
         """
@@ -329,10 +331,10 @@ class Device:
             return steps.version()
 
     @overload
-    def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
+    def read(self, what: type[C], **watch: Unpack[CallOptions]) -> C: ...
     @overload
-    def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
-    def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
+    def read(self, what: str, **watch: Unpack[CallOptions]) -> Content: ...
+    def read(self, what: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
         """Read an item by its name ("running-information"), or by the class of its content
         (`flasher.protocol.contents.RunningInformation`) if only one item has it. "model" and
         "serial-number" return the version information, which contains them.
@@ -342,12 +344,12 @@ class Device:
         with self._turn(watch) as steps:
             return steps.read(what)
 
-    def ask(self, request: Request, **watch: Unpack[Watch]) -> Content:
+    def ask(self, request: Request, **watch: Unpack[CallOptions]) -> Content:
         """Send your own request. Raises NoAnswerError."""
         with self._turn(watch) as steps:
             return steps.ask(request)
 
-    def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
+    def read_memory(self, start: int, end: int, **watch: Unpack[CallOptions]) -> bytes:
         """Read the bytes from address `start` up to `end`, exclusive (R5).
 
         Raises UsageError for an impossible range or a target without a memory query, NoAnswerError
@@ -361,7 +363,7 @@ class Device:
         name: str,
         *values: object,
         manufacturer: bool = False,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> WriteResult:
         """Write an item by name and read it back; the result has the old and the new value.
 
@@ -373,13 +375,13 @@ class Device:
         with self._turn(watch) as steps:
             return steps.write(name, values, manufacturer=manufacturer)
 
-    def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content:
+    def read_before_write(self, plan: WritePlan, **watch: Unpack[CallOptions]) -> Content:
         """First half of a write: read the present content."""
         with self._turn(watch) as steps:
-            return steps.content_before(plan)
+            return steps.read_before_write(plan)
 
     def carry_out(
-        self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]
+        self, plan: WritePlan, before: Content | None, **watch: Unpack[CallOptions]
     ) -> WriteResult:
         """Second half of a write: write and read back. Failures are in the result."""
         with self._turn(watch) as steps:
@@ -393,7 +395,7 @@ class Device:
         verify: Level | str | None = None,
         identity: Identity | None = None,
         in_session: bool = False,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> Result:
         """Upgrade it with an image file (or a loaded `Image`), and verify it.
 
@@ -413,7 +415,7 @@ class Device:
         verify: Level | str | None = None,
         identity: Identity | None = None,
         in_session: bool = False,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> Result:
         """`flash` for a device whose application does not run: wait until it announces its
         bootloader at power-up, for `power_up_timeout_s` of the options, then upgrade it. With
@@ -430,7 +432,7 @@ class Device:
         options: UpgradeOptions | None = None,
         verify: Level | None = None,
         identity: Identity | None = None,
-        **watch: Unpack[Watch],
+        **watch: Unpack[CallOptions],
     ) -> Result:
         """Run the upgrade alone and return its result, so that a failure can be examined instead of
         caught: only an adapter failure is raised.
@@ -443,7 +445,7 @@ class Device:
             return steps.upgrade(image, options, verify, identity)
 
     def verify(
-        self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
+        self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[CallOptions]
     ) -> Verification:
         """Check whether it runs this image, by the reported version or also by its memory.
         Contradictions are in the result. Raises UsageError for an impossible level.
@@ -451,14 +453,14 @@ class Device:
         with self._turn(watch) as steps:
             return steps.verify(image, as_level(level))
 
-    def reset(self, **watch: Unpack[Watch]) -> None:
+    def reset(self, **watch: Unpack[CallOptions]) -> None:
         """Restart its application. Raises NoAnswerError if it does not confirm, or has no
         documented reset.
         """
         with self._turn(watch) as steps:
             steps.reset()
 
-    def run(self, engine: Engine, **watch: Unpack[Watch]) -> None:
+    def run(self, engine: Engine, **watch: Unpack[CallOptions]) -> None:
         """Run your own engine on the connection."""
         with self._turn(watch) as steps:
             steps.run(engine)
@@ -469,7 +471,7 @@ class Device:
         options: UpgradeOptions | None,
         verify: Level | str | None,
         identity: Identity | None,
-        watch: Watch,
+        watch: CallOptions,
         *,
         in_session: bool,
         at_power_up: bool = False,
@@ -488,14 +490,14 @@ class Device:
             job = job.in_session()
         return _good(job.run(self, **watch))
 
-    def _steps(self, watch: Watch) -> Procedures:
+    def _steps(self, watch: CallOptions) -> Procedures:
         link, clock, rate = self.connection.link, self.connection.clock, self.connection.bit_rate
         return Procedures(link, clock, self.profile, rate, self._is_alone, watch)
 
     @contextmanager
-    def _turn(self, of_call: Watch) -> Iterator[Procedures]:
+    def _turn(self, of_call: CallOptions) -> Iterator[Procedures]:
         """Run a call while no other call is running on the connection."""
-        watch: Watch = {**self._watch, **of_call}
+        watch: CallOptions = {**self._watch, **of_call}
         turn = self.connection._turn  # noqa: SLF001  of this module
         cancelled = watch.get("cancelled")
         while not turn.acquire(timeout=_TURN_PAUSE_S if self._awaits_turn else 0):
@@ -534,7 +536,7 @@ class AsyncDevice:
     """
 
     def __init__(
-        self, connection: Connection, profile: Profile, *, is_alone: bool, watch: Watch
+        self, connection: Connection, profile: Profile, *, is_alone: bool, watch: CallOptions
     ) -> None:
         self.connection = connection
         self.profile = profile
@@ -550,12 +552,12 @@ class AsyncDevice:
         return self._device.plan(image)
 
     identify = _in_thread(Device.identify)
-    is_heard = _in_thread(Device.is_heard)
+    is_present = _in_thread(Device.is_present)
     version = _in_thread(Device.version)
     ask = _in_thread(Device.ask)
     read_memory = _in_thread(Device.read_memory)
     write = _in_thread(Device.write)
-    content_before = _in_thread(Device.content_before)
+    read_before_write = _in_thread(Device.read_before_write)
     carry_out = _in_thread(Device.carry_out)
     flash = _in_thread(Device.flash)
     rescue = _in_thread(Device.rescue)
@@ -565,10 +567,10 @@ class AsyncDevice:
     run = _in_thread(Device.run)
 
     @overload
-    async def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
+    async def read(self, what: type[C], **watch: Unpack[CallOptions]) -> C: ...
     @overload
-    async def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
-    async def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
+    async def read(self, what: str, **watch: Unpack[CallOptions]) -> Content: ...
+    async def read(self, what: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
         """Read an item; see `Device.read`."""
         return await self._call(Device.read, what, **watch)
 
@@ -677,7 +679,7 @@ class Job:
         """
         return replace(self, options=replace(self.options, in_session=True))
 
-    def run(self, device: Device, **watch: Unpack[Watch]) -> Result:
+    def run(self, device: Device, **watch: Unpack[CallOptions]) -> Result:
         """Run it to its end, good or bad; see `Device.upgrade`."""
         return device.upgrade(
             self.plan,

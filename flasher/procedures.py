@@ -79,7 +79,7 @@ _REOPEN_PAUSE_S: Final = 0.1
 EventHandler = Callable[[object], None]
 
 
-class Watch(TypedDict, total=False):
+class CallOptions(TypedDict, total=False):
     """Callbacks of a call; missing ones are those of the device."""
 
     taps: Sequence[Tap]
@@ -97,7 +97,7 @@ class Watch(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class Reading:
+class ItemReading:
     """One query of `identify` and its answer (None without one). `misfit` describes an answer of
     another format; `was_asked` is False if the device was silent to earlier queries.
     """
@@ -129,7 +129,7 @@ class DeviceInfo:
 
     target: Target
     dialect: Dialect
-    readings: tuple[Reading, ...]
+    readings: tuple[ItemReading, ...]
     """In the order of the document; empty for devices without queries."""
     survey: Survey
 
@@ -164,7 +164,7 @@ class Procedures:
     bit_rate: BitRate | None
     is_alone: bool
     """No other tool can be on this bus: queries need not listen for one first."""
-    watch: Watch
+    watch: CallOptions
 
     @property
     def target(self) -> Target:
@@ -299,7 +299,7 @@ class Procedures:
 
     # -- writing ---------------------------------------------------------------------------------
 
-    def content_before(self, plan: WritePlan) -> Content:
+    def read_before_write(self, plan: WritePlan) -> Content:
         """Read the content before a write."""
         request = Request(plan.writable.read_back.item)
         try:
@@ -331,7 +331,7 @@ class Procedures:
         """Write an item by name and read it back."""
         dialect = self.profile.dialect
         plan = plan_write(name, values, self.target, dialect=dialect, manufacturer=manufacturer)
-        before = self.content_before(plan)
+        before = self.read_before_write(plan)
         written = self.carry_out(plan, before)
         error = written.error()
         if error is not None:
@@ -354,7 +354,7 @@ class Procedures:
         readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
 
-    def is_heard(self) -> bool:
+    def is_present(self) -> bool:
         """Listen for the device, and send its version query, if any."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         survey = self._survey(
@@ -393,7 +393,7 @@ class Procedures:
         queries = self._queries([request])
         self.run(queries, may_cancel=may_cancel)
         if for_write and queries.duplicates.evidence:
-            raise two_devices(self.target, queries.duplicates.evidence, for_write)
+            raise two_devices_error(self.target, queries.duplicates.evidence, for_write)
         return queries.queries[0]
 
     def _queries(self, requests: Iterable[Request]) -> Queries:
@@ -667,7 +667,7 @@ def _no_answer(asked: Query) -> NoAnswerError:
     )
 
 
-def two_devices(target: Target, seen: str, written: str) -> WrongDeviceError:
+def two_devices_error(target: Target, seen: str, written: str) -> WrongDeviceError:
     """Create the error for two devices instead of one; `written` describes what may be written."""
     return WrongDeviceError(
         f"{target.node.name}: two devices answer on the same id ({seen}).",
@@ -677,7 +677,7 @@ def two_devices(target: Target, seen: str, written: str) -> WrongDeviceError:
     )
 
 
-def nobody_heard(survey: Survey, bitrate_bps: int) -> NoAnswerError:
+def nothing_received_error(survey: Survey, bitrate_bps: int) -> NoAnswerError:
     """Create the error for a bus without messages from any documented node."""
     count = survey.foreign_frames
     foreign = f"{count:,} frame{'' if count == 1 else 's'} under ids of other protocols came"
@@ -690,11 +690,11 @@ def nobody_heard(survey: Survey, bitrate_bps: int) -> NoAnswerError:
     )
 
 
-def _reading(entry: Readable, asked: Query | None) -> Reading:
+def _reading(entry: Readable, asked: Query | None) -> ItemReading:
     if asked is None:
-        return Reading(entry.name, entry.item, None, was_asked=False)
+        return ItemReading(entry.name, entry.item, None, was_asked=False)
     misfit = ""
     if asked.answer is None and asked.misfit is not None:
         came = asked.misfit
         misfit = f"{came.command:04X} with {len(came.data)} bytes, mode {came.mode:02X}"
-    return Reading(entry.name, entry.item, asked.answer, misfit)
+    return ItemReading(entry.name, entry.item, asked.answer, misfit)

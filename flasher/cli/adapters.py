@@ -9,7 +9,7 @@ from typing import Final, Unpack
 
 import click
 
-from flasher.api import Device, Watch
+from flasher.api import CallOptions, Device
 from flasher.bus.detect import SLOW, SOCKETCAN, Detected, Detection, Found, serial_ports
 from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface, start_command
 from flasher.cli.framework import rebuild_command_line
@@ -111,7 +111,7 @@ def using(found: Found, bus: Bus) -> Bus:
     )
 
 
-def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[Watch]) -> None:
+def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOptions]) -> None:
     """Before a device is changed through an adapter that nobody named: it has to be heard there.
 
     Raises NoAnswerError, having sent nothing but a question for its version.
@@ -120,7 +120,7 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[Watch]
         return
     node = device.target.node.name
     output.progress(f"listening for the {node} ...")
-    if not device.is_heard(**watch):
+    if not device.is_present(**watch):
         error = NoAnswerError(
             f"The {node} was not heard, and nobody named the adapter: nothing was changed.",
             where=f"the only adapter found, {printable(device.connection.name)}",

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from platformdirs import user_state_path
 
-from flasher.api import Connection, Device, Watch
+from flasher.api import CallOptions, Connection, Device
 from flasher.cli.adapters import choose_adapter
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
@@ -194,7 +194,7 @@ def recorded_device(
         recorded_connection(options, bus, output, target) as (connection, record),
         stop_on_signal() as stopped,
     ):
-        watch: Watch = {
+        watch: CallOptions = {
             "taps": record.taps, "cancelled": stopped, "on_event": partial(record.warn, output),
         }  # fmt: skip
         yield connection.device(target, dialect=bus.dialect, **watch), record

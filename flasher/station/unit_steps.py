@@ -367,7 +367,7 @@ class UnitSteps:
 
     def _write_one(self, target: UnitTarget, plan: WritePlan) -> None:
         target.check_cancelled()
-        old = target.device.content_before(plan)
+        old = target.device.read_before_write(plan)
         write = self._journal.intent(target.name, plan.writable.name, wanted_text(plan))
         target.confirm()
         target.continuity.allow(plan.content)

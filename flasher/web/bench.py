@@ -27,7 +27,7 @@ from flasher.host.query import memory_bytes
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
-from flasher.procedures import nobody_heard
+from flasher.procedures import nothing_received_error
 from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
@@ -245,7 +245,7 @@ class Bench:
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
         if not bike.survey.heard:
-            raise nobody_heard(bike.survey, self._place.bitrate_bps(self._adapter()))
+            raise nothing_received_error(bike.survey, self._place.bitrate_bps(self._adapter()))
 
     def _seen(self, adapter: Adapter, target: Target) -> DeviceInfo:
         with self._place.connect(adapter) as connection:

@@ -129,7 +129,7 @@ def test_an_unconfirmed_write_fails_even_if_it_reads_back() -> None:
     battery = Battery()
     battery.silent = frozenset({0x3A10})
     plan = plan_write("user-string-1", [""])
-    old = wire_to(battery).device().content_before(plan)
+    old = wire_to(battery).device().read_before_write(plan)
     written = wire_to(battery).device().carry_out(plan, old)
     assert not written.is_confirmed
     error = written.error()

@@ -27,7 +27,7 @@ from flasher.host.query import READ_MEMORY
 from flasher.i18n import text
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
-from flasher.procedures import DeviceInfo, two_devices
+from flasher.procedures import DeviceInfo, two_devices_error
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.settings.area import Area, area_of_image, area_of_profile
@@ -167,7 +167,7 @@ def backup(
         if area is not None and found.is_there:
             data = read_shown(device, area.start, area.end, output, record)
         if record.two_devices is not None:
-            raise two_devices(target, record.two_devices, "No file was written.")
+            raise two_devices_error(target, record.two_devices, "No file was written.")
         made = backup_of(found, area, data, device.connection.name, file)
     document, memory = made.document, made.document.memory
     write_whole(file, made.archive, _OUTPUT, is_private=True)

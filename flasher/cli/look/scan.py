@@ -17,7 +17,7 @@ from flasher.cli.recording import RecordingOptions, recorded_connection, recordi
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode
 from flasher.host.survey import Survey
-from flasher.procedures import SCAN_LISTEN_S, nobody_heard
+from flasher.procedures import SCAN_LISTEN_S, nothing_received_error
 from flasher.protocol.spec import BMS, DIALECTS, Dialect, Target
 
 _EXAMPLES: Final = """\
@@ -70,7 +70,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
         survey = connection.scan(
             dialect, taps=record.taps, cancelled=stopped, on_event=partial(record.warn, output),
         )  # fmt: skip
-        error = None if survey.heard else nobody_heard(survey, rate.bps)
+        error = None if survey.heard else nothing_received_error(survey, rate.bps)
         if error is not None:
             record.failed(error)
     guessed, why = judge_dialect(survey, rate.bps)

@@ -132,7 +132,7 @@ def write(
         device = connection.device(target, dialect=bus.dialect, taps=record.taps)
         with stop_on_signal() as stopped:
             check_heard(device, bus, output, cancelled=stopped)
-            old = device.content_before(plan, cancelled=stopped)
+            old = device.read_before_write(plan, cancelled=stopped)
         output.result(f"{target.node.name} {plan.writable.name}")
         output.table(
             (

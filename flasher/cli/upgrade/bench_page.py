@@ -22,7 +22,7 @@ from typing import Final
 import click
 from platformdirs import user_data_path, user_state_path
 
-from flasher.api import Connection, Job, Watch, connect
+from flasher.api import CallOptions, Connection, Job, connect
 from flasher.bus.opening import bus_config
 from flasher.bus.physical import is_physical
 from flasher.cli.adapters import described, detected_until, ports, using
@@ -145,7 +145,7 @@ class _Place:
             self.connect(adapter) as connection,
         ):
             record.opened(connection)
-            watch: Watch = {"taps": record.taps, "on_event": on_event, "cancelled": cancelled}
+            watch: CallOptions = {"taps": record.taps, "on_event": on_event, "cancelled": cancelled}
             device = connection.device(BMS, dialect=self.dialect, **watch)
             found = device.identify()
             data = b""
@@ -176,7 +176,7 @@ class _Place:
         output = self._output
 
         @contextmanager
-        def watching(connection: Connection, record: Recording) -> Iterator[Watch]:
+        def watching(connection: Connection, record: Recording) -> Iterator[CallOptions]:
             output.progress(f"{job.plan.target.node.name} on {connection.name} ...")
 
             def hung_up() -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
-from flasher.api import Connection, Job, Watch
+from flasher.api import CallOptions, Connection, Job
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
@@ -30,7 +30,7 @@ from flasher.host.session import Result
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
-Watching = Callable[[Connection, Recording], AbstractContextManager[Watch]]
+Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]]
 """Begins when the bus is open, and says who watches the upgrade."""
 
 
