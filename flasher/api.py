@@ -380,12 +380,12 @@ class Device:
         with self._turn(watch) as steps:
             return steps.read_before_write(plan)
 
-    def carry_out(
+    def write_planned(
         self, plan: WritePlan, before: Content | None, **watch: Unpack[CallOptions]
     ) -> WriteResult:
         """Second half of a write: write and read back. Failures are in the result."""
         with self._turn(watch) as steps:
-            return steps.carry_out(plan, before)
+            return steps.write_planned(plan, before)
 
     def flash(
         self,
@@ -558,7 +558,7 @@ class AsyncDevice:
     read_memory = _in_thread(Device.read_memory)
     write = _in_thread(Device.write)
     read_before_write = _in_thread(Device.read_before_write)
-    carry_out = _in_thread(Device.carry_out)
+    write_planned = _in_thread(Device.write_planned)
     flash = _in_thread(Device.flash)
     rescue = _in_thread(Device.rescue)
     upgrade = _in_thread(Device.upgrade)

@@ -308,7 +308,7 @@ class Procedures:
             error.remedy = f"Nothing was written. {error.remedy}"
             raise
 
-    def carry_out(self, plan: WritePlan, before: Content | None) -> WriteResult:
+    def write_planned(self, plan: WritePlan, before: Content | None) -> WriteResult:
         """Write, wait for general feedback, read back. Failures are in the result.
 
         The user cannot cancel a write once it has begun; it takes seconds.
@@ -332,7 +332,7 @@ class Procedures:
         dialect = self.profile.dialect
         plan = plan_write(name, values, self.target, dialect=dialect, manufacturer=manufacturer)
         before = self.read_before_write(plan)
-        written = self.carry_out(plan, before)
+        written = self.write_planned(plan, before)
         error = written.error()
         if error is not None:
             raise error

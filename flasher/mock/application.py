@@ -14,7 +14,7 @@ from flasher.protocol.spec import Dialect, Node
 from flasher.protocol.wire import Message
 
 
-class Port(Protocol):
+class ApplicationPort(Protocol):
     """The machine, as seen by its application."""
 
     @property
@@ -41,21 +41,21 @@ class Application:
     def __init__(self, node: Node, dialect: Dialect) -> None:
         self.node = node
         self.dialect = dialect
-        self._port: Port | None = None
+        self._port: ApplicationPort | None = None
 
     @property
-    def hears(self) -> frozenset[int]:
+    def received_ids(self) -> frozenset[int]:
         """CAN ids of the messages that it processes."""
         return frozenset()
 
     @property
-    def port(self) -> Port:
+    def port(self) -> ApplicationPort:
         """The machine that it runs on. Raises LookupError before `attach`."""
         if self._port is None:
             raise LookupError("an application runs on a machine")
         return self._port
 
-    def attach(self, port: Port) -> None:
+    def attach(self, port: ApplicationPort) -> None:
         self._port = port
 
     def start(self, firmware: str, now: float) -> None:
@@ -64,7 +64,7 @@ class Application:
     def stop(self) -> None:
         """Stop at a restart or power loss; only stored data are kept."""
 
-    def heard(self, now: float) -> None:
+    def note_traffic(self, now: float) -> None:
         """Note a received frame of any node."""
 
     def take(self, message: Message, now: float) -> None:
@@ -82,7 +82,7 @@ class Application:
         """Process the time `due_at`."""
 
 
-def ids_heard_by(node: Node, dialect: Dialect) -> frozenset[int]:
+def ids_received_by(node: Node, dialect: Dialect) -> frozenset[int]:
     """CAN ids of all documented messages that others send to `node` or broadcast."""
     return frozenset(
         item.can_id

@@ -40,7 +40,7 @@ _WARMING_C: Final = 11.0
 
 
 @dataclass(frozen=True)
-class Reading:
+class BatteryReading:
     """State of the battery at one time; a discharging current is negative."""
 
     elapsed_s: float
@@ -72,7 +72,7 @@ class Battery:
         self._spread_mv = _spread(seed)
         self._began_at: float | None = None
 
-    def at(self, now: float) -> Reading:
+    def at(self, now: float) -> BatteryReading:
         """Return the state at `now` (seconds)."""
         if self._began_at is None:
             self._began_at = now
@@ -102,11 +102,11 @@ class Battery:
         charge: float,
         warmth: float,
         status: BatteryStatus,
-    ) -> Reading:
+    ) -> BatteryReading:
         open_mv = _EMPTY_CELL_MV + (_FULL_CELL_MV - _EMPTY_CELL_MV) * charge
         cell_mv = open_mv + _CELL_RESISTANCE_OHM * current_ma
         cells_mv = [round(cell_mv) + spread_mv for spread_mv in self._spread_mv]
-        return Reading(
+        return BatteryReading(
             elapsed_s=elapsed_s,
             current_ma=round(current_ma),
             remaining_mah=round(charge * FULL_CAPACITY_MAH),

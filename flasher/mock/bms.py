@@ -12,7 +12,13 @@ from math import inf
 from typing import Final
 
 from flasher.events import DeviceReported, DeviceWritten, ShutdownAnnounced, ShutdownEnded
-from flasher.mock.application import Application, Port, due_again, due_until, ids_heard_by
+from flasher.mock.application import (
+    Application,
+    ApplicationPort,
+    due_again,
+    due_until,
+    ids_received_by,
+)
 from flasher.mock.battery import (
     DESIGN_CAPACITY_MAH,
     DESIGN_VOLTAGE_V,
@@ -68,10 +74,10 @@ _NEWER_QUERIES: Final = frozenset(
 6)."""
 
 
-class Shutdown:
+class ShutdownSequence:
     """Shutdown handshake (5.1): announce, collect the answers, switch off."""
 
-    def __init__(self, dialect: Dialect, port: Port, why: str, now: float) -> None:
+    def __init__(self, dialect: Dialect, port: ApplicationPort, why: str, now: float) -> None:
         self._port = port
         self._announcement = _sent_item(contents.Shutdown, dialect)
         self._missing = {
@@ -113,7 +119,7 @@ class BmsApplication(Application):
         self.kept = _factory_settings(profile)
         self._memory = memory
         self._firmware = ""
-        self._shutdown: Shutdown | None = None
+        self._shutdown: ShutdownSequence | None = None
         self._fault_due_at = inf
         self._idle_since: float | None = None
         """Time since which there was no frame and the current was small; None before the first
@@ -133,8 +139,8 @@ class BmsApplication(Application):
     # -- the machine's side -----------------------------------------------------------------------
 
     @property
-    def hears(self) -> frozenset[int]:
-        return ids_heard_by(self.node, self.dialect)
+    def received_ids(self) -> frozenset[int]:
+        return ids_received_by(self.node, self.dialect)
 
     def start(self, firmware: str, now: float) -> None:
         self._firmware = firmware
@@ -146,7 +152,7 @@ class BmsApplication(Application):
         self._shutdown = None
         self._fault_due_at = inf
 
-    def heard(self, now: float) -> None:
+    def note_traffic(self, now: float) -> None:
         self._idle_since = now
 
     @property
@@ -181,7 +187,7 @@ class BmsApplication(Application):
 
     def _announce_shutdown(self, why: str, now: float) -> None:
         if self._shutdown is None:
-            self._shutdown = Shutdown(self.dialect, self.port, why, now)
+            self._shutdown = ShutdownSequence(self.dialect, self.port, why, now)
             self._shutdown.tick(now)
 
     @property

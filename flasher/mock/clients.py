@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-from flasher.mock.application import Application, due_again, due_until, ids_heard_by
+from flasher.mock.application import Application, due_again, due_until, ids_received_by
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
 from flasher.protocol.spec import Dialect, Node
@@ -83,8 +83,8 @@ class ClientApplication(Application):
     # -- the machine's side -----------------------------------------------------------------------
 
     @property
-    def hears(self) -> frozenset[int]:
-        return ids_heard_by(self.node, self.dialect)
+    def received_ids(self) -> frozenset[int]:
+        return ids_received_by(self.node, self.dialect)
 
     def start(self, firmware: str, now: float) -> None:
         self._is_asleep = self._said_goodbye = False

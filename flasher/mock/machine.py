@@ -46,7 +46,7 @@ class Machine(ABC):
         self._bitrate_bps = bitrate_bps
         self._reassemblers = {
             can_id: self.reassembler_type(can_id, timings.inter_frame_timeout_s)
-            for can_id in sorted(own_ids | application.hears)
+            for can_id in sorted(own_ids | application.received_ids)
         }
         self._transmitter = Transmitter(bitrate_bps)
         self._events: list[object] = []
@@ -71,7 +71,7 @@ class Machine(ABC):
         if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
             return
         if self._runs_application:
-            self.application.heard(now)
+            self.application.note_traffic(now)
         can_id, payload, is_extended, is_remote, is_error = frame[:5]
         reassembler = self._reassemblers.get(can_id)
         if reassembler is None or not payload or is_extended or is_remote or is_error:

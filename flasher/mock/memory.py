@@ -34,7 +34,7 @@ class FlashNotErasedError(FlashError):
     """A unit was programmed, or torn, since its page was erased."""
 
 
-class Flash:
+class FlashMemory:
     """`size_bytes` of flash from address `start`, erased by page, programmed by unit.
 
     A unit counts as programmed even if it was programmed with FF, as in parts with ECC. Raises
@@ -87,7 +87,7 @@ class Flash:
         self._used_units.update(self._units(offset, len(data)))
         self.program_count += 1
 
-    def carry_out(self, operation: Operation) -> None:
+    def execute(self, operation: Operation) -> None:
         """Complete an erase or program operation. Raises as these do."""
         if operation.data is None:
             self.erase_page(operation.address)
@@ -95,7 +95,7 @@ class Flash:
             self.program(operation.address, operation.data)
 
     def tear(self, operation: Operation, fraction: float) -> None:
-        """Interrupt an operation after `fraction` of its time (0 to 1). Raises as `carry_out`."""
+        """Interrupt an operation after `fraction` of its time (0 to 1). Raises as `execute`."""
         if operation.data is None:
             self.tear_erase(operation.address, fraction)
         else:
@@ -184,7 +184,7 @@ class FlashController:
     times of 0 nothing can be interrupted.
     """
 
-    def __init__(self, flash: Flash, *, erase_time_s: float, program_time_s: float) -> None:
+    def __init__(self, flash: FlashMemory, *, erase_time_s: float, program_time_s: float) -> None:
         self._flash = flash
         self._erase_time_s = erase_time_s
         self._program_time_s = program_time_s
@@ -219,7 +219,7 @@ class FlashController:
             ends_at = self._began_at + self._duration_s(operation)
             if ends_at > now:
                 return False
-            self._flash.carry_out(operation)
+            self._flash.execute(operation)
             self._begin_next(ends_at)
         return True
 

@@ -48,7 +48,7 @@ from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
 """Firmware version of an image without one."""
-AnyRow = messages.UpgradeMessage | messages.Malformed | messages.Unknown
+AnyMessage = messages.UpgradeMessage | messages.Malformed | messages.Unknown
 """Message as processed by the bootloader."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 _DEAF: Final = frozenset((BootloaderState.OFF, BootloaderState.RESTARTING))
@@ -83,7 +83,7 @@ _NUMBER_END: Final = _NUMBER_AT + 2
 
 
 @dataclass
-class Transfer:
+class ReceivedTransfer:
     """Image being received: its size, and the number of stored packets."""
 
     size_bytes: int
@@ -113,7 +113,7 @@ class MockDevice(Machine):
     """
 
     store_type: ClassVar[type[ApplicationStore]] = ApplicationStore
-    transfer_type: ClassVar[type[Transfer]] = Transfer
+    transfer_type: ClassVar[type[ReceivedTransfer]] = ReceivedTransfer
     burst: ClassVar[int] = BOOT_VERSION_BURST
     """Number of announcements before it starts the application."""
     in_ram: ClassVar[tuple[str, ...]] = ()
@@ -226,7 +226,7 @@ class MockDevice(Machine):
         else:
             self._handle(BootloaderEvent.QUERY, now)
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet):
             self._number, self._payload = row.number, row.payload
         elif isinstance(row, messages.UpdateCommand):
@@ -244,7 +244,7 @@ class MockDevice(Machine):
             self._number = int.from_bytes(number, "little") if is_whole else None
             self._handle(BootloaderEvent.PACKET_BAD, now)
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         """Event of a message. Choices of the profile that change the state are applied here; those
         that only change the answer are in the action.
         """
@@ -525,7 +525,7 @@ class MockDevice(Machine):
         self.send(row.to_message(self.target.answer_id))
 
 
-def _in_application(row: AnyRow) -> BootloaderEvent:
+def _in_application(row: AnyMessage) -> BootloaderEvent:
     """Event of a message to the running application."""
     match row:
         case messages.ResetCommand():

@@ -12,7 +12,7 @@ import zlib
 from struct import Struct
 from typing import ClassVar, Final
 
-from flasher.mock.memory import ERASED, Flash, Operation
+from flasher.mock.memory import ERASED, FlashMemory, Operation
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
@@ -54,7 +54,7 @@ def factory_image(profile: DeviceProfile) -> bytes:
 class ApplicationStore:
     """Application area and its record, on their own flash."""
 
-    flash_type: ClassVar[type[Flash]] = Flash
+    flash_type: ClassVar[type[FlashMemory]] = FlashMemory
 
     def __init__(self, profile: DeviceProfile) -> None:
         self._area_bytes = profile.application_area_bytes
@@ -104,7 +104,7 @@ class ApplicationStore:
     def load(self, image: bytes) -> None:
         """Program an image and its record like a factory: no time, no operation counted."""
         self.flash.program(AREA_START, self._units(image))
-        self.flash.carry_out(self.recording(len(image)))
+        self.flash.execute(self.recording(len(image)))
         self.flash.program_count = 0
 
     def _units(self, data: bytes) -> bytes:
@@ -116,7 +116,7 @@ class ApplicationStore:
 class MemoryMap:
     """Bootloader, flash and RAM; contents of bootloader and RAM are invented, but constant."""
 
-    def __init__(self, flash: Flash) -> None:
+    def __init__(self, flash: FlashMemory) -> None:
         self._areas = (
             (_ROM_START, _ROM_SIZE_BYTES, _made_up),
             (flash.start, flash.size_bytes, flash.read),

@@ -371,7 +371,7 @@ class UnitSteps:
         write = self._journal.intent(target.name, plan.writable.name, wanted_text(plan))
         target.confirm()
         target.continuity.allow(plan.content)
-        written = target.device.carry_out(plan, old)
+        written = target.device.write_planned(plan, old)
         error = written.error()
         if isinstance(error, VerificationError):
             code = codes.WRITE_DIFFERS if written.differences else codes.WRITE_FAILED

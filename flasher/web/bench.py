@@ -172,9 +172,9 @@ class Bench:
                 if not self._has_new_files.is_set() or not self.order(Bench.take_files):
                     continue
                 order = self._orders.get()
-            self.carry_out(order)
+            self.write_planned(order)
 
-    def carry_out(self, order: Order) -> None:
+    def write_planned(self, order: Order) -> None:
         """Do it, and show how it goes."""
         self._set(trouble=None)
         try:

@@ -130,7 +130,7 @@ def test_an_unconfirmed_write_fails_even_if_it_reads_back() -> None:
     battery.silent = frozenset({0x3A10})
     plan = plan_write("user-string-1", [""])
     old = wire_to(battery).device().read_before_write(plan)
-    written = wire_to(battery).device().carry_out(plan, old)
+    written = wire_to(battery).device().write_planned(plan, old)
     assert not written.is_confirmed
     error = written.error()
     assert isinstance(error, VerificationError)
@@ -146,7 +146,7 @@ def test_a_write_that_reads_back_differently_fails_and_names_both_values() -> No
 def test_a_write_is_seen_through_once_it_has_begun() -> None:
     battery = Battery()
     plan = plan_write("user-string-1", ["RACK 7"])
-    written = wire_to(battery).device().carry_out(plan, None, cancelled=lambda: True)
+    written = wire_to(battery).device().write_planned(plan, None, cancelled=lambda: True)
     assert written.error() is None
     assert written.is_confirmed
 
@@ -257,7 +257,9 @@ def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
         lambda wire: wire.device().read("history"),
         lambda wire: wire.device().read_memory(0x0800_0000, 0x0800_0080),
         lambda wire: wire.device().write("user-string-1", "rack 7"),
-        lambda wire: wire.device().carry_out(plan_write("user-string-1", ["rack 7"], BMS), None),
+        lambda wire: wire.device().write_planned(
+            plan_write("user-string-1", ["rack 7"], BMS), None
+        ),
     ],
 )
 def test_nobody_asks_or_writes_before_having_listened_for_another_tool(

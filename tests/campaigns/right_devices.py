@@ -23,7 +23,7 @@ from flasher.conformance.mock import MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.entering import LOOP_S, QueuesUpdates
@@ -50,7 +50,7 @@ _BOOTLOADER: Final = frozenset(BootloaderState) - {
 class _ConfirmsUnknown(MockDevice):
     """Sends general feedback to a write that it does not know (2.2.1 (2), R15)."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         is_write = isinstance(row, messages.Unknown) and row.message.mode == Mode.WRITE
         if is_write and self.state in _BOOTLOADER:
             self._send(messages.GeneralFeedbackMessage())
@@ -60,7 +60,7 @@ class _ConfirmsUnknown(MockDevice):
 class _ConfirmsAll(_ConfirmsUnknown):
     """Sends general feedback to update command, packet and end of transfer as well (R15)."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         upgrade = messages.UpdateCommand | messages.Packet | messages.EndOfTransfer
         if isinstance(row, upgrade) and self.state in _BOOTLOADER:
             self._send(messages.GeneralFeedbackMessage())
@@ -78,7 +78,7 @@ class _RefusesByNak(MockDevice):
 class _ListensBehindBurst(MockDevice):
     """Takes the update command when the burst is over, not between its announcements (R2)."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         in_burst = self.state is BootloaderState.ANNOUNCING and self._announced < self.burst
         is_deaf = in_burst and self._has_whole_application

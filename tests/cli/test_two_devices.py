@@ -79,7 +79,7 @@ def test_a_write_that_two_confirm_is_an_error(stage: Stage) -> None:
     device = stage.connection().device("bms")
     plan = plan_write("user-string-1", ["both"])
     with pytest.raises(WrongDeviceError, match="confirmed twice") as caught:
-        device.carry_out(plan, None)
+        device.write_planned(plan, None)
     assert caught.value.code is ErrorCode.TWO_DEVICES
     assert "may hold the new value" in caught.value.remedy
 

@@ -24,7 +24,7 @@ from flasher.conformance.mock import (
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
 from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants import VARIANTS
@@ -84,7 +84,7 @@ class OtherDevice(MockDevice):
         timings = replace(DEFAULT_TIMINGS, inter_frame_timeout_s=0.05)
         super().__init__(*given, **{**named, "timings": timings})
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         super()._take_row(row, now)
         if isinstance(row, messages.UpdateCommand) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Nak(1))
@@ -115,7 +115,7 @@ class Confirming(MockDevice):
 
     acks = 0
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if self.state is not BootloaderState.APPLICATION:
             self._send(messages.GeneralFeedbackMessage())
         super()._take_row(row, now)

@@ -12,7 +12,7 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
@@ -308,7 +308,7 @@ def test_a_battery_that_answers_beside_the_new_application_is_no_success() -> No
 class Confirming(MockDevice):
     """Its bootloader sends general feedback to whatever it receives, the reset too (R15)."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if self.state not in (
             BootloaderState.APPLICATION,
             BootloaderState.OFF,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from flasher.mock.battery import FULL_CAPACITY_MAH, Battery, Reading
+from flasher.mock.battery import FULL_CAPACITY_MAH, Battery, BatteryReading
 from flasher.protocol.contents import BatteryStatus
 
 CYCLE_S = 5 * 3600
 
 
-def readings(step_s: float, until_s: float, battery: Battery | None = None) -> list[Reading]:
+def readings(step_s: float, until_s: float, battery: Battery | None = None) -> list[BatteryReading]:
     battery = battery or Battery()
     return [battery.at(100.0 + step_s * index) for index in range(int(until_s / step_s) + 1)]
 

@@ -7,9 +7,9 @@ from math import inf
 import pytest
 
 from flasher.mock.memory import (
-    Flash,
     FlashAlignmentError,
     FlashController,
+    FlashMemory,
     FlashNotErasedError,
     FlashRangeError,
     Operation,
@@ -21,11 +21,11 @@ PAGE = 32
 UNIT = 8
 
 
-def make_flash() -> Flash:
-    return Flash(START, 4 * PAGE, page_size_bytes=PAGE, program_unit_bytes=UNIT)
+def make_flash() -> FlashMemory:
+    return FlashMemory(START, 4 * PAGE, page_size_bytes=PAGE, program_unit_bytes=UNIT)
 
 
-def make_controller(flash: Flash) -> FlashController:
+def make_controller(flash: FlashMemory) -> FlashController:
     return FlashController(flash, erase_time_s=1.0, program_time_s=0.1)
 
 
@@ -94,7 +94,7 @@ def test_a_page_is_erased_from_its_beginning_and_inside_only() -> None:
 @each("size, page, unit", [(100, 32, 8), (128, 32, 5)])
 def test_sizes_that_do_not_divide_each_other_are_an_error(size: int, page: int, unit: int) -> None:
     with pytest.raises(ValueError, match="whole"):
-        Flash(START, size, page_size_bytes=page, program_unit_bytes=unit)
+        FlashMemory(START, size, page_size_bytes=page, program_unit_bytes=unit)
 
 
 # -- torn operations ------------------------------------------------------------------------------

@@ -133,7 +133,7 @@ class World:
                 elif self.now - bay.differs_since >= 0.5:
                     self.settle(name)
         self.line.tick(self.now)
-        self.carry_out()
+        self.write_planned()
 
     def note(self, what: object) -> None:
         """For whoever looks for the cause of a failure."""
@@ -143,7 +143,7 @@ class World:
         self.note(f"{name} {what}")
         self.way = "named" if self.line.sockets[name].binding is Binding.NAMED else "card"
         self.line.feed(name, what, self.now)
-        self.carry_out()
+        self.write_planned()
 
     def scan(self, text: str) -> None:
         self.note(f"scan {text}")
@@ -153,9 +153,9 @@ class World:
         holder = next((s for s in self.line.sockets.values() if s.own == text), None)
         self.way = "card" if is_card or holder is None else "said by the unit"
         self.line.scan(text, self.now)
-        self.carry_out()
+        self.write_planned()
 
-    def carry_out(self) -> None:
+    def write_planned(self) -> None:
         while effects := self.line.take():
             for effect in effects:
                 match effect:
@@ -204,7 +204,7 @@ class World:
         self.open[name] = (label, outcome)
         self.feed(name, RESULT)
         self.save(name)
-        self.carry_out()
+        self.write_planned()
 
     def save(self, name: str) -> bool:
         if not self.disk_works:

@@ -82,7 +82,7 @@ class BenchPlace:
     def do(self, *orders: Order) -> State:
         """Carry out orders; the state then."""
         for order in orders:
-            self.bench.carry_out(order)
+            self.bench.write_planned(order)
         return self.bench.state
 
     @contextmanager

@@ -153,7 +153,7 @@ def write(
                 NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED
             )
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
-            written = device.carry_out(plan, old)
+            written = device.write_planned(plan, old)
         error = written.error()
         if error is not None:
             record.failed(error)

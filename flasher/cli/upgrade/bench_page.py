@@ -190,7 +190,7 @@ class _Place:
         carried = Carried(job, self.bus(adapter), RecordingOptions(), output)
         result = None
         try:
-            result = carried.carry_out(lambda: self.connect(adapter), watching)
+            result = carried.write_planned(lambda: self.connect(adapter), watching)
         except FlasherError as error:
             carried.error = error
         bundle = None if carried.record is None else carried.record.bundle

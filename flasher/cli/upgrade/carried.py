@@ -36,7 +36,7 @@ Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]
 
 @dataclass
 class Carried:
-    """An upgrade; `carry_out` fills in what is known of it."""
+    """An upgrade; `write_planned` fills in what is known of it."""
 
     job: Job
     bus: Bus
@@ -60,7 +60,7 @@ class Carried:
     _serial_number: str | None = None
     _result: Result | None = None
 
-    def carry_out(
+    def write_planned(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
     ) -> Result:
         """Returns the result, good or bad. Raises BusError and InterruptedByUserError."""

@@ -320,7 +320,7 @@ class _Upgrade:
         ctx = click.get_current_context()
         again = shlex.join(["flasher", *rebuild_command_line(ctx, str(ctx.info_name))])
         carried = Carried(job, self.bus, self.recorded, output, self._add_repair, again)
-        result = carried.carry_out(
+        result = carried.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
             lambda connection, record: self._watching(carried.job, connection, record),
         )

@@ -14,7 +14,7 @@ from flasher.errors import FlasherError
 from flasher.mock.application import Application
 from flasher.mock.bms import BmsApplication
 from flasher.mock.machine import Machine
-from flasher.mock.memory import Flash, FlashError, Operation
+from flasher.mock.memory import FlashError, FlashMemory, Operation
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START, MemoryMap, checksum_fits, with_checksum
 from flasher.protocol import messages
@@ -69,7 +69,7 @@ class CompiledDevice(Machine):
         self._process = process
         self.facts = facts = process.start()
         process.kill()
-        self.flash = Flash(
+        self.flash = FlashMemory(
             AREA_START - facts.application_offset,
             facts.flash_bytes,
             page_size_bytes=facts.sector_bytes,
@@ -313,7 +313,7 @@ class CompiledDevice(Machine):
             self.power_cut(now_us / _US)
             self._due_at = (now_us + share * takes_us) / _US + off_s
             return None
-        self.flash.carry_out(operation)
+        self.flash.write_planned(operation)
         return pipes.TIME.pack(now_us + takes_us)
 
     def _count_bytes(self, size_bytes: int) -> None:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final, TypeVar
 
-from flasher.mock.memory import Flash, FlashNotErasedError, FlashRangeError
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.memory import FlashMemory, FlashNotErasedError, FlashRangeError
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.store import ApplicationStore
 from flasher.mock.table import BootloaderEvent
 from flasher.protocol.messages import Malformed
@@ -21,7 +21,7 @@ _SENTENCE_END: Final = re.compile(r"\.\s+(?=[A-Z])")
 _WrongT = TypeVar("_WrongT", bound=type[object])
 
 
-def bad_write(row: AnyRow, command: Command) -> Message | None:
+def bad_write(row: AnyMessage, command: Command) -> Message | None:
     """Return a malformed write of this command; None for anything else."""
     if not isinstance(row, Malformed):
         return None
@@ -108,7 +108,7 @@ class HangingDevice(MockDevice):
         return "hangs"
 
 
-class PlainFlash(Flash):
+class PlainFlash(FlashMemory):
     """Flash without checks: programming again can only clear bits, as in plain NOR parts;
     programming outside has no effect.
     """

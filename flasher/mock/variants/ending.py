@@ -6,7 +6,7 @@ from math import inf
 from typing import Final
 
 from flasher.mock.memory import ERASED, Operation
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.store import AREA_START, ApplicationStore
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
@@ -43,7 +43,7 @@ class AnnouncesAfterComplete(MockDevice):
 class AcceptsEarlyEnd(MockDevice):
     """Completes when packets are missing."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         if event is not BootloaderEvent.END_EARLY:
             return event
@@ -140,7 +140,7 @@ class AckBeforeWrite(MockDevice):
     def _flush(self) -> None:
         operation, self._buffered = self._buffered, None
         if operation is not None:
-            self.store.flash.carry_out(operation)
+            self.store.flash.execute(operation)
 
     def _erase(self, now: float) -> str:
         self._buffered = None
@@ -225,7 +225,7 @@ class CompletesSecondEnd(MockDevice):
         self._refused = False
         return super()._erase(now)
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         if event is not BootloaderEvent.END_EARLY:
             return event
@@ -245,7 +245,7 @@ class RefusalHangs(HangingDevice):
             self._due_at = inf
         return detail
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         stuck = self.state is BootloaderState.REFUSED and event is not BootloaderEvent.END_AGAIN
         return BootloaderEvent.NO_CONCERN if stuck else event
@@ -255,7 +255,7 @@ class RefusalHangs(HangingDevice):
 class AnyEndByte(MockDevice):
     """Takes an end of transfer with another byte than 04."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         is_end = bad_write(row, Command.END_OF_TRANSFER)
         super()._take_row(messages.EndOfTransfer() if is_end else row, now)
 
@@ -316,4 +316,4 @@ class CompleteBeforeRecord(MockDevice):
     def _pay_record(self) -> None:
         if self._owes_record:
             self._owes_record = False
-            self.store.flash.carry_out(self.store.recording(self._transfer.size_bytes))
+            self.store.flash.execute(self.store.recording(self._transfer.size_bytes))

@@ -6,7 +6,7 @@ import dataclasses
 from math import inf
 from typing import Final
 
-from flasher.mock.model import AnyRow, MockDevice, Transfer
+from flasher.mock.model import AnyMessage, MockDevice, ReceivedTransfer
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
@@ -116,7 +116,7 @@ class GivesUp(HangingDevice):
 class ResetByAnyText(MockDevice):
     """Takes a reset with a wrong text."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         super()._take_row(messages.ResetCommand() if bad_write(row, Command.RESET) else row, now)
 
 
@@ -124,7 +124,7 @@ class ResetByAnyText(MockDevice):
 class ResetByRead(MockDevice):
     """Takes a reset that is a read."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         message = row.message if isinstance(row, messages.Malformed) else None
         if message and (message.command, message.data) == (
             Command.RESET,
@@ -153,7 +153,7 @@ class SilentPowerUp(MockDevice):
 
 
 @variant("full-last-packet-fails", "UP-01", also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12")
-class FullPacketsFail(Transfer):
+class FullPacketsFail(ReceivedTransfer):
     """Wants a packet more when the size is a multiple of 128."""
 
     @property
@@ -186,7 +186,7 @@ class ErasesFromApplication(MockDevice):
 def _erase_at_once(device: MockDevice) -> None:
     """The record and the first page are gone; the time that it takes is not modelled."""
     for operation in device.store.erasing(1)[:2]:
-        device.store.flash.carry_out(operation)
+        device.store.flash.execute(operation)
 
 
 @variant("listens-until-third-version", "UP-04", also="UP-05")
@@ -195,7 +195,7 @@ class StopsListening(MockDevice):
     announcements only, when it has an application to start.
     """
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         is_late = self.state is BootloaderState.ANNOUNCING and self._announced >= _LISTENS_UNTIL
         is_deaf = is_late and self._has_whole_application
@@ -232,7 +232,7 @@ class QueuesUpdates(MockDevice):
 class AnyTargetName(MockDevice):
     """Takes the update command of any target."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
             row = dataclasses.replace(row, text=self.target.update_text)
         super()._take_row(row, now)
@@ -244,7 +244,7 @@ class MixesTransfers(MockDevice):
 
     store_type = PlainStore
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         if (
             event is BootloaderEvent.UPDATE
@@ -260,7 +260,7 @@ class MixesTransfers(MockDevice):
 class ResetTextOfFour(MockDevice):
     """Compares the first four letters of a reset's text. As many as a pointer has bytes."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         message = bad_write(row, Command.RESET)
         if message and message.data.startswith(messages.ResetCommand.DATA[:_POINTER_BYTES]):
             row = messages.ResetCommand()
@@ -271,7 +271,7 @@ class ResetTextOfFour(MockDevice):
 class UpdateTextOfFour(MockDevice):
     """Compares the first four letters of a target's name. As many as a pointer has bytes."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         message, text = bad_write(row, Command.UPDATE), self.target.update_text.encode("ascii")
         if message and message.data.startswith(text[:_POINTER_BYTES]):
             row = messages.decode(message._replace(data=text + message.data[len(text) :]))
@@ -352,7 +352,7 @@ class LeftoverAnnouncement(MockDevice):
 class SixteenBitSize(MockDevice):
     """Keeps 16 bits of the size, and takes one beyond 64 KiB for a small one."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
             row = dataclasses.replace(row, size_bytes=row.size_bytes & _SIXTEEN_BITS)
         super()._take_row(row, now)
@@ -376,7 +376,7 @@ class HangsAt20thUpdate(HangingDevice):
 class ResetWhileErasingHangs(HangingDevice):
     """Hangs at a reset while it erases until power is cut."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.ResetCommand) and self.state is BootloaderState.ERASING:
             self._hang()
         else:
@@ -389,7 +389,7 @@ class CompletesWithoutTransfer(MockDevice):
     as long as none was announced.
     """
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.EndOfTransfer) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Complete())
         super()._take_row(row, now)
@@ -399,7 +399,7 @@ class CompletesWithoutTransfer(MockDevice):
 class AcksWithoutTransfer(MockDevice):
     """Acknowledges packets while it announces itself, and stores nothing."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and self.state is BootloaderState.ANNOUNCING:
             self._send(messages.Ack(row.number))
         super()._take_row(row, now)

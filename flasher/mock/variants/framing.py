@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import Final
 
-from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
+from flasher.mock.model import AnyMessage, MockDevice, is_damaged_packet
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, variant
 from flasher.protocol import messages
@@ -150,7 +150,7 @@ class EveryFrameIsPayload(MockDevice):
 class UnknownRestarts(MockDevice):
     """Its bootloader restarts on an unknown command or mode."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         if isinstance(row, messages.Unknown | messages.Malformed):
             message = row.message
             is_known = message.command in _KNOWN_COMMANDS and message.mode in _KNOWN_MODES

@@ -10,7 +10,7 @@ from math import inf
 from typing import Final
 
 from flasher.mock.machine import BUS_OFF_S
-from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.model import AnyMessage, MockDevice
 from flasher.mock.store import AREA_START
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, variant
@@ -95,7 +95,7 @@ class LogsUseless(HangingDevice):
 
     _log_bytes = 0
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event, message = super()._classify(row), self._message
         is_useless = event in _USELESS
         if event is BootloaderEvent.QUERY and message is not None:
@@ -139,7 +139,7 @@ class WritesAnywhere(MockDevice):
     store_type = PlainStore
     _is_beyond = False
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         self._is_beyond = (
             event is BootloaderEvent.PACKET_BAD
@@ -166,7 +166,7 @@ class SizeRoundedUp(MockDevice):
     whole packets in 32 bits, then looks whether it fits.
     """
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
             rounded = row.size_bytes + PACKET_DATA_SIZE - 1
             if rounded > _WORD:
@@ -239,7 +239,7 @@ class HearsOtherTargets(MockDevice):
 class AnswersInBootloader(MockDevice):
     """Its bootloader confirms messages of chapter 3."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         command = row.message.command if isinstance(row, messages.Unknown) else None
         if self.state is not BootloaderState.APPLICATION and command in _APPLICATION_COMMANDS:
             self._send(messages.GeneralFeedbackMessage())

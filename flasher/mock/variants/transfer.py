@@ -7,7 +7,7 @@ from math import inf
 from typing import ClassVar, Final
 
 from flasher.mock.memory import Operation
-from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
+from flasher.mock.model import AnyMessage, MockDevice, is_damaged_packet
 from flasher.mock.store import AREA_START
 from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
@@ -83,14 +83,14 @@ class WritesRepeated(MockDevice):
         if self._written * PACKET_DATA_SIZE < size_bytes:
             self._written += 1
             operation = self.store.storing(self._written, self._payload, size_bytes)
-            self.store.flash.carry_out(operation)
+            self.store.flash.execute(operation)
 
 
 @variant("accepts-skipped-number", "TX-03")
 class AcceptsSkipped(MockDevice):
     """Takes a packet after a gap, and leaves the gap."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         transfer = self._transfer
         if event is not BootloaderEvent.PACKET_BAD or not isinstance(row, messages.Packet):
@@ -105,7 +105,7 @@ class AcceptsSkipped(MockDevice):
 class IgnoresTotal(MockDevice):
     """Takes a packet with any total."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and self._transfer.total:
             row = dataclasses.replace(row, total=self._transfer.total)
         super()._take_row(row, now)
@@ -120,7 +120,7 @@ class RepeatOverwrites(MockDevice):
     def _answer_repeated(self, now: float) -> str:
         transfer = self._transfer
         operation = self.store.storing(transfer.stored, self._payload, transfer.size_bytes)
-        self.store.flash.carry_out(operation)
+        self.store.flash.execute(operation)
         return super()._answer_repeated(now)
 
 
@@ -128,7 +128,7 @@ class RepeatOverwrites(MockDevice):
 class IgnoresStartByte(MockDevice):
     """Takes a packet with any start byte."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         message = bad_write(row, Command.PACKET)
         if message:
             data = bytes((PACKET_START,)) + message.data[1:]
@@ -140,7 +140,7 @@ class IgnoresStartByte(MockDevice):
 class ByteNumbers(MockDevice):
     """Expects packet 0 after packet 255. Counts them in a byte."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         wraps = isinstance(row, messages.Packet) and row.number > _BYTE
         return (
@@ -167,7 +167,7 @@ class HangsAfter256(HangingDevice):
 class FillerChecked(MockDevice):
     """Refuses a last packet whose bytes behind the image are not FF."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         if event is BootloaderEvent.PACKET_NEXT and isinstance(row, messages.Packet):
             start = (row.number - 1) * PACKET_DATA_SIZE
@@ -195,7 +195,7 @@ class NeverTimesOut(MockDevice):
         else:
             super()._expire(now)
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         is_way_out = event in {
             BootloaderEvent.UPDATE,
@@ -210,7 +210,7 @@ class NeverTimesOut(MockDevice):
 class ResetHangs(HangingDevice):
     """Hangs at a reset during the upgrade until power is cut."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.ResetCommand) and self.state in _UPGRADING:
             self._hang()
         else:
@@ -270,7 +270,7 @@ class OlderOverwrites(MockDevice):
         if self._number:
             size_bytes = self._transfer.size_bytes
             operation = self.store.storing(self._number, self._payload, size_bytes)
-            self.store.flash.carry_out(operation)
+            self.store.flash.execute(operation)
         return super()._answer_older(now)
 
 
@@ -278,7 +278,7 @@ class OlderOverwrites(MockDevice):
 class TotalLookedAtOnce(MockDevice):
     """Looks at the total of packet 1 only."""
 
-    def _classify(self, row: AnyRow) -> BootloaderEvent:
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         if event is BootloaderEvent.PACKET_BAD and isinstance(row, messages.Packet):
             is_next = row.number == self._transfer.stored + 1 <= self._transfer.total
@@ -301,7 +301,7 @@ class SixteenBitOffsets(PlainStore):
 class NumbersModulo256(MockDevice):
     """Looks at the low byte of a packet's number only."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and self.state is BootloaderState.TRANSFER:
             transfer = self._transfer
             for number in (transfer.stored, transfer.wanted):
@@ -314,7 +314,7 @@ class NumbersModulo256(MockDevice):
 class TotalsModulo256(MockDevice):
     """Looks at the low byte of a packet's total only."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and (row.total - self._transfer.total) & _BYTE == 0:
             row = dataclasses.replace(row, total=self._transfer.total)
         super()._take_row(row, now)
@@ -324,7 +324,7 @@ class TotalsModulo256(MockDevice):
 class NumberZeroIsFirst(MockDevice):
     """Takes packet 0 for packet 1 at the beginning."""
 
-    def _take_row(self, row: AnyRow, now: float) -> None:
+    def _take_row(self, row: AnyMessage, now: float) -> None:
         message = bad_write(row, Command.PACKET)
         if message and not self._transfer.stored and not any(message.data[1:3]):
             data = message.data[:1] + b"\x01\x00" + message.data[3:]
