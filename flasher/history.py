@@ -162,7 +162,7 @@ class Flash:
 T = TypeVar("T", Began, Ended)
 
 
-class History:
+class FlashHistory:
     """The history file. Writing raises OSError, or TimeoutError if another program holds the
     lock.
     """

@@ -27,7 +27,7 @@ from pydantic import AfterValidator, Field, model_validator
 from flasher.conformance.wire import IMAGE_BYTES_MAX, RESET, RESET_TEXT
 from flasher.errors import Fault, did_you_mean, printable
 from flasher.files import read_toml
-from flasher.settings.reading import Key, Reader, Table
+from flasher.settings.toml_reader import Key, Reader, TomlTable
 from flasher.validation import NumberRange, Parsed
 
 DEVIATIONS: Final = "deviations"
@@ -61,7 +61,7 @@ Limit = Annotated[float, NumberRange(ge=0, le=3600)]
 Ascii = Annotated[str, Parsed("a text in ASCII", _ascii)]
 
 
-class Limits(Table):
+class Limits(TomlTable):
     """Times; the defaults are this project's readings of the document."""
 
     feedback_s: Limit = 1.0
@@ -96,7 +96,7 @@ class Limits(Table):
     """How long the bus must be quiet to count as silent."""
 
 
-class DeviceFacts(Table):
+class DeviceFacts(TomlTable):
     """Sizes and words of the product."""
 
     application_bytes: Annotated[int, NumberRange(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
@@ -127,7 +127,7 @@ class DeviceFacts(Table):
         return self
 
 
-class ProfileKeys(Table):
+class ProfileKeys(TomlTable):
     """Keys of a profile file without rationales. Keys named after a case (`tx_02`) are the choices
     that the catalogue marks P.
     """

@@ -21,13 +21,13 @@ from flasher.bus.fallback import Fallback
 from flasher.errors import Fault, did_you_mean
 from flasher.protocol.text import printable
 from flasher.python_can import can
-from flasher.settings.reading import Reader, Table
+from flasher.settings.toml_reader import Reader, TomlTable
 
 BUS: Final = "bus"
 """Name of the table."""
 
 
-class BusTable(Table):
+class BusTable(TomlTable):
     """One adapter, by python-can's keywords."""
 
     interface: str

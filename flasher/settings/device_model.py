@@ -12,12 +12,12 @@ from flasher.mock.profile import DeviceProfile
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
-    from flasher.settings.reading import Reader
+    from flasher.settings.toml_reader import Reader
 
 
 @cache
 def reader() -> Reader[DeviceProfile]:
-    from flasher.settings.reading import Reader  # noqa: PLC0415
+    from flasher.settings.toml_reader import Reader  # noqa: PLC0415
 
     return Reader(DeviceProfile, "device model")
 

@@ -33,7 +33,7 @@ from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
-    from flasher.settings.reading import Reader
+    from flasher.settings.toml_reader import Reader
 
 FORMAT_KEY: Final = "format"
 FORMAT_VERSION: Final = 1
@@ -64,7 +64,7 @@ def find_release(
 
 @cache
 def reader() -> Reader[Release]:
-    from flasher.settings.reading import Reader  # noqa: PLC0415
+    from flasher.settings.toml_reader import Reader  # noqa: PLC0415
 
     return Reader(
         Release,

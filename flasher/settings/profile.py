@@ -58,7 +58,7 @@ from flasher.validation import NumberRange, Parsed
 
 if TYPE_CHECKING:
     from flasher.bus.fallback import Fallback
-    from flasher.settings.reading import Reader
+    from flasher.settings.toml_reader import Reader
 
 FILE_NAME: Final = "flasher.toml"
 _BUS: Final = "bus"
@@ -379,7 +379,7 @@ def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
 @cache
 def reader() -> Reader[Profile]:
     """Reader for profiles, with all their keys."""
-    from flasher.settings.reading import Reader  # noqa: PLC0415
+    from flasher.settings.toml_reader import Reader  # noqa: PLC0415
 
     return Reader(Profile, "profile", beside=_BESIDE, also=(*TARGETS, _BUS))
 

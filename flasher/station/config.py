@@ -29,7 +29,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, field_validator, model_validator
 
 from flasher.errors import UsageError
-from flasher.settings.reading import Reader, Table
+from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.recipe import ShortText
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.tally import DEFAULT_SHIFTS
@@ -42,7 +42,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 BusValue = bool | int | float | str
 
 
-class MockUnits(Table):
+class MockUnits(TomlTable):
     """What virtual units a socket without an adapter meets: shares of 1 of all units."""
 
     bad: Share = 0.0
@@ -65,7 +65,7 @@ class MockUnits(Table):
         return self
 
 
-class SocketConfig(Table):
+class SocketConfig(TomlTable):
     """One socket: an adapter of its own, or virtual units."""
 
     name: ShortText
@@ -116,7 +116,7 @@ class SocketConfig(Table):
         return self
 
 
-class ScannerConfig(Table):
+class ScannerConfig(TomlTable):
     """A scanner that the station reads itself."""
 
     name: ShortText
@@ -139,7 +139,7 @@ class ScannerConfig(Table):
         return self
 
 
-class LabelConfig(Table):
+class LabelConfig(TomlTable):
     """The label that a unit gets when it has passed."""
 
     template: str = Field(min_length=1)
@@ -162,7 +162,7 @@ class LabelConfig(Table):
         return self
 
 
-class StationConfig(Table):
+class StationConfig(TomlTable):
     """The whole file."""
 
     name: ShortText = "station"

@@ -24,7 +24,7 @@ from pydantic import Field, field_validator, model_validator
 from flasher.errors import Fault
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.settings.reading import Reader, Table
+from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station import pins
 from flasher.station.attempts import BackOff
 from flasher.station.config import no_two
@@ -56,7 +56,7 @@ _ROLES: Final[Mapping[Word, frozenset[Role]]] = {
 """Who may give a command that overrides the station. The others are for everybody."""
 
 
-class Person(Table):
+class Person(TomlTable):
     """Somebody with a badge."""
 
     name: ShortText
@@ -86,7 +86,7 @@ class Person(Table):
         return value
 
 
-class BadgeTable(Table):
+class BadgeTable(TomlTable):
     """The whole file."""
 
     person: tuple[Person, ...] = Field(min_length=1, max_length=1000)

@@ -36,7 +36,7 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flasher.protocol.spec import TARGETS, Target, find_target
-from flasher.settings.reading import Reader, Table
+from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.pattern import CHECKS, TEXT_MAX, pattern_of
 from flasher.station.records.model import StepName, Verified
 
@@ -55,7 +55,7 @@ def _target_name(value: str) -> str:
     return target.name
 
 
-class TargetTable(Table):
+class TargetTable(TomlTable):
     """A table for one of the targets."""
 
     target: Annotated[str, AfterValidator(_target_name)]
@@ -66,7 +66,7 @@ class TargetTable(Table):
         return TARGETS[self.target]
 
 
-class SerialNumber(Table):
+class SerialNumber(TomlTable):
     """How serial numbers look."""
 
     pattern: str
@@ -131,7 +131,7 @@ class SerialNumber(Table):
         return groups
 
 
-class Lot(Table):
+class Lot(TomlTable):
     """What holds for a lot."""
 
     quantity_max: int | None = Field(default=None, ge=1)
@@ -215,7 +215,7 @@ class Limit(TargetTable):
         return self
 
 
-class StepRule(Table):
+class StepRule(TomlTable):
     """How long a step may take, and when it is tried again."""
 
     time_limit_s: Seconds | None = None
@@ -243,7 +243,7 @@ class AfterRestart(StrEnum):
     CONTINUE = "continue"
 
 
-class Golden(Table):
+class Golden(TomlTable):
     """Known good units that test a socket before it may go on. Their runs count in no figure."""
 
     serial_numbers: tuple[ShortText, ...] = Field(min_length=1)
@@ -262,7 +262,7 @@ class Golden(Table):
         return self
 
 
-class Recipe(Table):
+class Recipe(TomlTable):
     """A recipe. `target` and `write` are in the order in which they are done."""
 
     name: ShortText

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from flasher.errors import ErrorCode, FlasherError, UsageError
-from flasher.history import History, matching
+from flasher.history import FlashHistory, matching
 from flasher.protocol.text import printable
 from flasher.report.base import visible
 from flasher.report.explain_page import told
@@ -81,7 +81,7 @@ class Kept:
 
     def overview(self, question: Question) -> Answer:
         """The history, bundles and backups, the latest first."""
-        history = History()
+        history = FlashHistory()
         flashes, damaged = history.flashes()
         serial = question.fields.get("serial", "")
         found = list(matching(flashes, target=None, serial_number=serial))

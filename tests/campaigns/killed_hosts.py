@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.errors import ExitCode
-from flasher.history import Flash, History
+from flasher.history import Flash, FlashHistory
 from tests.end_to_end.processes import (
     FLASHER,
     MockProcess,
@@ -108,13 +108,13 @@ def trial(number: int, seed: int, whole_s: float, bus: Sequence[str], folder: Pa
     moments = [draw.uniform(0.0, whole_s)]
     if number % TWICE == 0:
         moments.append(draw.uniform(0.0, whole_s + 10.0))
-    before = len(History().flashes()[0])
+    before = len(FlashHistory().flashes()[0])
     killed: list[Flash] = []
     for moment in moments:
         is_first, at_s = not killed, moment
         while True:
             killed_after(at_s, (*flash, *GAP), folder)
-            killed = History().flashes()[0][before:]
+            killed = FlashHistory().flashes()[0][before:]
             if not is_first or killed[-1].ended is None:
                 break
             before, at_s = before + len(killed), 0.7 * at_s  # the computer was faster than before

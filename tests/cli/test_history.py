@@ -16,7 +16,7 @@ from filelock import FileLock
 
 from flasher import history
 from flasher.errors import ExitCode
-from flasher.history import Began, Ended, History
+from flasher.history import Began, Ended, FlashHistory
 from tests.cli.conftest import SAMPLES, Flasher
 
 BMS = str(SAMPLES / "bms.hex")
@@ -169,12 +169,12 @@ def test_a_lock_that_another_program_holds_is_waited_for_a_moment_only(
 
 def test_nothing_flashed_is_said(flasher: Flasher) -> None:
     assert flasher("history").out == "nothing flashed yet\n"
-    History().begin(BEGAN)
+    FlashHistory().begin(BEGAN)
     assert flasher("history", "-t", "wmc").out == "nothing flashed that fits\n"
 
 
 def test_the_latest_come_first_and_are_limited(flasher: Flasher) -> None:
-    kept = History()
+    kept = FlashHistory()
     for number in range(5):
         name = kept.begin(Began(**{**vars(BEGAN), "image": f"{number}.hex"}))
         kept.end(name, Ended(**{**vars(ENDED), "serial_number": f"W{number % 2}"}))
@@ -188,7 +188,7 @@ def test_the_latest_come_first_and_are_limited(flasher: Flasher) -> None:
 
 
 def test_damaged_lines_are_left_out_and_counted(flasher: Flasher, file: Path) -> None:
-    kept = History()
+    kept = FlashHistory()
     kept.end(kept.begin(BEGAN), ENDED)
     damages = ['{"flash": "x", "event": "began"}', "[1, 2]", "\xff\xfe", "{" * 10_000, "null"]
     with file.open("a", encoding="latin-1") as appended:
@@ -202,7 +202,7 @@ def test_damaged_lines_are_left_out_and_counted(flasher: Flasher, file: Path) ->
 
 
 def test_what_stands_in_it_is_shown_escaped(flasher: Flasher) -> None:
-    History().begin(Began(**{**vars(BEGAN), "image": "\x1b[2J.hex"}))
+    FlashHistory().begin(Began(**{**vars(BEGAN), "image": "\x1b[2J.hex"}))
     out = flasher("history").out
     assert "\x1b" not in out
     assert "\\x1b[2J.hex" in out
@@ -247,7 +247,7 @@ def test_whatever_is_in_the_file_is_survived(
     document = flasher("history", "--json").document
     assert document["total"] == shown
     assert damaged is None or document["damaged_lines"] == damaged
-    kept = History()
+    kept = FlashHistory()
     kept.end(kept.begin(BEGAN), ENDED)
     assert flasher("history", "--json").document["flashes"][0]["ended"]["exit_code"] == 0
     assert file.stat().st_size <= history.SIZE_MAX + 10_000
@@ -289,7 +289,7 @@ def test_a_pipe_in_its_place_is_not_waited_for(flasher: Flasher, file: Path) -> 
 
 def test_it_stays_bounded_and_keeps_the_latest(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "SIZE_MAX", 4_000)
-    kept = History()
+    kept = FlashHistory()
     for number in range(60):
         kept.end(kept.begin(Began(**{**vars(BEGAN), "image": f"{number}.hex"})), ENDED)
     assert file.stat().st_size < 5_000
@@ -302,7 +302,7 @@ def test_it_stays_bounded_and_keeps_the_latest(file: Path, monkeypatch: pytest.M
 
 
 def test_keys_of_a_newer_flasher_are_no_damage(file: Path) -> None:
-    kept = History()
+    kept = FlashHistory()
     kept.begin(BEGAN)
     line = json.loads(file.read_text())
     file.write_text(json.dumps({**line, "mood": ["good"]}) + "\n")

@@ -13,7 +13,7 @@ import pytest
 from flasher.bus.detect import Detected, Found
 from flasher.errors import ErrorCode, ExitCode
 from flasher.events import Phase
-from flasher.history import MOCK, Began, Ended, Flash, History, Reached, left_open
+from flasher.history import MOCK, Began, Ended, Flash, FlashHistory, Reached, left_open
 from flasher.protocol.frame import Frame
 from tests.cli.conftest import Flasher
 from tests.end_to_end.stage import IMAGE, NEW, Stage
@@ -34,7 +34,7 @@ UNTOUCHED = replace(BROKEN, needs_rescue=False)
 
 def kept(began: Began = BEGAN, ended: Ended | None = None, reached: Reached | None = None) -> None:
     """A flash of a program that is gone."""
-    history = History()
+    history = FlashHistory()
     name = history.begin(began)
     if reached is not None:
         history.reached(name, reached)
@@ -84,7 +84,7 @@ def test_an_upgrade_without_an_end_or_with_a_bad_one_is_finished_by_the_same_com
     assert "power-cycle" not in run.err
     assert "boot version: not announced: it sat in an open session" in run.out
     assert stage.has == IMAGE.data
-    flashes, _ = History().flashes()
+    flashes, _ = FlashHistory().flashes()
     assert left_open(flashes, target="bms", adapter=ADAPTER) is None, "a good one ends it"
 
 
@@ -158,7 +158,7 @@ def test_an_upgrade_that_is_still_running_is_not_left_open(
     flasher: Flasher, put: Callable[[Stage], Stage], image: str
 ) -> None:
     stage = put(left_in_session())
-    history = History()
+    history = FlashHistory()
     name = history.begin(BEGAN)
     assert flasher("flash", image, *WORDS).code == ExitCode.NO_ANSWER
     assert updates(stage) == 0
@@ -237,7 +237,7 @@ def test_its_begin_is_on_the_disk_before_the_first_update_command(
 
     def look(frame: Frame, _now: float) -> list[Frame]:
         if frame.data.startswith(UPDATE):
-            found.append((len(synced), History().flashes()[0]))
+            found.append((len(synced), FlashHistory().flashes()[0]))
         return [frame]
 
     stage.disturb = look
@@ -249,7 +249,7 @@ def test_its_begin_is_on_the_disk_before_the_first_update_command(
 
 
 def test_how_far_it_came_is_noted_and_no_later_attempt_takes_it_back() -> None:
-    history = History()
+    history = FlashHistory()
     name = history.begin(BEGAN)
 
     def noted(phase: Phase, packet: int = 0) -> Reached | None:
@@ -273,7 +273,7 @@ def test_the_packets_of_an_upgrade_are_noted(
 ) -> None:
     stage = put(Stage())
     found: list[Reached | None] = []
-    stage.at_packet[4] = lambda: found.append(History().flashes()[0][0].reached)
+    stage.at_packet[4] = lambda: found.append(FlashHistory().flashes()[0][0].reached)
     assert flasher("flash", image, *WORDS).code == ExitCode.OK
     assert found == [Reached("transfer", 3)]
 
@@ -312,7 +312,7 @@ def test_what_is_kept_to_type_again_is_what_was_typed(
 ) -> None:
     put(Stage())
     flasher("-q", "flash", image, *WORDS, "--bus-kwargs", "url=x://u:secret@h")
-    (flash,), _ = History().flashes()
+    (flash,), _ = FlashHistory().flashes()
     assert flash.began.again.startswith(f"flasher -q flash {image} -t bms -i virtual")
     assert "secret" not in flash.began.again
     assert flash.began.folder == str(Path.cwd())

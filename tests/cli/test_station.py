@@ -20,7 +20,7 @@ from flasher.cli.main import main
 from flasher.cli.station.run import WAIT_LEFT_S
 from flasher.cli.station.views import JsonLines
 from flasher.errors import ExitCode
-from flasher.settings.reading import Table
+from flasher.settings.toml_reader import TomlTable
 from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
 from flasher.station.messages import CannotWork
@@ -550,7 +550,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 @each("model", [Recipe, StationConfig, BadgeTable])
-def test_every_key_says_what_it_is(model: type[Table]) -> None:
+def test_every_key_says_what_it_is(model: type[TomlTable]) -> None:
     tables = [model]
     for table in tables:
         for name, field in table.model_fields.items():
@@ -559,9 +559,9 @@ def test_every_key_says_what_it_is(model: type[Table]) -> None:
     assert len(tables) > 1
 
 
-def parts_in(annotation: Any) -> list[type[Table]]:
+def parts_in(annotation: Any) -> list[type[TomlTable]]:
     """The tables of a recipe in the type of a key."""
-    if isinstance(annotation, type) and issubclass(annotation, Table):
+    if isinstance(annotation, type) and issubclass(annotation, TomlTable):
         return [annotation]
     return [part for argument in get_args(annotation) for part in parts_in(argument)]
 

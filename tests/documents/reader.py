@@ -20,7 +20,7 @@ import pytest
 
 from flasher.cli.main import COMMANDS, main
 from flasher.settings import bus
-from flasher.settings.reading import Reader
+from flasher.settings.toml_reader import Reader
 from flasher.station import config
 from tests.documents.blocks import ROOT, Block
 from tests.firmware import shorten

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.history import History
+from flasher.history import FlashHistory
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.test_processes import GROUP, bus, free_port
 from tests.firmware import VECTORS
@@ -66,7 +66,7 @@ def test_a_session_that_a_killed_host_left_open_is_finished_by_the_same_command(
         "-t", "bms", *NEVER_ENDS, "--save-image", "out.bin", *bus, folder=tmp_path
     ) as mock:
         kill_at(7, (*flash, *SLOW), tmp_path)
-        (left,), _ = History().flashes()
+        (left,), _ = FlashHistory().flashes()
         assert left.left_device_open
         assert left.reached is not None
         assert (left.reached.phase, left.reached.packet >= 7) == ("transfer", True)

@@ -24,7 +24,7 @@ from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
 from flasher.conformance.profile import profile_keys
 from flasher.settings import bus, device_model, manifest, profile
-from flasher.settings.reading import Key, Reader
+from flasher.settings.toml_reader import Key, Reader
 from flasher.station import codes, config, people, recipe
 
 _MADE: Final = re.compile(r"^<!-- made: (\S+) ?(.*) -->$", re.MULTILINE)

@@ -23,7 +23,7 @@ from flasher.errors import (
     UsageError,
     WrongDeviceError,
 )
-from flasher.history import History
+from flasher.history import FlashHistory
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
@@ -89,9 +89,9 @@ def test_a_device_that_cannot_be_asked_is_not_said_to_run_anything(place: BenchP
 
 
 def test_it_is_kept_in_the_history_as_by_the_command(place: BenchPlace) -> None:
-    before = len(History().flashes()[0])
+    before = len(FlashHistory().flashes()[0])
     _done(place)
-    flashes, _ = History().flashes()
+    flashes, _ = FlashHistory().flashes()
     assert len(flashes) == before + 1
     assert flashes[-1].began.command == "flash"
     assert flashes[-1].began.is_virtual
@@ -226,7 +226,7 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     assert done is not None
     assert done.is_completed
     assert ("hardware", "waived") in {(each.check, each.verdict) for each in done.checks}
-    assert History().flashes()[0][-1].began.waived == "hardware"
+    assert FlashHistory().flashes()[0][-1].began.waived == "hardware"
     state = place.do(
         Bench.start_over,
         order(Bench.use_adapter, Fault.HARDWARE.value),

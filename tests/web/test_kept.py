@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.history import History, Reached
+from flasher.history import FlashHistory, Reached
 from flasher.trace.bundle import write_bundle
 from flasher.trace.taps import FlightRecorder
 from flasher.web.answers import Answer, Question
@@ -86,7 +86,7 @@ def test_a_story_names_the_file_and_not_where_it_was_put(kept: Kept, tmp_path: P
 
 
 def test_an_upgrade_without_an_end_names_what_it_left(kept: Kept) -> None:
-    history = History()
+    history = FlashHistory()
     name = history.begin(BEGAN)
     assert "it is still running" in _asked(kept, "/kept").body.decode()
     history.reached(name, Reached("transfer", 12))

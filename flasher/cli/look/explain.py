@@ -18,7 +18,7 @@ from flasher.cli.recording import bundle_folder
 from flasher.cli.terminal import painted, takes_colour
 from flasher.cli.upgrade.history import again, reached
 from flasher.errors import ErrorCode, ExitCode, UsageError
-from flasher.history import MOCK, Flash, History
+from flasher.history import MOCK, Flash, FlashHistory
 from flasher.protocol.text import printable
 from flasher.trace.story import Story
 
@@ -129,7 +129,7 @@ def _source(trace: Path | None, *, last: bool) -> Path:
 def _unfinished(bundle: Path | None) -> UsageError | None:
     """The error for a latest upgrade that has no end, which is later than the latest bundle."""
     with suppress(UsageError, ValueError):
-        flashes, _ = History().flashes()
+        flashes, _ = FlashHistory().flashes()
         latest = flashes[-1] if flashes else None
         if latest is None or latest.ended is not None or latest.is_running:
             return None

@@ -25,7 +25,7 @@ from flasher.events import (
     QueryAnswered,
     UpgradeLeftOpen,
 )
-from flasher.history import MOCK, Began, Ended, History, Reached, left_open, working_folder
+from flasher.history import MOCK, Began, Ended, FlashHistory, Reached, left_open, working_folder
 from flasher.host.session import Result
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
@@ -54,7 +54,7 @@ class Carried:
     took_s: float = 0.0
     warning: str = ""
     """Why the history does not have it; empty where it has."""
-    _history: History = field(default_factory=History)
+    _history: FlashHistory = field(default_factory=FlashHistory)
     _name: str | None = None
     """Of the history's; None before it has begun."""
     _serial_number: str | None = None

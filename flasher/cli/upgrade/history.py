@@ -12,7 +12,7 @@ from flasher.cli.framework import command, option
 from flasher.cli.options import target_option
 from flasher.cli.output import Output, byte_count, counted
 from flasher.errors import ExitCode
-from flasher.history import Began, Flash, History, left_open, matching, working_folder
+from flasher.history import Began, Flash, FlashHistory, left_open, matching, working_folder
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.wording import wording_of
@@ -55,7 +55,7 @@ def history(output: Output, *, target: Target | None, serial: str | None, limit:
     """Show what this computer has flashed: when, what onto which device, and how it ended. The
     latest first.
     """
-    kept = History()
+    kept = FlashHistory()
     flashes, damaged = kept.flashes()
     name = None if target is None else target.name
     found = list(matching(flashes, target=name, serial_number=serial))

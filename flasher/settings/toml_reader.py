@@ -20,7 +20,7 @@ from pydantic_core import to_json
 from flasher.errors import Fault, FlasherError, UsageError, did_you_mean, printable
 from flasher.files import parse_file, read_toml
 
-Kind = TypeVar("Kind")
+ModelT = TypeVar("ModelT")
 Location = tuple[str | int, ...]
 """Place in a document: keys, and indexes of lists."""
 Detail = tuple[str, Location, str]
@@ -40,7 +40,7 @@ _HEXADECIMAL: Final = frozenset({0x7FF, 0xFFFF, 0xFFFF_FFFF})
 """Limits shown in hexadecimal."""
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """Table of a file."""
 
     model_config = CONFIG
@@ -61,7 +61,7 @@ class Key:
     """Its purpose."""
 
 
-class Reader(Generic[Kind]):
+class Reader(Generic[ModelT]):
     """Reads files of one kind, which messages call `what`.
 
     `beside` are fields of the type that are not in the file; `also` are keys of the file that are
@@ -70,7 +70,7 @@ class Reader(Generic[Kind]):
 
     def __init__(
         self,
-        kind: type[Kind],
+        kind: type[ModelT],
         what: str,
         *,
         error: type[FlasherError] = UsageError,
@@ -79,7 +79,7 @@ class Reader(Generic[Kind]):
         also: Sequence[str] = (),
     ) -> None:
         described = with_config(CONFIG)(kind) if is_dataclass(kind) else kind
-        self._adapter: TypeAdapter[Kind] = TypeAdapter(described)
+        self._adapter: TypeAdapter[ModelT] = TypeAdapter(described)
         self._what = what
         self._error = error
         self._remedy = remedy
@@ -99,18 +99,18 @@ class Reader(Generic[Kind]):
 
     def load(
         self, path: str | os.PathLike[str], *, if_missing: str = "Correct the name.", **beside: Any
-    ) -> Kind:
+    ) -> ModelT:
         """Read a file. Raises UsageError if it does not exist, and `error` with all problems."""
         document = read_toml(path, what=self._what, error=self._error, if_missing=if_missing)
         return self.read(document, path, **beside)
 
-    def parse(self, raw: bytes, path: str | os.PathLike[str], **beside: Any) -> Kind:
+    def parse(self, raw: bytes, path: str | os.PathLike[str], **beside: Any) -> ModelT:
         """Read the bytes of a file. Raises `error` with all problems."""
         return self.read(parse_file(raw, path, what=self._what, error=self._error), path, **beside)
 
     def read(
         self, document: Mapping[str, Any], path: str | os.PathLike[str], **beside: Any
-    ) -> Kind:
+    ) -> ModelT:
         """Read a document. Raises `error` with all problems."""
         value, faults = self.check(document, **beside)
         if value is None or faults:
@@ -124,7 +124,7 @@ class Reader(Generic[Kind]):
         *,
         is_whole: bool = True,
         **beside: Any,
-    ) -> tuple[Kind | None, list[Fault]]:
+    ) -> tuple[ModelT | None, list[Fault]]:
         """Read a document, or the table `prefix` of one; return the value and all problems. Missing
         keys are only a problem of a whole document.
         """
@@ -199,14 +199,14 @@ class Reader(Generic[Kind]):
             *(() if table else self._also),
             *(name for name in self._root.at(location).names if name not in self._beside),
         ]
-        spelled = {path.rpartition(".")[2]: place_of((*prefix, path)) for path in self.keys}
+        spelled = {path.rpartition(".")[2]: location_text((*prefix, path)) for path in self.keys}
         spelled |= {name: name for name in names}
-        where = f" in [{place_of(table)}]" if table else ""
+        where = f" in [{location_text(table)}]" if table else ""
         for key in keys:
             close = did_you_mean(key.lower(), spelled, spelled.__getitem__)
             known = f"Known are: {', '.join(names)}." if key == keys[0] else ""
             yield Fault(
-                place_of((*table, key)),
+                location_text((*table, key)),
                 "unknown key.",
                 (close + known).strip(),
                 f"The {self._what} has an unknown key {key!a:.60}{where}.",
@@ -215,7 +215,7 @@ class Reader(Generic[Kind]):
     def _wrong(
         self, kind: str, location: Location, value: object, said: str, prefix: Location
     ) -> Fault:
-        place = place_of((*prefix, *location))
+        place = location_text((*prefix, *location))
         schema = self._root.at(location)
         if kind in _NO_TABLE:
             return self.fault((*prefix, *location), f"is a table, [{place}].")
@@ -229,7 +229,7 @@ class Reader(Generic[Kind]):
 
     def fault(self, location: Location, what: str, remedy: str = "") -> Fault:
         """Create a fault; `what` begins with a verb, whose subject is the place or the file."""
-        place = place_of(location)
+        place = location_text(location)
         return Fault(place, f"{place or f'The {self._what}'} {what}", remedy)
 
 
@@ -275,7 +275,7 @@ class _Schema:
             else:
                 default = found.node.get("default")
                 allowed, choices = found.allowed(name), tuple(found.choices)
-                yield Key(place_of(place), default, allowed, choices, found.text)
+                yield Key(location_text(place), default, allowed, choices, found.text)
 
     @property
     def names(self) -> list[str]:
@@ -348,7 +348,7 @@ class _Schema:
 _NULL: Final = {"type": "null"}
 
 
-def place_of(location: Location) -> str:
+def location_text(location: Location) -> str:
     """Format a place as people write it: `target[0].base`."""
     place = ""
     for part in location:
