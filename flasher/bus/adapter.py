@@ -20,10 +20,10 @@ from flasher.bus.back_ends import (
     TAKES_SEND_TIMEOUT,
     Meaning,
     causes,
+    error_text,
     is_foreign_datagram,
     meaning_in_receiving,
     meaning_in_sending,
-    words_of,
 )
 from flasher.bus.bit_rate import BitRate, bit_rate
 from flasher.bus.echoes import FLAGGED_SENDER, Echoes, Sender
@@ -40,7 +40,7 @@ from flasher.bus.health import (
 )
 from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
-from flasher.bus.lock import hold, place_of
+from flasher.bus.lock import acquire, lock_name
 from flasher.bus.opening import bus_config, open_bus
 from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
@@ -85,7 +85,7 @@ def open_adapter(
     files, and the `fallback`.
 
     `default_bitrate_bps` is the dialect's bit rate, which applies unless `config` itself names
-    another one. `holder` locks the adapter until it is closed (`lock.hold`). With `sends`, an
+    another one. `holder` locks the adapter until it is closed (`lock.acquire`). With `sends`, an
     interface that only listens is refused. `listen_only` keeps the adapter from acknowledging, if
     its back end supports that (`opening.can_listen_only`).
 
@@ -98,16 +98,16 @@ def open_adapter(
 
     interface = str(merged["interface"])
     channel = str(merged.get("channel") or "")
-    place, give_back = place_of(merged), hold(merged, holder)
+    place, release = lock_name(merged), acquire(merged, holder)
 
     def open_again() -> can.BusABC:
         # The interface may have come back with other settings.
         bit_rate(default_bitrate_bps, config, merged, fallback)
-        nonlocal place, give_back
+        nonlocal place, release
         # A symbolic link may lead to another serial port now.
-        new_place, give_new_back = place_of(merged), None
+        new_place, give_new_back = lock_name(merged), None
         if new_place != place:
-            give_new_back = hold(merged, holder)
+            give_new_back = acquire(merged, holder)
         try:
             bus = open_bus(settings, sends=sends)
         except BaseException:
@@ -115,8 +115,8 @@ def open_adapter(
                 give_new_back()
             raise
         if give_new_back is not None:
-            give_back()
-            place, give_back = new_place, give_new_back
+            release()
+            place, release = new_place, give_new_back
         return bus
 
     try:
@@ -125,11 +125,11 @@ def open_adapter(
             interface,
             channel,
             open_again,
-            lambda: give_back(),  # noqa: PLW0108  replaced when reopened
+            lambda: release(),  # noqa: PLW0108  replaced when reopened
             gives_own=interface != "socketcan" or bool(merged.get("receive_own_messages")),
         )
     except BaseException:
-        give_back()
+        release()
         raise
     link.bit_rate = rate
     return link
@@ -144,11 +144,11 @@ class CanLink:
         interface: str,
         channel: str = "",
         open_again: Callable[[], can.BusABC] | None = None,
-        give_back: Callable[[], None] = lambda: None,
+        release: Callable[[], None] = lambda: None,
         *,
         gives_own: bool = True,
     ) -> None:
-        self._give_back = give_back
+        self._release = release
         self._interface = interface
         self._channel = channel
         self._name = f"{interface} {channel}".strip()
@@ -263,7 +263,7 @@ class CanLink:
     def close(self) -> None:
         """Shut the adapter down, ignoring failures."""
         self._shut_down()
-        self._give_back()
+        self._release()
 
     def _shut_down(self) -> None:
         if self._bus is not None:
@@ -343,7 +343,7 @@ class CanLink:
             frame = self._echoes.mark(frame, message.timestamp, is_rx=message.is_rx)
         # Filtered frames count as received; error frames pass the filters.
         if message.is_error_frame:
-            self._health.hear(frame)
+            self._health.count_frame(frame)
             return frame
         self._health.received += 1
         if filtered or self._bus is None:
@@ -358,7 +358,7 @@ class CanLink:
         if isinstance(meaning, BusTrouble):
             self._health.report(meaning)
         elif meaning is Meaning.UNREADABLE:
-            self._health.add_unreadable(words_of(error))
+            self._health.add_unreadable(error_text(error))
             if is_foreign_datagram(error):
                 return
             self._unreadable_in_a_row += 1
@@ -394,13 +394,13 @@ class CanLink:
             self._waiting.append((frame, self.received_at))
 
     def _failure(self, doing: str, error: Exception, meaning: Meaning) -> BusError:
-        what = f"The adapter failed while {doing}: {words_of(error)}."
+        what = f"The adapter failed while {doing}: {error_text(error)}."
         if meaning is Meaning.BUS_OFF:
             self._health.state = ControllerState.BUS_OFF
             return bus_off_error(str(self), what)
         if meaning is Meaning.UNREADABLE:
             how_often = f"{self._unreadable_in_a_row} times in a row"
-            return unreadable_error(str(self), how_often, words_of(error))
+            return unreadable_error(str(self), how_often, error_text(error))
         return BusError(
             what,
             where=str(self),
@@ -411,7 +411,7 @@ class CanLink:
 
     def _blocked(self, error: Exception) -> TransmitBlockedError:
         return TransmitBlockedError(
-            f"The adapter took no frame for {SEND_LIMIT_S:g} s: {words_of(error)}.",
+            f"The adapter took no frame for {SEND_LIMIT_S:g} s: {error_text(error)}.",
             where=str(self),
             cause="no node on the bus acknowledges (device off, wrong bit rate, wiring, "
             "termination), or other traffic takes the whole bus",

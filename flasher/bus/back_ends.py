@@ -115,7 +115,7 @@ def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTroub
         return Meaning.BUS_OFF
     kind = _reported_trouble(chain, interface)
     if kind is not None:
-        return BusTrouble(frozenset({kind}), words_of(error))
+        return BusTrouble(frozenset({kind}), error_text(error))
     if interface in _LOSES_ITS_PLACE or any(isinstance(each, OSError) for each in chain):
         return Meaning.LOST
     is_own = isinstance(chain[-1], can.CanError)
@@ -140,7 +140,7 @@ def causes(error: BaseException) -> Iterator[BaseException]:
         found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
 
 
-def words_of(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Message of the back end without a full stop, or the type of the error if it is empty."""
     said: list[str] = []
     for each in causes(error):

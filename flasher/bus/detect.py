@@ -55,7 +55,7 @@ _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedAdapter:
     """Connected adapter, as reported by its back end."""
 
     interface: str
@@ -94,10 +94,10 @@ class Found:
 
 
 @dataclass
-class Detected:
+class DetectionResult:
     """Adapters found, and back ends without a result."""
 
-    found: list[Found] = field(default_factory=list)
+    found: list[DetectedAdapter] = field(default_factory=list)
     hung: list[str] = field(default_factory=list)
     """Did not answer in time."""
     failed: dict[str, str] = field(default_factory=dict)
@@ -136,12 +136,12 @@ class Detection:
     def __exit__(self, *_: object) -> None:
         self._end()
 
-    def collect(self, cancelled: Callable[[], bool] = lambda: False) -> Detected:
+    def collect(self, cancelled: Callable[[], bool] = lambda: False) -> DetectionResult:
         """Return the result; waits at most for the rest of the time, or until `cancelled` (checked
         five times a second).
         """
         self._cancelled = cancelled
-        detected = Detected()
+        detected = DetectionResult()
         if self._asks_kernel:
             detected.found += network_adapters()
         unanswered = set(self._names)
@@ -165,7 +165,7 @@ class Detection:
             start_new_session=True,  # Ctrl-C is for this process, which ends them
         )
 
-    def _gather(self, detected: Detected, unanswered: set[str]) -> bool:
+    def _gather(self, detected: DetectionResult, unanswered: set[str]) -> bool:
         """Collect the answers of all processes; True if one ended without answering."""
         crashed = False
         for names, process in self._processes:
@@ -200,7 +200,7 @@ class Detection:
                 process.stdout.close()
 
 
-def _take(said: str, detected: Detected, unanswered: set[str]) -> None:
+def _take(said: str, detected: DetectionResult, unanswered: set[str]) -> None:
     for line in said.splitlines():
         if not line.startswith(_MARK):
             continue
@@ -214,14 +214,16 @@ def _take(said: str, detected: Detected, unanswered: set[str]) -> None:
             elif answer["sees"] == _CANNOT_TELL:
                 detected.cannot_tell.append(name)
             for channel in answer["channels"]:
-                detected.found.append(Found(name, str(channel.pop("channel", "")), channel))
+                detected.found.append(
+                    DetectedAdapter(name, str(channel.pop("channel", "")), channel)
+                )
             unanswered.discard(name)
 
 
 # -- without another process -----------------------------------------------------------------------
 
 
-def network_adapters(sysfs: Path = SYSFS) -> Iterator[Found]:
+def network_adapters(sysfs: Path = SYSFS) -> Iterator[DetectedAdapter]:
     """Yield the CAN interfaces of Linux, up or down, with data of their USB device."""
     for folder in sorted(sysfs.glob("*")):
         if not getattr(look_up(folder.name, sysfs=sysfs), "is_can", False):
@@ -233,10 +235,12 @@ def network_adapters(sysfs: Path = SYSFS) -> Iterator[Found]:
             ":" in device.name and (device.parent / "idVendor").exists()
         )
         usb_path = device.name.partition(":")[0] if is_usb else ""
-        yield Found(SOCKETCAN, folder.name, _without_empty(serial_number=serial, usb_path=usb_path))
+        yield DetectedAdapter(
+            SOCKETCAN, folder.name, _without_empty(serial_number=serial, usb_path=usb_path)
+        )
 
 
-def serial_ports(interface: str) -> Iterator[Found]:
+def serial_ports(interface: str) -> Iterator[DetectedAdapter]:
     """Yield the serial ports on USB, each as a possible adapter of one of `SERIAL_PORTS`. Built-in
     ports (ttyS0, COM1) are skipped.
 
@@ -250,7 +254,7 @@ def serial_ports(interface: str) -> Iterator[Found]:
         details = _without_empty(
             description=description, serial_number=port.serial_number, usb_path=port.location
         )
-        yield Found(interface, port.device, details)
+        yield DetectedAdapter(interface, port.device, details)
 
 
 def _without_empty(**details: str | None) -> dict[str, str]:
@@ -267,7 +271,7 @@ def _text(path: Path) -> str:
 # -- the other process -----------------------------------------------------------------------------
 
 
-def say_detected(names: Sequence[str]) -> None:
+def print_detected(names: Sequence[str]) -> None:
     """Ask these interfaces and print their answers, one per line."""
     threads = [threading.Thread(target=_ask, args=(name,), daemon=True) for name in names]
     for thread in threads:
@@ -315,4 +319,4 @@ if __name__ == "__main__":
     watchdog = threading.Timer(_LIFE_S, os._exit, (1,))
     watchdog.daemon = True
     watchdog.start()
-    say_detected(sys.argv[1:])
+    print_detected(sys.argv[1:])

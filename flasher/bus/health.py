@@ -278,7 +278,7 @@ class HealthKeeper:
         self._rx_errors: int | None = None
         self._was_unacknowledged = False
 
-    def hear(self, frame: Frame) -> None:
+    def count_frame(self, frame: Frame) -> None:
         """Count a received frame or error frame."""
         if not frame.is_error:
             self.received += 1

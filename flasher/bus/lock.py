@@ -40,7 +40,7 @@ _PLACE: Final = ("channel", "host", "port", "index", "bus", "address", "serial",
 """Keywords of python-can's back ends that identify an adapter."""
 
 
-def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
+def acquire(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     """Lock the adapter that `config` (python-can's keywords) names; return the function that
     unlocks it, which may be called twice.
 
@@ -55,7 +55,7 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     try:
         folder = user_state_path("flasher", appauthor=False) / "locks"
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path = folder / f"{place_of(config)}.lock"
+        path = folder / f"{lock_name(config)}.lock"
         lock = FileLock(path, timeout=0, thread_local=False)
         lock.acquire()
     except Timeout:
@@ -78,16 +78,16 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     with contextlib.suppress(OSError):
         note_path.write_text(json.dumps(note))
 
-    def give_back() -> None:
+    def release() -> None:
         if lock.is_locked:
             with contextlib.suppress(OSError):
                 note_path.unlink()
             lock.release()
 
-    return give_back
+    return release
 
 
-def place_of(config: Mapping[str, Any]) -> str:
+def lock_name(config: Mapping[str, Any]) -> str:
     """Return the file name that identifies an adapter, however it is named. The folder may be
     shared with other computers.
     """

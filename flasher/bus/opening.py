@@ -8,7 +8,7 @@ import errno
 from collections.abc import Mapping
 from typing import Any, Final
 
-from flasher.bus.back_ends import causes, words_of
+from flasher.bus.back_ends import causes, error_text
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, bus_off_error
 from flasher.bus.inspect_interface import (
@@ -104,7 +104,7 @@ def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
         raise _no_interface(error) from error
     except (ValueError, TypeError, configparser.Error) as error:
         raise UsageError(
-            f"The adapter's configuration makes no sense: {printable(words_of(error))}.",
+            f"The adapter's configuration makes no sense: {printable(error_text(error))}.",
             remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
         ) from error
 
@@ -128,7 +128,7 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
         bus = can.Bus(**config, ignore_config=True)
     except Exception as error:
         raise BusError(
-            f"The adapter cannot be opened: {words_of(error)}.",
+            f"The adapter cannot be opened: {error_text(error)}.",
             where=f"interface {interface}, channel {channel}",
             cause=_opening_cause(interface, error),
             remedy=_opening_remedy(interface, channel, config.get("bitrate"), error),
@@ -192,7 +192,7 @@ def _no_interface(error: Exception) -> UsageError | BusError:
             f"--mock needs none. flasher adapters lists what is plugged in. Interfaces: {known}.",
             code=ErrorCode.NO_ADAPTER,
         )
-    return UsageError(f"{words_of(error)}.", remedy=f"python-can knows: {known}.")
+    return UsageError(f"{error_text(error)}.", remedy=f"python-can knows: {known}.")
 
 
 def _code(error: BaseException) -> int | None:

@@ -103,7 +103,7 @@ class SimulatedBus:
         """Time of a delivered frame without answer: devices are as exact as the wire, even if the
         clock woke late."""
         self.faults = AdapterFaults()
-        """Faults of the host's adapter; see `unplug`, `bus_off` and `nobody_acknowledges`."""
+        """Faults of the host's adapter; see `unplug`, `bus_off` and `is_unacknowledged`."""
 
     def unplug(self, back_after_s: float | None = None) -> None:
         """Unplug the host's adapter: its links raise BusError until it is back (`plug`, or
@@ -126,14 +126,14 @@ class SimulatedBus:
         self.faults.come_back(self.clock.now())
 
     @property
-    def nobody_acknowledges(self) -> bool:
+    def is_unacknowledged(self) -> bool:
         """True while the host's adapter is alone: its frames are never sent, its queue fills up,
         and it receives nothing.
         """
         return self.faults.is_alone
 
-    @nobody_acknowledges.setter
-    def nobody_acknowledges(self, alone: bool) -> None:
+    @is_unacknowledged.setter
+    def is_unacknowledged(self, alone: bool) -> None:
         self.faults.be_alone(self.clock.now(), alone=alone)
 
     def attach(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
@@ -317,7 +317,7 @@ class SimulatedLink:
                 raise TransmitBlockedError(
                     f"The simulated bus took no frame for {SEND_LIMIT_S:g} s.",
                     cause="no node on the bus acknowledges"
-                    if self._bus.nobody_acknowledges
+                    if self._bus.is_unacknowledged
                     else "other traffic takes the whole bus",
                 )
             self._bus.advance(give_up_at)
@@ -336,14 +336,14 @@ class SimulatedLink:
             self._bus.advance(deadline)
             self._check_plugged("receiving")
         frame = inbox.popleft()
-        self._health.hear(frame)
+        self._health.count_frame(frame)
         return frame
 
     def drain(self) -> int:
         """Discard received frames, but count the adapter's reports."""
         count = len(self._host.inbox)
         for frame in self._host.inbox:
-            self._health.hear(frame)
+            self._health.count_frame(frame)
         self._host.inbox.clear()
         return count
 

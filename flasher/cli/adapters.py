@@ -10,7 +10,14 @@ from typing import Final, Unpack
 import click
 
 from flasher.api import CallOptions, Device
-from flasher.bus.detect import SLOW, SOCKETCAN, Detected, Detection, Found, serial_ports
+from flasher.bus.detect import (
+    SLOW,
+    SOCKETCAN,
+    DetectedAdapter,
+    Detection,
+    DetectionResult,
+    serial_ports,
+)
 from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface, start_command
 from flasher.cli.framework import rebuild_command_line
 from flasher.cli.options import Bus
@@ -25,7 +32,7 @@ _NAMES: Final = ("device_name", "description")
 """Where back ends and serial ports say what an adapter is called."""
 
 
-def detected_adapters(*, on_network: bool = False) -> Detected:
+def detected_adapters(*, on_network: bool = False) -> DetectionResult:
     """What is plugged in; servers on the network only when they are asked for. Takes 5 s at the
     most. Raises InterruptedByUserError.
     """
@@ -33,7 +40,7 @@ def detected_adapters(*, on_network: bool = False) -> Detected:
         return detected_until(stopped, on_network=on_network)
 
 
-def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> Detected:
+def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> DetectionResult:
     """The same; `stopped` says when the user has enough."""
     asked = set(interface_names()) - (frozenset() if on_network else SLOW)
     with Detection(sorted(asked)) as detection:
@@ -43,7 +50,7 @@ def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> 
     return found
 
 
-def ports() -> list[Found] | None:
+def ports() -> list[DetectedAdapter] | None:
     """The serial ports, as slcan adapters, which they may be; None where pyserial is missing."""
     try:
         return list(serial_ports("slcan"))
@@ -51,13 +58,13 @@ def ports() -> list[Found] | None:
         return None
 
 
-def interface_of(found: Found) -> Interface | None:
+def interface_of(found: DetectedAdapter) -> Interface | None:
     """What the kernel says of a SocketCAN interface; None of any other adapter."""
     seen = read_interface(found.channel) if found.interface == SOCKETCAN else None
     return seen if isinstance(seen, Interface) else None
 
 
-def described(found: Found, dialect: Dialect) -> str:
+def described(found: DetectedAdapter, dialect: Dialect) -> str:
     """An adapter in words: its state where the kernel tells it, its name, its serial number."""
     words = []
     seen = interface_of(found)
@@ -94,13 +101,13 @@ def choose_adapter(bus: Bus, output: Output) -> Bus:
     return only(found[0], bus, output)
 
 
-def only(found: Found, bus: Bus, output: Output) -> Bus:
+def only(found: DetectedAdapter, bus: Bus, output: Output) -> Bus:
     """The bus with the only adapter found."""
     output.progress(f"no adapter is named: using the only one found, {printable(found.arguments)}")
     return replace(using(found, bus), found=found)
 
 
-def using(found: Found, bus: Bus) -> Bus:
+def using(found: DetectedAdapter, bus: Bus) -> Bus:
     """The bus with this adapter."""
     kwargs = tuple((key, str(value)) for key, value in found.bus_kwargs.items())
     return replace(
@@ -138,7 +145,7 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOp
     output.progress(f"the {node} is there")
 
 
-def _several_found(found: list[Found], dialect: Dialect) -> UsageError:
+def _several_found(found: list[DetectedAdapter], dialect: Dialect) -> UsageError:
     width = max(len(each.arguments) for each in found)
     listed = "".join(
         f"\n    {printable(each.arguments):<{width}}   {described(each, dialect)}".rstrip()

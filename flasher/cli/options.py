@@ -14,7 +14,7 @@ import click
 from flasher.api import Connection, as_dialect, connect, connect_mock
 from flasher.api import bit_rate as settle_bit_rate
 from flasher.bus.bit_rate import BitRate
-from flasher.bus.detect import Found
+from flasher.bus.detect import DetectedAdapter
 from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
@@ -198,7 +198,7 @@ class Bus:
     )] = ()  # fmt: skip
     settings: str | None = None
     """A file that may name the adapter, as --profile names one."""
-    found: Found | None = None
+    found: DetectedAdapter | None = None
     """The adapter, where nothing names one: the only one found (`flasher.cli.adapters`)."""
 
     @property

@@ -14,8 +14,8 @@ from typing import Any
 from flasher.bus.detect import (
     SERIAL_PORTS,
     SOCKETCAN,
+    DetectedAdapter,
     Detection,
-    Found,
     network_adapters,
     serial_ports,
 )
@@ -37,7 +37,9 @@ class Resolved:
     bus: Mapping[str, Any] | None
 
 
-def resolve(sockets: Sequence[SocketConfig], detected: Iterable[Found]) -> tuple[Resolved, ...]:
+def resolve(
+    sockets: Sequence[SocketConfig], detected: Iterable[DetectedAdapter]
+) -> tuple[Resolved, ...]:
     """Every socket with its adapter.
 
     Raises BusError when an adapter is not there, UsageError when two sockets come to the same one
@@ -60,7 +62,7 @@ def resolve(sockets: Sequence[SocketConfig], detected: Iterable[Found]) -> tuple
     return resolved
 
 
-def _resolve(socket: SocketConfig, detected: Sequence[Found]) -> Resolved:
+def _resolve(socket: SocketConfig, detected: Sequence[DetectedAdapter]) -> Resolved:
     if socket.mock is not None:
         return Resolved(socket, None)
     bus: dict[str, Any] = {**socket.bus, "interface": socket.interface}
@@ -142,13 +144,15 @@ def worker_setups(
 # -- what is plugged in ---------------------------------------------------------------------------
 
 
-def detect(sockets: Sequence[SocketConfig], *, network: Path = SYSFS) -> tuple[Found, ...]:
+def detect(
+    sockets: Sequence[SocketConfig], *, network: Path = SYSFS
+) -> tuple[DetectedAdapter, ...]:
     """The adapters for the interfaces of sockets that are found by serial number or USB path.
 
     Raises UsageError where a package is missing that finds them.
     """
     wanted = {s.interface for s in sockets if s.serial_number or s.usb_path}
-    found: list[Found] = []
+    found: list[DetectedAdapter] = []
     for interface in sorted(wanted & SERIAL_PORTS):
         try:
             found += serial_ports(interface)

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from flasher.bus import detect
-from flasher.bus.detect import Detection, Found, network_adapters, serial_ports
+from flasher.bus.detect import DetectedAdapter, Detection, network_adapters, serial_ports
 
 # Stands for the process that asks: the answer of each back end goes by its name.
 CHILD = """
@@ -41,7 +41,7 @@ def test_one_back_end_that_hangs_does_not_hide_the_others() -> None:
     with Detection(["hangs", "good"], command=COMMAND, limit_s=0.5) as detection:
         detected = detection.collect()
     assert time.perf_counter() - began < 5.0
-    assert detected.found == [Found("good", "ch0", {"serial": 7})]
+    assert detected.found == [DetectedAdapter("good", "ch0", {"serial": 7})]
     assert detected.hung == ["hangs"]
     assert detection._processes[0][1].returncode is not None
 
@@ -94,7 +94,7 @@ def test_the_real_process_answers_for_python_cans_back_ends(
 
     monkeypatch.setattr("can.detect_available_configs", answer)
     monkeypatch.setitem(can.interfaces.BACKENDS, "virtual2", ("no_such_module", "Bus"))
-    detect.say_detected(["kvaser", "vector", "slcan", "virtual2"])
+    detect.print_detected(["kvaser", "vector", "slcan", "virtual2"])
     answers = [json.loads(line.partition(": ")[2]) for line in capsys.readouterr().out.splitlines()]
     assert sorted(answers, key=lambda answer: str(answer["interface"])) == [
         {"interface": "kvaser", "channels": [{"channel": 0}], "sees": "", "error": ""},
@@ -125,7 +125,7 @@ def test_the_kernels_interfaces_are_found_up_or_down(
     monkeypatch.setattr(detect, "network_adapters", lambda sysfs=tmp_path: network_adapters(sysfs))
     with Detection(["socketcan", "slcan"], command=COMMAND) as detection:
         assert detection._processes == [], "a serial port is not opened to look"
-        assert detection.collect().found == [Found("socketcan", "can0")]
+        assert detection.collect().found == [DetectedAdapter("socketcan", "can0")]
 
 
 def test_a_serial_port_is_one_with_what_its_usb_device_says(

@@ -103,7 +103,7 @@ def keeper(*frames: Frame, sent: int = 0) -> HealthKeeper:
     kept = HealthKeeper(Layout.SOCKETCAN)
     kept.sent = sent
     for frame in frames:
-        kept.hear(frame)
+        kept.count_frame(frame)
     return kept
 
 
@@ -157,7 +157,7 @@ def test_the_state_follows_the_error_frames() -> None:
     restarted = error_frame(0x100)
     active_again = error_frame(0x204, "00 40 00 00 00 00 00 00")
     for frame in (PASSIVE, BUS_OFF, restarted, PASSIVE, active_again):
-        kept.hear(frame)
+        kept.count_frame(frame)
         states.append(wording(kept.state))
     assert states == [
         "error-passive", "bus-off", "error-active", "error-passive", "error-active"

@@ -28,24 +28,24 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def is_free(config: dict[str, Any]) -> bool:
     try:
-        lock.hold(config, "somebody else")()
+        lock.acquire(config, "somebody else")()
     except BusError:
         return False
     return True
 
 
 def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
-    give_back = lock.hold(CAN0, "flasher flash")
+    release = lock.acquire(CAN0, "flasher flash")
     with pytest.raises(BusError) as caught:
-        lock.hold(CAN0, "flasher read")
+        lock.acquire(CAN0, "flasher read")
     error = caught.value
     assert error.exit_code is ExitCode.BUS
     assert (
         f"socketcan can0 is in use by flasher flash (process {os.getpid()}, since 20" in error.what
     )
     assert "Wait until it has ended" in error.remedy
-    give_back()
-    give_back()
+    release()
+    release()
     assert is_free(CAN0)
 
 
@@ -87,18 +87,18 @@ def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
 def test_the_same_adapter_is_known_however_it_is_named(
     one: dict[str, Any], other: dict[str, Any], *, same: bool
 ) -> None:
-    give_back = lock.hold(one, "one")
+    release = lock.acquire(one, "one")
     assert is_free(other) is not same
-    give_back()
+    release()
 
 
 def test_who_only_listens_takes_a_serial_adapter_alone() -> None:
     """To open it a second time would end the upgrade that uses it."""
-    lock.hold(CAN0, None)
+    lock.acquire(CAN0, None)
     assert is_free(CAN0)
-    give_back = lock.hold(SLCAN, None)
+    release = lock.acquire(SLCAN, None)
     assert not is_free(SLCAN)
-    give_back()
+    release()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs links and SIGKILL")
@@ -106,9 +106,9 @@ def test_a_serial_port_is_the_same_by_its_link(tmp_path: Path) -> None:
     port, link = tmp_path / "ttyACM0", tmp_path / "by-id"
     port.touch()
     link.symlink_to(port)
-    give_back = lock.hold({"interface": "slcan", "channel": f"{link}@115200"}, "one")
+    release = lock.acquire({"interface": "slcan", "channel": f"{link}@115200"}, "one")
     assert not is_free({"interface": "slcan", "channel": str(port)})
-    give_back()
+    release()
 
 
 @pytest.mark.slow
@@ -130,12 +130,12 @@ def test_who_was_killed_holds_nothing() -> None:
 
 @pytest.mark.parametrize("told", ["", "[]", "{", '{"holder": 1}', "\x00\xff"])
 def test_what_stands_beside_the_lock_may_be_anything(state: Path, told: str) -> None:
-    give_back = lock.hold(CAN0, "one")
+    release = lock.acquire(CAN0, "one")
     (note,) = state.glob("flasher/locks/*.json")
     note.write_text(told)
     with pytest.raises(BusError, match="in use by another program"):
-        lock.hold(CAN0, "another")
-    give_back()
+        lock.acquire(CAN0, "another")
+    release()
 
 
 def test_a_state_folder_that_cannot_be_written_keeps_nobody_from_working(
@@ -143,7 +143,7 @@ def test_a_state_folder_that_cannot_be_written_keeps_nobody_from_working(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    lock.hold(CAN0, "flasher flash")()
+    lock.acquire(CAN0, "flasher flash")()
     assert "no lock for socketcan can0" in caplog.text
 
 

@@ -135,7 +135,7 @@ def test_a_controller_that_restarts_by_itself_takes_part_again() -> None:
 
 def test_without_acknowledgement_nothing_leaves_and_linux_reports_error_passive() -> None:
     world = World(Frame(0x725, b"x"))
-    world.bus.nobody_acknowledges = True
+    world.bus.is_unacknowledged = True
     world.link.send(FRAME)
     reports = [world.link.receive(1.0), world.link.receive(1.0)]
     assert [r and (r.can_id, r.data[1], r.data[6]) for r in reports] == [
@@ -153,7 +153,7 @@ def test_without_acknowledgement_nothing_leaves_and_linux_reports_error_passive(
 
 def test_the_queue_stays_full() -> None:
     world = World()
-    world.bus.nobody_acknowledges = True
+    world.bus.is_unacknowledged = True
     for _ in range(DEFAULT_QUEUE_FRAMES):
         world.link.send(FRAME)
     with pytest.raises(TransmitBlockedError) as caught:
@@ -165,18 +165,18 @@ def test_the_queue_stays_full() -> None:
 
 def test_a_link_that_never_sent_does_not_complain() -> None:
     world = World()
-    world.bus.nobody_acknowledges = True
+    world.bus.is_unacknowledged = True
     assert world.link.receive(1.0) is None
     assert world.link.health().error() is None
 
 
 def test_once_somebody_acknowledges_the_queue_leaves() -> None:
     world = World()
-    world.bus.nobody_acknowledges = True
+    world.bus.is_unacknowledged = True
     world.link.send(FRAME)
     world.link.receive(0.5)
-    assert world.bus.nobody_acknowledges
-    world.bus.nobody_acknowledges = False
+    assert world.bus.is_unacknowledged
+    world.bus.is_unacknowledged = False
     while world.link.receive(1.0):
         pass
     assert world.heard() == 1

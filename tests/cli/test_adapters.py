@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from flasher.api import Connection, connect_mock
-from flasher.bus.detect import Detected, Found
+from flasher.bus.detect import DetectedAdapter, DetectionResult
 from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.errors import ExitCode
 from tests.api.battery import Battery, wire_to
@@ -23,9 +23,9 @@ from tests.cli.conftest import SAMPLES, Flasher
 
 BMS = SAMPLES / "bms.hex"
 WMC = SAMPLES / "wmc.hex"
-CAN0 = Found("socketcan", "can0", {"serial_number": "0042", "usb_path": "1-1.4"})
-PCAN = Found("pcan", "PCAN_USBBUS1", {"device_name": "PCAN-USB"})
-IXXAT = Found("ixxat", "0", {"unique_hardware_id": "HW 12"})
+CAN0 = DetectedAdapter("socketcan", "can0", {"serial_number": "0042", "usb_path": "1-1.4"})
+PCAN = DetectedAdapter("pcan", "PCAN_USBBUS1", {"device_name": "PCAN-USB"})
+IXXAT = DetectedAdapter("ixxat", "0", {"unique_hardware_id": "HW 12"})
 UP = Interface(
     "can0", is_can=True, is_up=True, kind="can", bitrate_bps=250_000, state_name="ERROR-ACTIVE"
 )
@@ -35,14 +35,14 @@ UP = Interface(
 class Machine:
     """A computer: what is plugged in, and the bus behind each adapter that is opened."""
 
-    detected: Detected = field(default_factory=Detected)
-    ports: list[Found] | None = field(default_factory=list)
+    detected: DetectionResult = field(default_factory=DetectionResult)
+    ports: list[DetectedAdapter] | None = field(default_factory=list)
     interface: Interface | Unseen = UP
     wire: Connection = field(default_factory=lambda: wire_to(Battery()))
     opened: list[dict[str, Any]] = field(default_factory=list)
     asked: int = 0
 
-    def look(self, *, on_network: bool = False) -> Detected:
+    def look(self, *, on_network: bool = False) -> DetectionResult:
         self.asked += 1
         return self.detected
 
@@ -106,7 +106,7 @@ def test_an_interface_that_is_down_says_how_it_is_started(
 def test_serial_ports_are_apart_since_nobody_knows_what_is_behind_them(
     flasher: Flasher, machine: Machine
 ) -> None:
-    machine.ports = [Found("slcan", "/dev/ttyACM0", {"description": "CANable2 \x1b[2J"})]
+    machine.ports = [DetectedAdapter("slcan", "/dev/ttyACM0", {"description": "CANable2 \x1b[2J"})]
     run = flasher("adapters")
     assert "no adapter found" in run.out
     assert "-i slcan -c /dev/ttyACM0  CANable2 \\x1b[2J" in run.out
@@ -141,7 +141,7 @@ def test_what_cannot_be_seen_is_said_with_its_reason(
 def test_an_adapter_whose_channel_nobody_tells_is_listed_and_never_chosen(
     flasher: Flasher, machine: Machine
 ) -> None:
-    machine.detected.found = [Found("neovi", "", {"serial": "CY1234"})]
+    machine.detected.found = [DetectedAdapter("neovi", "", {"serial": "CY1234"})]
     assert "-i neovi -c CHANNEL --bus-kwargs serial=CY1234" in flasher("adapters").out
     assert flasher("info", "-t", "bms").code == ExitCode.BUS
     assert machine.opened == []
@@ -197,7 +197,7 @@ def test_of_several_none_is_chosen_and_all_are_listed_to_copy(
 
 
 def test_without_any_the_next_step_is_named(flasher: Flasher, machine: Machine) -> None:
-    machine.ports = [Found("slcan", "/dev/ttyACM0")]
+    machine.ports = [DetectedAdapter("slcan", "/dev/ttyACM0")]
     run = flasher("info", "-t", "bms", "--json")
     assert run.code == ExitCode.BUS
     assert "none was found" in run.document["error"]["what"]

@@ -14,7 +14,7 @@ import can
 import pytest
 
 from flasher.api import Connection
-from flasher.bus.detect import Detected, Found
+from flasher.bus.detect import DetectedAdapter, DetectionResult
 from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.simulated import SimulatedLink
 from flasher.cli.look import doctor
@@ -199,7 +199,7 @@ class Doctor:
 
     def __init__(self, flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> None:
         self._flasher = flasher
-        self.detected = Detected()
+        self.detected = DetectionResult()
         self.interface: Interface | Unseen = CAN0
         self.failure: Exception | None = None
         self.asked: list[str] = []
@@ -217,7 +217,7 @@ class Doctor:
         self.asked = list(names)
         yield self
 
-    def collect(self, cancelled: Callable[[], bool]) -> Detected:
+    def collect(self, cancelled: Callable[[], bool]) -> DetectionResult:
         if self.is_interrupted:
             signal.raise_signal(signal.SIGINT)
             assert cancelled()
@@ -244,7 +244,9 @@ ON_CAN0 = ("-i", "socketcan", "-c", "can0")
 
 
 def test_the_only_adapter_is_looked_at_where_none_is_named(examine: Doctor) -> None:
-    examine.detected = Detected([Found("pcan", "PCAN_USBBUS1", {"device": 5})], ["kvaser"], {})
+    examine.detected = DetectionResult(
+        [DetectedAdapter("pcan", "PCAN_USBBUS1", {"device": 5})], ["kvaser"], {}
+    )
     run = examine()
     assert run.code == ExitCode.OK
     assert "using the only one found, -i pcan -c PCAN_USBBUS1" in run.err
@@ -255,7 +257,9 @@ def test_the_only_adapter_is_looked_at_where_none_is_named(examine: Doctor) -> N
 
 
 def test_of_several_none_is_opened_and_how_to_choose_is_said(examine: Doctor) -> None:
-    examine.detected = Detected([Found("pcan", "PCAN_USBBUS1"), Found("kvaser", "0")])
+    examine.detected = DetectionResult(
+        [DetectedAdapter("pcan", "PCAN_USBBUS1"), DetectedAdapter("kvaser", "0")]
+    )
     run = examine()
     assert run.code == ExitCode.BUS
     severity, fix = one(run, "no adapter is chosen")
@@ -267,7 +271,7 @@ def test_of_several_none_is_opened_and_how_to_choose_is_said(examine: Doctor) ->
 
 
 def test_half_an_adapter_that_is_named_is_not_completed_by_a_guess(examine: Doctor) -> None:
-    examine.detected = Detected([Found("pcan", "PCAN_USBBUS1")])
+    examine.detected = DetectionResult([DetectedAdapter("pcan", "PCAN_USBBUS1")])
     assert one(examine("-c", "can0"), "no adapter is chosen")[0] == "problem"
     assert examine.opened == []
 

@@ -91,7 +91,7 @@ def bus_off_from_the_beginning(scene: Scene) -> Words:
 
 
 def alone(scene: Scene) -> Words:
-    scene.stage.bus.nobody_acknowledges = True
+    scene.stage.bus.is_unacknowledged = True
     return scene.flash()
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from flasher.bus.lock import hold
+from flasher.bus.lock import acquire
 from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 
@@ -16,7 +16,7 @@ IMAGE = str(SAMPLES / "bms.hex")
 
 @pytest.fixture(autouse=True)
 def somebody_else() -> Iterator[None]:
-    give_back = hold({"interface": "socketcan", "channel": "nocan7"}, "flasher flash")
+    give_back = acquire({"interface": "socketcan", "channel": "nocan7"}, "flasher flash")
     yield
     give_back()
 

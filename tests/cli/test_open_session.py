@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from flasher.bus.detect import Detected, Found
+from flasher.bus.detect import DetectedAdapter, DetectionResult
 from flasher.errors import ErrorCode, ExitCode
 from flasher.events import Phase
 from flasher.history import MOCK, Began, Ended, Flash, FlashHistory, Reached, left_open
@@ -203,7 +203,7 @@ def test_an_adapter_that_nobody_named_need_not_hear_a_device_that_was_left_there
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stage = put(left_in_session())
-    detected = Detected([Found("virtual", "x")])
+    detected = DetectionResult([DetectedAdapter("virtual", "x")])
     monkeypatch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: detected)
     assert flasher("flash", image, "-t", "bms").code == ExitCode.NO_ANSWER
     kept()

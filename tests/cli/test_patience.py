@@ -94,7 +94,7 @@ def test_a_device_without_power_on_a_bus_of_two_is_asked_for(
 ) -> None:
     def alone() -> None:
         stage.cut_power()
-        stage.bus.nobody_acknowledges = True
+        stage.bus.is_unacknowledged = True
 
     stage.at_packet[3] = alone
     run = flasher("flash", image, *BUS, "--timeout", "30")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.bus.detect import Detected
+from flasher.bus.detect import DetectionResult
 from flasher.bus.link import VirtualClock
 from tests.documents.blocks import LANGUAGES, ROOT, Block, blocks, pages
 from tests.documents.reader import PageReader, hold_options, is_told
@@ -27,7 +27,7 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
     """Do what a page says. Nothing waits for the device model."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("flasher.bus.link.PacedClock", lambda _speed: VirtualClock())
-        patch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: Detected())
+        patch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: DetectionResult())
         patch.setattr("can.util.load_file_config", lambda *_args: {})
         patch.setattr("can.util.load_environment_config", lambda *_args: {})
         # What it leaves for later pages it would find there.

@@ -17,12 +17,12 @@ AWAY_S = 0.3
 def without_power(stage: Stage, seconds: float) -> None:
     """The device is off for so long, and nobody else is there to acknowledge."""
     stage.cut_power()
-    stage.bus.nobody_acknowledges = True
+    stage.bus.is_unacknowledged = True
     back_at = stage.clock.now() + seconds
 
     def look(now: float) -> None:
         if now >= back_at and not stage.device.has_power:
-            stage.bus.nobody_acknowledges = False
+            stage.bus.is_unacknowledged = False
             stage.give_power()
 
     stage.clock.on_wait = look
@@ -65,7 +65,7 @@ def test_the_user_ends_the_wait_for_a_blocked_bus() -> None:
 
 def test_a_bus_that_takes_no_frame_ends_it_where_something_can_be_lost() -> None:
     stage = Stage()
-    stage.bus.nobody_acknowledges = True
+    stage.bus.is_unacknowledged = True
     stage.queue_frames = 1
     with pytest.raises(TransmitBlockedError):
         stage.flash()

@@ -21,7 +21,7 @@ pytest.importorskip("pty", reason="there are no pseudo terminals here")
 
 from flasher import api, events
 from flasher.bus.link import Link
-from flasher.bus.lock import hold
+from flasher.bus.lock import acquire
 from flasher.errors import BusError, ErrorCode, ExitCode, TransmitBlockedError
 from flasher.host.options import UpgradeOptions
 from flasher.host.session import Result
@@ -126,9 +126,9 @@ def test_an_adapter_that_is_back_under_another_name_is_locked_there(
         adapter.port.symlink_to(other.port.resolve())
         bus.link.reopen()
         with pytest.raises(BusError, match="in use by a program"):
-            hold({"channel": str(other.port), **options}, "another")
-        hold({"channel": str(first), **options}, "another")()
-    hold({"channel": str(other.port), **options}, "another")()
+            acquire({"channel": str(other.port), **options}, "another")
+        acquire({"channel": str(first), **options}, "another")()
+    acquire({"channel": str(other.port), **options}, "another")()
 
 
 def test_an_adapter_that_is_pulled_out_for_good_ends_it_with_the_state_of_the_device(

@@ -526,7 +526,7 @@ def test_a_device_that_is_always_just_in_time_is_upgraded_or_ends_with_the_deadl
 
 def test_nobody_who_acknowledges_is_told_from_a_device_that_is_silent() -> None:
     alone, silent = Stage(), Stage()
-    alone.bus.nobody_acknowledges = True
+    alone.bus.is_unacknowledged = True
     silent.cut_power()
     silent.bus.attach(Speaker(Frame(0x100, b"\1"), every_s=0.1))
     with pytest.raises(BusError, match="No node on the bus acknowledges"):

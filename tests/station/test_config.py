@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.bus.detect import Found
+from flasher.bus.detect import DetectedAdapter
 from flasher.errors import BusError, UsageError
 from flasher.station.adapters import detect, resolve
 from flasher.station.config import (
@@ -45,11 +45,11 @@ name = "D"
 mock = { bad = 0.1, slow = 0.2, dead = 0.05, seed = 7 }
 """
 PLUGGED = (
-    Found("slcan", "/dev/ttyACM3", {"serial_number": "B7", "usb_path": "1-1.1"}),
-    Found("slcan", "/dev/ttyACM0", {"serial_number": "A1", "usb_path": "1-1.2"}),
-    Found("socketcan", "can1", {"usb_path": "1-1.4"}),
-    Found("kvaser", "0", {"serial": 77}),
-    Found("kvaser", "1", {"serial": 77}),
+    DetectedAdapter("slcan", "/dev/ttyACM3", {"serial_number": "B7", "usb_path": "1-1.1"}),
+    DetectedAdapter("slcan", "/dev/ttyACM0", {"serial_number": "A1", "usb_path": "1-1.2"}),
+    DetectedAdapter("socketcan", "can1", {"usb_path": "1-1.4"}),
+    DetectedAdapter("kvaser", "0", {"serial": 77}),
+    DetectedAdapter("kvaser", "1", {"serial": 77}),
 )
 
 
@@ -178,8 +178,8 @@ def test_the_system_s_can_interfaces_are_found_with_their_usb_device(tmp_path: P
     (network / "can1" / "device").symlink_to(device / "1-1.4:1.0")
     found = detect([socket(interface="socketcan", serial_number="x")], network=network)
     assert found == (
-        Found("socketcan", "can1", {"serial_number": "004500", "usb_path": "1-1.4"}),
-        Found("socketcan", "vcan0"),
+        DetectedAdapter("socketcan", "can1", {"serial_number": "004500", "usb_path": "1-1.4"}),
+        DetectedAdapter("socketcan", "vcan0"),
     )
     assert detect([socket(interface="socketcan", channel="can1")], network=network) == ()
 

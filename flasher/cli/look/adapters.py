@@ -7,7 +7,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from flasher.bus.detect import BUILT_IN, SERIAL_PORTS, SLOW, SOCKETCAN, Detected, Found
+from flasher.bus.detect import (
+    BUILT_IN,
+    SERIAL_PORTS,
+    SLOW,
+    SOCKETCAN,
+    DetectedAdapter,
+    DetectionResult,
+)
 from flasher.cli.adapters import described, detected_adapters, interface_of, ports
 from flasher.cli.framework import command, option
 from flasher.cli.output import Output
@@ -108,11 +115,11 @@ def adapters(output: Output, *, network: bool) -> int:
     )
 
 
-def _rows(found: Iterable[Found]) -> list[tuple[str, str]]:
+def _rows(found: Iterable[DetectedAdapter]) -> list[tuple[str, str]]:
     return [(printable(each.arguments), described(each, WELLING)) for each in found]
 
 
-def _document(found: Found) -> FoundAdapter:
+def _document(found: DetectedAdapter) -> FoundAdapter:
     seen = interface_of(found)
     return FoundAdapter(
         interface=found.interface,
@@ -129,7 +136,7 @@ def _document(found: Found) -> FoundAdapter:
 # -- what cannot be seen ---------------------------------------------------------------------------
 
 
-def _unseen(detected: Detected, *, on_network: bool, lists_ports: bool) -> Iterable[NotSeen]:
+def _unseen(detected: DetectionResult, *, on_network: bool, lists_ports: bool) -> Iterable[NotSeen]:
     """The back ends of which nothing is known, each with the reason."""
     from flasher.bus.opening import needed_extra  # noqa: PLC0415  loads python-can
 

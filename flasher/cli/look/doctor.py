@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from flasher import api
-from flasher.bus.detect import SLOW, Detected, Detection
+from flasher.bus.detect import SLOW, Detection, DetectionResult
 from flasher.bus.health import ControllerState, HealthKeeper
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
@@ -191,7 +191,7 @@ class Examination:
         self._output = output
         self.dialect = bus.dialect
         self.bitrate_bps = self.dialect.bitrate_bps
-        self.detected = Detected()
+        self.detected = DetectionResult()
         self.listened: Listened | None = None
         self.findings: list[Finding] = []
         """In the order in which they are told."""

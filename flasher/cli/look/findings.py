@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from flasher.bus.detect import Detected
+from flasher.bus.detect import DetectionResult
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, LinkHealth
 from flasher.bus.inspect_interface import (
@@ -120,7 +120,7 @@ def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
 # -- adapters and interfaces -----------------------------------------------------------------------
 
 
-def adapter(detected: Detected) -> Iterator[Finding]:
+def adapter(detected: DetectionResult) -> Iterator[Finding]:
     """The adapters that python-can sees, and the back ends that gave no answer."""
     for found in detected.found[:_SHOWN_AT_MOST]:
         details = " ".join(f"{key}={value}" for key, value in found.details.items())
@@ -153,7 +153,7 @@ def opening(error: BusError) -> Finding:
     return _problem("adapter", what, (printable(error.remedy),))
 
 
-def unchosen(detected: Detected) -> Finding:
+def unchosen(detected: DetectionResult) -> Finding:
     """No adapter was named, on the command line or elsewhere: how to choose one."""
     ways = [f"flasher doctor {printable(each.arguments)}" for each in detected.found]
     return _problem(

@@ -185,8 +185,8 @@ class Player:
 
     def _look_who_is_there(self) -> None:
         is_alone = not self.plan.world.others and not any(unit.has_power for unit in self.units)
-        if is_alone != self.bus.nobody_acknowledges:
-            self.bus.nobody_acknowledges = is_alone
+        if is_alone != self.bus.is_unacknowledged:
+            self.bus.is_unacknowledged = is_alone
 
     def _expect(self, clause: plans.Clause) -> None:
         when = clause.when
@@ -418,7 +418,7 @@ class Player:
         self._waiting.clear()
         self.bus.timers.clear()
         self.bus.faults_of_frames.clear()
-        self.bus.nobody_acknowledges = False
+        self.bus.is_unacknowledged = False
         self.bus.plug()
         for unit in self.units:
             unit.hang(-inf)
