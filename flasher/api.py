@@ -488,7 +488,7 @@ class Device:
         ).checked()
         if in_session:
             job = job.in_session()
-        return _good(job.run(self, **watch))
+        return _check_result(job.run(self, **watch))
 
     def _steps(self, watch: CallOptions) -> Procedures:
         link, clock, rate = self.connection.link, self.connection.clock, self.connection.bit_rate
@@ -580,10 +580,10 @@ class AsyncDevice:
 
         watch = {**self._watch, **kwargs}
         loop = asyncio.get_running_loop()
-        hand = _Hand(loop, watch.get("on_event"), watch.get("cancelled"))
-        kwargs["cancelled"] = hand.is_cancelled
-        if hand.on_event is not None:
-            kwargs["on_event"] = hand.over
+        bridge = _LoopBridge(loop, watch.get("on_event"), watch.get("cancelled"))
+        kwargs["cancelled"] = bridge.is_cancelled
+        if bridge.on_event is not None:
+            kwargs["on_event"] = bridge.handle_in_loop
         call = partial(copy_context().run, method, self._device, *args, **kwargs)
         # Its own thread, because the loop has few and a call may take minutes. Not a task, because
         # the end of the loop would cancel it before the call has ended.
@@ -594,14 +594,14 @@ class AsyncDevice:
             try:
                 await asyncio.wait([work])
             except asyncio.CancelledError:
-                hand.task_is_cancelled = True
-        if hand.task_is_cancelled:
+                bridge.task_is_cancelled = True
+        if bridge.task_is_cancelled:
             raise asyncio.CancelledError from work.exception()
         return work.result()
 
 
 @dataclass
-class _Hand:
+class _LoopBridge:
     """Connects a call in a thread with the event loop that awaits it."""
 
     loop: AbstractEventLoop
@@ -616,7 +616,7 @@ class _Hand:
             return True
         return self.cancelled is not None and self.cancelled()
 
-    def over(self, event: object) -> None:
+    def handle_in_loop(self, event: object) -> None:
         """Handle an event in the loop, and wait for that in the thread while the loop exists.
         Raises exceptions of the handler.
         """
@@ -720,7 +720,7 @@ def prepare(
             goes_on_unchecked=at_power_up,
         )
     release = identity.release
-    plan = plan_for(release_checked(loaded, release), profile, bitrate_bps)
+    plan = plan_for(with_release(loaded, release), profile, bitrate_bps)
     chosen = options or profile.upgrade_options(allow_boot_name=waivers.BOOT_NAME in names or None)
     if chosen.minimum_boot_version is None and release and waivers.BOOT_VERSION not in names:
         chosen = replace(chosen, minimum_boot_version=release.minimum_boot_version)
@@ -758,10 +758,10 @@ def flash(
     ).checked()
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
     with opened as connection:
-        return _good(job.run(connection.device(profile=profile), on_event=on_event))
+        return _check_result(job.run(connection.device(profile=profile), on_event=on_event))
 
 
-def _good(result: Result) -> Result:
+def _check_result(result: Result) -> Result:
     """Return a good result; raise the error of any other."""
     error = result.error()
     if error is not None:
@@ -769,7 +769,7 @@ def _good(result: Result) -> Result:
     return result
 
 
-def release_checked(image: Image, release: Release | None) -> Image:
+def with_release(image: Image, release: Release | None) -> Image:
     """Return the image, with the version of its manifest if it names none itself.
 
     Raises ImageError if its bytes are not those of the manifest.

@@ -54,7 +54,7 @@ def drive(
     late_s = 0.0
     """How late the last wait ended, plus the time of callbacks before it."""
     while True:
-        received_until = _hear(came, engine, link, clock, taps)
+        received_until = _receive_waiting(came, engine, link, clock, taps)
         sending_s = 0.0
         if cancelled is not None and not cancel_seen and cancelled():
             cancel_seen = True
@@ -87,7 +87,7 @@ def drive(
         late_s = rests_at - now + max(0.0, clock.now() - max(until, rests_at))
 
 
-def _hear(
+def _receive_waiting(
     frame: Frame | None, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
 ) -> float:
     """Pass on a frame and all that wait after it, so that the next message sent does not look like

@@ -185,15 +185,15 @@ class Fault:
     what: str
     remedy: str = ""
     alone: str = ""
-    """Message with its place, if it is the only fault; empty: as `said`."""
+    """Message with its place, if it is the only fault; empty: as `sentence`."""
 
     @property
-    def said(self) -> str:
+    def sentence(self) -> str:
         """Message with its place."""
         return self.what if self.what.startswith(self.place) else f"{self.place}: {self.what}"
 
     def __str__(self) -> str:
-        return f"{self.said} {self.remedy}".rstrip()
+        return f"{self.sentence} {self.remedy}".rstrip()
 
 
 class FlasherError(Exception):

@@ -497,13 +497,13 @@ class Procedures:
                 session.link_back(self.clock.now())
         except (BusError, InterruptedByUserError) as error:
             # The adapter does not know the session.
-            error.where = f"{session.standing}; {error.where}".removesuffix("; ")
+            error.where = f"{session.progress}; {error.where}".removesuffix("; ")
             _add_device_state(error, session)
             raise
         except KeyboardInterrupt as interrupt:
             interrupted = InterruptedByUserError(
                 "Interrupted at once.",
-                where=session.standing,
+                where=session.progress,
                 cause="it may have ended in the middle of a message",
                 remedy=AGAIN,
             )

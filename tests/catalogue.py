@@ -21,7 +21,7 @@ from flasher.host.items import meaningful_fields
 from flasher.host.outcome import (
     _EXPLANATIONS,
     _NO_SESSION_EITHER,
-    _TWO_TOLD_TO_UPDATE,
+    _TWO_PERHAPS_ERASED,
     AGAIN,
     DeviceLeft,
     _late,
@@ -58,7 +58,7 @@ def sentences() -> Iterator[str]:
     explained = [
         *_EXPLANATIONS.values(),
         _NO_SESSION_EITHER,
-        _TWO_TOLD_TO_UPDATE,
+        _TWO_PERHAPS_ERASED,
         *itertools.starmap(_late, itertools.product(Phase, DeviceLeft)),
     ]
     for each in explained:

@@ -179,7 +179,7 @@ class DuplicateDetector:
         """The last reset was confirmed while a bootloader announced itself."""
 
         # The upgrade.
-        self._was_told_to_update = False
+        self._update_was_sent = False
         self._requested_at = inf
         self._left_at = -inf
         self._lost_by = ""
@@ -226,7 +226,7 @@ class DuplicateDetector:
             for each in self._packets.values():
                 each.begin()
             self._packet = _Packet()
-            self._was_told_to_update = True
+            self._update_was_sent = True
             self._lost_by, self._requested_at = "", inf
             self._is_complete = self._has_ack = False
         elif command is Command.PACKET:
@@ -347,7 +347,7 @@ class DuplicateDetector:
 
     def _take_feedback(self, answer_id: int, now: float) -> None:
         is_odd = self._feedbacks.is_odd()
-        if self._was_told_to_update:
+        if self._update_was_sent:
             self._confirmed.note_feedback()
         else:
             self.is_beside = self.is_beside or self.announces(answer_id, now)
@@ -388,7 +388,7 @@ class DuplicateDetector:
             return
         if isinstance(row, messages.GeneralFeedbackMessage):
             self._take_feedback(message.can_id, now)
-        if not self._was_told_to_update:
+        if not self._update_was_sent:
             return
         if self._is_complete and isinstance(row, _OF_A_TRANSFER):
             self._see_two(text("one device continued a transfer that another one had completed"))

@@ -40,7 +40,7 @@ class IdentifyStage:
         self._queries: list[Query] = []
         self.phase = Phase.LISTEN
         """Current phase."""
-        self.heard: Message | None = None
+        self.announcement: Message | None = None
         """Boot version announced by the device; None without one."""
         self.two_devices = ""
         """Evidence of a second device; may be empty."""
@@ -65,23 +65,23 @@ class IdentifyStage:
         """Listen and query; the result is this object."""
         item = self._version_item
         run.listen_always(self._answer_id, *(() if item is None else (item.can_id,)))
-        run.tell(PhaseEntered(Phase.LISTEN, 1))
+        run.emit(PhaseEntered(Phase.LISTEN, 1))
         yield from self._listen(run, run.now + LISTEN_FIRST_S)
         if self.cancelled:
             return self
         self.phase = Phase.IDENTIFY
-        if self._requests and self.heard is None:
-            run.tell(PhaseEntered(Phase.IDENTIFY, 1))
+        if self._requests and self.announcement is None:
+            run.emit(PhaseEntered(Phase.IDENTIFY, 1))
             asking = ask_all(run, self._while_silent(), self._queries, stop_at_silence=True)
             yield from filtered(asking, self._look)
-            if not self.cancelled and self.heard is None:
+            if not self.cancelled and self.announcement is None:
                 yield from filtered(count_answers(run, self._queries), self._look)
         self.two_devices = run.duplicates.evidence
         return self
 
     def _while_silent(self) -> Iterator[Request]:
         for request in self._requests:
-            if self.heard is None:
+            if self.announcement is None:
                 yield request
 
     def _listen(self, run: Runner[Any], until: float) -> Stage[None]:
@@ -94,7 +94,7 @@ class IdentifyStage:
         if not isinstance(came, Message):
             return came
         if came.can_id == self._answer_id and isinstance(decode(came), BootVersion):
-            self.heard = came
+            self.announcement = came
             return Signal.CANCEL
         return came
 

@@ -235,7 +235,7 @@ def judge_device(
     answer.
     """
     if seen.version is None:
-        yield _untold(identity, target)
+        yield _versions_unknown(identity, target)
     else:
         yield _hardware(identity, seen.hardware_version)
         yield from _versions(image, identity, seen.firmware_version or "")
@@ -243,7 +243,7 @@ def judge_device(
         yield from _state(identity, seen.running)
 
 
-def _untold(identity: Identity, target: Target) -> CheckResult:
+def _versions_unknown(identity: Identity, target: Target) -> CheckResult:
     """Result when the application does not answer, or has no query for its versions."""
     release = identity.release
     hardware = release is not None and bool(release.hardware_versions)

@@ -64,7 +64,7 @@ class Statistics:
     """From request transfer to the ACK of the last packet, in the last attempt that got so far."""
 
 
-def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
+def describe_progress(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
     """Describe the progress of an upgrade."""
     where = text(wording(phase))
     if packet:
@@ -125,7 +125,9 @@ class Outcome:
     @property
     def where(self) -> str:
         """Phase, packet and attempt in words."""
-        return standing(self.phase, self.packet, self.total_packets, self.statistics.attempts)
+        return describe_progress(
+            self.phase, self.packet, self.total_packets, self.statistics.attempts
+        )
 
     @property
     def nothing_to_do(self) -> bool:
@@ -142,7 +144,7 @@ class Outcome:
         elif self.ending is Ending.NO_BOOT_VERSION and self.sent_into_silence:
             explained = _NO_SESSION_EITHER
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
-            explained = _TWO_TOLD_TO_UPDATE
+            explained = _TWO_PERHAPS_ERASED
         kind, cause, remedy, code = explained
         node, ending = self.target.node.name, text(wording(self.ending))
         what = text("{node}: {ending}.", node=node, ending=ending)
@@ -344,7 +346,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
 """For a device that did not answer the update command into its silence either (R26)."""
 
 
-_TWO_TOLD_TO_UPDATE: Final = _Explanation(
+_TWO_PERHAPS_ERASED: Final = _Explanation(
     WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
 )
 

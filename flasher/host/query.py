@@ -146,17 +146,17 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
                 run.send(query.frames)
                 if query.tries > 1 and not query.quiet:
                     why = Reason.QUERY_UNANSWERED.value
-                    run.tell(events.MessageRepeated(title, why, query.tries))
+                    run.emit(events.MessageRepeated(title, why, query.tries))
             case Signal.LEFT:
                 _copy_left(run, query)
             case Message():
                 _take(run, query, came)
             case Damage() if came.can_id == query.answer_item.can_id and not query.quiet:
-                run.tell_damage(came)
+                run.emit_damage(came)
         if not query.is_settled:
             came = yield min(query.ends_at, query.repeat_at)
     if query.answer is None and not query.cancelled and not query.quiet:
-        run.tell(events.QueryUnanswered(title, query.tries))
+        run.emit(events.QueryUnanswered(title, query.tries))
     yield from run.finish_message()
     return query
 
@@ -191,7 +191,7 @@ def _take(run: Runner[Any], query: Query, message: Message) -> None:
     query.answers += 1
     if query.answers == 1 and query.answer is not None and not query.quiet:
         title = query.request.item.title
-        run.tell(events.QueryAnswered(title, query.answer, query.tries))
+        run.emit(events.QueryAnswered(title, query.answer, query.tries))
     query.repeat_at = inf
     run.tx.drop_unstarted()
     query.is_settled = run.tx.idle and query.answers >= query.copies_left
@@ -224,19 +224,19 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
     """
     if not any(query.answers for query in queries):
         return
-    if (yield from run.listen_on()):
+    if (yield from run.await_second_device()):
         return
     for query in queries:
         if query.answer_item in run.duplicates.doubts:
             yield from ask(run, Query(query.request, quiet=True))
-            if (yield from run.listen_on()):
+            if (yield from run.await_second_device()):
                 return
 
 
 def report_two_devices(run: Runner[Any]) -> None:
     """Report a second device, if detected."""
     if run.duplicates.evidence:
-        run.tell(events.TwoDevicesSeen(run.duplicates.evidence))
+        run.emit(events.TwoDevicesSeen(run.duplicates.evidence))
 
 
 class Queries(Runner[None]):

@@ -118,15 +118,15 @@ class Runner(Generic[T]):
         """Send a message; `Signal.LEFT` follows when it was sent (`tx.left_at`, `tx.left_tag`)."""
         self.tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=tag)
 
-    def tell(self, event: object) -> None:
+    def emit(self, event: object) -> None:
         """Report an event."""
         self._events.append(event)
 
-    def tell_damage(self, damage: Damage) -> None:
+    def emit_damage(self, damage: Damage) -> None:
         """Report bytes that are not a message."""
         self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
 
-    def listen_on(self) -> Stage[bool]:
+    def await_second_device(self) -> Stage[bool]:
         """Wait for late messages of a second device; return True if cancelled."""
         until = self.now + SECOND_DEVICE_WAIT_S
         came: StageInput = Signal.TIME

@@ -143,7 +143,7 @@ class UpgradeSession(Runner[Result]):
         """Current level of verification; None during the upgrade."""
 
     @property
-    def standing(self) -> str:
+    def progress(self) -> str:
         """Describe the progress."""
         if self._checking is Level.NONE:
             return "listening for a second device"
@@ -151,7 +151,7 @@ class UpgradeSession(Runner[Result]):
             return f"verifying by {self._checking.value}"
         if self._identify is not None:
             return wording(self._identify.phase)
-        return self._upgrade.standing
+        return self._upgrade.progress
 
     @property
     def device_left(self) -> DeviceLeft:
@@ -212,7 +212,7 @@ class UpgradeSession(Runner[Result]):
             if refused is not None:
                 return refused
             previous = asked.seen.firmware_version
-            self._upgrade.heard = asked.heard
+            self._upgrade.announcement = asked.announcement
             self._identify = None
         self.limit_at = inf  # the upgrade observes its deadline itself
         outcome = yield from self._upgrade.stage(self.deadline_at)
@@ -245,7 +245,7 @@ class UpgradeSession(Runner[Result]):
             self._upgrade.in_session = False
         if self._identity is None:
             return None
-        return self._judge_device(self._identity, asked.seen, is_silent=asked.heard is None)
+        return self._judge_device(self._identity, asked.seen, is_silent=asked.announcement is None)
 
     def _judge_device(
         self, identity: Identity, seen: DeviceAnswers, *, is_silent: bool = False
@@ -269,7 +269,7 @@ class UpgradeSession(Runner[Result]):
         """Report all findings; a refusing one ends the session."""
         refused = None
         for finding in findings:
-            self.tell(finding.event)
+            self.emit(finding.event)
             if finding.ending is not None and refused is None:
                 refused = self._end_early(finding.ending, finding.detail, finding.waiver)
         return refused
@@ -288,7 +288,7 @@ class UpgradeSession(Runner[Result]):
         level, self._checking = self._level, Level.NONE
         self.listen_always(self._plan.target.answer_id)
         with contextlib.suppress(SecondToolSeen):  # the device has the image anyway
-            yield from self.listen_on()
+            yield from self.await_second_device()
         if self.duplicates.evidence:
             return Verification(level, Verdict.TWO_DEVICES, None, self.duplicates.evidence)
         found = NOT_ASKED
@@ -300,7 +300,7 @@ class UpgradeSession(Runner[Result]):
 
     def _checked(self, level: Level, running_version: str | None = None) -> Stage[Verification]:
         self._checking = level
-        self.tell(events.VerificationStarted(level.value))
+        self.emit(events.VerificationStarted(level.value))
         try:
             if level is Level.VERSION:
                 found = yield from check_version(self, self._plan, self._options)
@@ -323,7 +323,7 @@ class UpgradeSession(Runner[Result]):
             self._upgrade.in_session = False  # a bootloader sends only to the tool
         foreign = self._guard.see(frame, self.now)
         for event in self._guard.take_events():
-            self.tell(event)
+            self.emit(event)
         if foreign is None:
             return frame.is_echo
         has_its_program = self._is_upgrading and not self._upgrade.has_begun_to_erase
@@ -336,5 +336,5 @@ class UpgradeSession(Runner[Result]):
             self._foreign_queries.add(foreign.query)
             item = BY_KEY.get((self._plan.target.request_id, foreign.query))
             title = f"query {foreign.query:04X}" if item is None else item.title
-            self.tell(events.ForeignQuery(title))
+            self.emit(events.ForeignQuery(title))
         return True

@@ -23,7 +23,7 @@ from flasher.host.options import (
     firmware_version,
     overall_timeout_s,
 )
-from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
+from flasher.host.outcome import DeviceLeft, Outcome, Statistics, describe_progress
 from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
 from flasher.image.plan import Plan
@@ -128,7 +128,7 @@ class _Attempt:
 
 
 class UpgradeStage:
-    """One upgrade of one device. Begins with a reset, or, if the device was `heard` announcing its
+    """One upgrade of one device. Begins with a reset, or, if the device was `announcement` announcing its
     boot version, with the answer to that.
     """
 
@@ -147,7 +147,7 @@ class UpgradeStage:
             for row in TABLE.values()
             for move in row.values()
         }
-        self.heard: Message | None = None
+        self.announcement: Message | None = None
         """Boot version received before the beginning."""
         self.in_session = options.in_session
         """An earlier upgrade may have left the device in its session (R26): no application was
@@ -197,9 +197,9 @@ class UpgradeStage:
     # -- progress --------------------------------------------------------------------------------
 
     @property
-    def standing(self) -> str:
+    def describe_progress(self) -> str:
         """Describe phase, packet and attempt."""
-        return standing(self._phase, self._packet, self._plan.total_packets, self._attempt)
+        return describe_progress(self._phase, self._packet, self._plan.total_packets, self._attempt)
 
     @property
     def _duplicates(self) -> DuplicateDetector:
@@ -214,7 +214,7 @@ class UpgradeStage:
         return self._erasures > 0
 
     @property
-    def _was_told_to_update(self) -> bool:
+    def _update_was_sent(self) -> bool:
         """True if an update command was sent: the device may have erased its application."""
         return self._update_left_at > -inf
 
@@ -222,7 +222,7 @@ class UpgradeStage:
     def has_begun_to_erase(self) -> bool:
         """True once an update command is being sent or was sent."""
         is_leaving = self.state is UpgradeState.AWAITING_REQUEST and self._tx.begun
-        return self._was_told_to_update or is_leaving
+        return self._update_was_sent or is_leaving
 
     @property
     def device_left(self) -> DeviceLeft:
@@ -231,7 +231,7 @@ class UpgradeStage:
             return DeviceLeft.UNKNOWN
         if self._erased:
             return DeviceLeft.NO_APPLICATION
-        return DeviceLeft.PERHAPS_ERASED if self._was_told_to_update else DeviceLeft.UNTOUCHED
+        return DeviceLeft.PERHAPS_ERASED if self._update_was_sent else DeviceLeft.UNTOUCHED
 
     @property
     def may_begin_again(self) -> bool:
@@ -274,7 +274,7 @@ class UpgradeStage:
     def _has_begun(self) -> bool:
         """True if the device received an update command, and not only into its silence."""
         was_heard = self._last_boot is not None or self._erased
-        return was_heard and self._was_told_to_update
+        return was_heard and self._update_was_sent
 
     @property
     def _boot_timeout_s(self) -> float:
@@ -299,16 +299,16 @@ class UpgradeStage:
         self._deadline_at = deadline_at
         self._run.listen_always(self._plan.target.answer_id)
         self._asks_for_power = self._options.at_power_up and not self.in_session
-        is_awaited = self._asks_for_power or self.heard is not None
+        is_awaited = self._asks_for_power or self.announcement is not None
         self.state = UpgradeState.AWAITING_BOOT if is_awaited else UpgradeState.RESETTING
         self._phase = _PHASES[self.state]
-        self._run.tell(events.PhaseEntered(self._phase, self._attempt))
+        self._run.emit(events.PhaseEntered(self._phase, self._attempt))
         if self.state is UpgradeState.RESETTING:
             self._send_reset()
         else:
             self._wait_for_boot()
-        if self.heard is not None:
-            self._take(self.heard)
+        if self.announcement is not None:
+            self._take(self.announcement)
         if self.state is UpgradeState.WATCHING and not self._options.at_power_up:
             # A bootloader ignores the reset (R18), but another device's application answers it.
             self._send_reset()
@@ -346,7 +346,7 @@ class UpgradeStage:
             case Signal.CANCEL:
                 self._dispatch(UpgradeEvent.CANCEL)
             case Damage():
-                self._run.tell_damage(came)
+                self._run.emit_damage(came)
             case Message():
                 self._message(came)
 
@@ -393,7 +393,7 @@ class UpgradeStage:
         phase = _PHASES.get(state, self._phase)
         if phase is not self._phase:
             self._phase = phase
-            self._run.tell(events.PhaseEntered(phase, self._attempt))
+            self._run.emit(events.PhaseEntered(phase, self._attempt))
 
     # -- what is sent, and the timers that start when it has left ---------------------------------
 
@@ -488,7 +488,7 @@ class UpgradeStage:
                 what += f": {printable(name)} {printable(version)}"
             case Ack(number) | Nak(number):
                 what += f": {type(row).__name__.upper()} {number}"
-        self._run.tell(events.Reported(what))
+        self._run.emit(events.Reported(what))
 
     def _fail(self, ending: Ending, row: ReceivedContent, reason: Reason) -> None:
         """Begin another attempt, or end if none is left."""
@@ -528,11 +528,11 @@ class UpgradeStage:
         self._at = _Attempt()
         self._attempt += 1
         left_s = self._deadline_at - self._run.now if self.goes_on else 0.0
-        self._run.tell(events.AttemptStarted(self._attempt, reason.value, left_s))
+        self._run.emit(events.AttemptStarted(self._attempt, reason.value, left_s))
 
     def _repeated(self, what: str, reason: Reason, tries: int) -> None:
         self._repetitions += 1
-        self._run.tell(events.MessageRepeated(what, reason.value, tries))
+        self._run.emit(events.MessageRepeated(what, reason.value, tries))
 
     def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
         """Handle a device that lost the transfer."""
@@ -556,9 +556,9 @@ class UpgradeStage:
         self._timer_at = max(self._run.now, self._tx.left_at) + wait_s
         is_silent = self._silence_was_answered and self._heard_at < self._update_left_at
         if is_silent and self.goes_on:
-            self._run.tell(events.PowerCycleAwaited(self._deadline_at - self._run.now))
-        elif self._asks_for_power and self.heard is None:
-            self._run.tell(events.PowerCycleAwaited(wait_s))
+            self._run.emit(events.PowerCycleAwaited(self._deadline_at - self._run.now))
+        elif self._asks_for_power and self.announcement is None:
+            self._run.emit(events.PowerCycleAwaited(wait_s))
 
     def _wait_or_begin_again(self, row: ReceivedContent) -> None:
         """Send nothing to a device that has not announced itself at power-up."""
@@ -643,10 +643,10 @@ class UpgradeStage:
             return
         self._at.boot = self._last_boot = boot
         version, minimum = printable(boot.version), self._options.minimum_boot_version
-        self._run.tell(events.BootVersionSeen(printable(boot.name), version))
+        self._run.emit(events.BootVersionSeen(printable(boot.name), version))
         if minimum is not None:
             text = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
-            self._run.tell(events.CheckMade("boot-version", "passed", text))
+            self._run.emit(events.CheckMade("boot-version", "passed", text))
 
     def _miss_boot(self, row: ReceivedContent) -> None:
         """Handle a missing boot version; a device that may be in an open session gets an update
@@ -730,7 +730,7 @@ class UpgradeStage:
         minimum = self._options.minimum_boot_version
         if minimum is not None and not self._has_begun:
             text = f"no boot version in an open session; the manifest asks for {minimum}"
-            self._run.tell(events.CheckMade("boot-version", "unknown", text))
+            self._run.emit(events.CheckMade("boot-version", "unknown", text))
         self.unchecked = None
         self._at.request_at = self._run.now
         self._erasures += 1
@@ -780,7 +780,7 @@ class UpgradeStage:
             return
         self._acknowledged = at.packet
         self._tx.all_left(self._run.now)
-        self._run.tell(events.PacketAcknowledged(at.packet, total, at.tries))
+        self._run.emit(events.PacketAcknowledged(at.packet, total, at.tries))
         if at.packet < total:
             self._go(UpgradeState.TRANSFERRING)
             self._next_packet(at.packet + 1)
@@ -932,13 +932,13 @@ class UpgradeStage:
         tool is silent; one that may be complete, or untouched, is left to the user.
         """
         is_complete_perhaps = self._at.end_copies_left > 0
-        is_erased_perhaps = self._was_told_to_update and not is_complete_perhaps
+        is_erased_perhaps = self._update_was_sent and not is_complete_perhaps
         may_wait = self._options.waits_for_other_tool and not self._is_last_attempt
         if not (is_erased_perhaps and may_wait):
             self._end(Ending.SECOND_TOOL, row, self._second_tool)
             return
         if not self.is_yielding:
-            self._run.tell(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
+            self._run.emit(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
         self._go(UpgradeState.YIELDING)
         self._yield_on(row)
 

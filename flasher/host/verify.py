@@ -234,7 +234,7 @@ def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> S
             at = next(index for index, byte in enumerate(expected) if got[index] != byte)
             detail = f"first at 0x{start + at:08X}: {got[at]:02X} instead of {expected[at]:02X}"
             return found(Verdict.MEMORY_OTHER, detail)
-        run.tell(events.MemoryRead(end - base, len(data)))
+        run.emit(events.MemoryRead(end - base, len(data)))
         if run.is_cancelled and end - base < len(data):
             return Verification(Level.MEMORY, Verdict.INTERRUPTED)
     return found(Verdict.MEMORY_RIGHT)

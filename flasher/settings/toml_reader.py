@@ -152,7 +152,7 @@ class Reader(Generic[ModelT]):
         if len(faults) == 1:
             (fault,) = faults
             remedy = " ".join(filter(None, (fault.remedy, self._remedy)))
-            error = self._error(fault.alone or fault.said, where=shown, remedy=remedy)
+            error = self._error(fault.alone or fault.sentence, where=shown, remedy=remedy)
         else:
             listed = [f"{shown}: {fault}" for fault in faults[:FAULTS_SHOWN]]
             if len(faults) > FAULTS_SHOWN:
@@ -173,7 +173,7 @@ class Reader(Generic[ModelT]):
         missing: dict[Location, list[str]] = {}
         wrong: dict[str, Fault] = {}
         places = [location for kind, location, _ in details if kind != "too_short"]
-        for kind, location, said in details:
+        for kind, location, sentence in details:
             if kind == "too_short" and any(each[: len(location)] == location for each in places):
                 continue  # the length of a list with errors is not reported
             at, value = _found(document, location)
@@ -182,7 +182,7 @@ class Reader(Generic[ModelT]):
             elif kind in _UNKNOWN or location[-1:] == ("[key]",):
                 unknown.setdefault(at[:-1], []).append(str(at[-1]))
             else:
-                fault = self._wrong(kind, at, value, said, prefix)
+                fault = self._wrong(kind, at, value, sentence, prefix)
                 wrong.setdefault(fault.place, fault)
         lacking = [
             self.fault((*prefix, *at), f"has no {' and no '.join(names)}.")
@@ -213,14 +213,14 @@ class Reader(Generic[ModelT]):
             )
 
     def _wrong(
-        self, kind: str, location: Location, value: object, said: str, prefix: Location
+        self, kind: str, location: Location, value: object, sentence: str, prefix: Location
     ) -> Fault:
         place = location_text((*prefix, *location))
         schema = self._root.at(location)
         if kind in _NO_TABLE:
             return self.fault((*prefix, *location), f"is a table, [{place}].")
         if kind in ("value_error", "assertion_error") and not schema.has_words:
-            return Fault(place, f"{printable(said)}.")
+            return Fault(place, f"{printable(sentence)}.")
         name = next((part for part in reversed(location) if isinstance(part, str)), "")
         close = did_you_mean(value, schema.choices) if isinstance(value, str) else ""
         remedy = f"{close}It is {schema.allowed(name)}"

@@ -116,7 +116,7 @@ def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
     assert asked.engine.done
     assert set(asked.commands) == {0x3300}
     assert asked.told.seen.version is None
-    assert asked.told.heard is None
+    assert asked.told.announcement is None
     assert not asked.told.cancelled
 
 
@@ -125,7 +125,7 @@ def test_an_announcement_ends_it_at_once() -> None:
     asked.run(10.1)
     asked.hear(answer_frames(BootVersion("BMS", "V1.2.3")))
     assert asked.engine.done
-    assert asked.told.heard is not None
+    assert asked.told.announcement is not None
     assert asked.engine.next_frame(asked.now) is None
 
 
@@ -135,7 +135,7 @@ def test_an_announcement_while_it_listens_first_is_kept_until_it_has_listened() 
     assert asked.engine.deadline() is not None
     asked.run(10.0)
     assert asked.engine.done
-    assert asked.told.heard is not None
+    assert asked.told.announcement is not None
     assert asked.commands == []
 
 
@@ -175,7 +175,7 @@ def test_other_frames_on_its_ids_are_nothing() -> None:
         asked.hear([Frame(can_id, b"\x05"), Frame(can_id, b"", is_remote=True)])
         asked.hear([Frame(can_id, b"\x55\xaa\x0c", is_extended=True)])
     assert asked.told.seen.version is None
-    assert asked.told.heard is None
+    assert asked.told.announcement is None
     asked.now = 10.2
     asked.say(VERSION, version())
     assert asked.told.seen.version == version()

@@ -9,7 +9,13 @@ import pytest
 
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.events import Phase
-from flasher.host.outcome import DeviceLeft, Outcome, Statistics, ended_before_start, standing
+from flasher.host.outcome import (
+    DeviceLeft,
+    Outcome,
+    Statistics,
+    describe_progress,
+    ended_before_start,
+)
 from flasher.host.table import Ending
 from flasher.host.verify import (
     Level,
@@ -151,7 +157,7 @@ def test_what_was_seen_stands_in_brackets_and_the_waiver_is_named() -> None:
     ],
 )
 def test_where_it_was(packet: int | None, attempt: int, text: str) -> None:
-    assert standing(Phase.TRANSFER, packet, 3, attempt) == text
+    assert describe_progress(Phase.TRANSFER, packet, 3, attempt) == text
     figures = Statistics(attempts=attempt)
     where = outcome(Ending.PACKET_FAILED, packet=packet, statistics=figures)
     assert where.where == text

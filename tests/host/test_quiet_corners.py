@@ -100,15 +100,15 @@ def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> Non
     bench.engine = session  # type: ignore[assignment]
     bench.sent.clear()
     bench._step()
-    stands = [(session.standing, session.device_left)]
+    stands = [(session.progress, session.device_left)]
     bench.wait(LISTEN_FIRST_S)
-    stands.append((session.standing, session.device_left))
+    stands.append((session.progress, session.device_left))
     bench.to_end()
-    stands.append((session.standing, session.device_left))
+    stands.append((session.progress, session.device_left))
     bench.say(Complete())
-    stands.append((session.standing, session.device_left))
+    stands.append((session.progress, session.device_left))
     bench.wait(SECOND_DEVICE_WAIT_S)
-    stands.append((session.standing, session.device_left))
+    stands.append((session.progress, session.device_left))
     assert stands == [
         ("listening for another tool", DeviceLeft.UNTOUCHED),
         ("resetting the application", DeviceLeft.UNTOUCHED),

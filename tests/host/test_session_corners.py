@@ -88,7 +88,7 @@ def test_a_session_without_identity_asks_nobody_and_checks_nothing() -> None:
     session.tick(0.0)
     assert session.next_frame(0.0) is None
     session.tick(LISTEN_FIRST_S)
-    assert session.standing.startswith("resetting")
+    assert session.progress.startswith("resetting")
     frame = session.next_frame(LISTEN_FIRST_S)
     assert frame is not None
     assert frame.data.startswith(bytes.fromhex("55AA16074205"))

@@ -101,7 +101,7 @@ class Dialogue(Bench):
 
     @property
     def result(self) -> Result:
-        assert self.session.done, self.session.standing
+        assert self.session.done, self.session.progress
         return self.session.result
 
     @property
@@ -314,7 +314,7 @@ def test_questions_are_asked_anew_when_the_adapter_is_back() -> None:
     assert dialogue.session.now == dialogue.now + 3.0
     dialogue.now += 3.0
     dialogue._flush()
-    assert dialogue.session.standing == "listening for another tool"
+    assert dialogue.session.progress == "listening for another tool"
     dialogue.identified()
     dialogue.expect(ResetCommand)
 
@@ -337,9 +337,9 @@ def to_verification(options: UpgradeOptions | None = None) -> Dialogue:
     dialogue.expect(EndOfTransfer)
     assert dialogue.session.has_begun_to_erase
     dialogue.say(Complete())
-    assert dialogue.session.standing == "listening for a second device"
+    assert dialogue.session.progress == "listening for a second device"
     dialogue.wait(SECOND_DEVICE_WAIT_S)
-    assert dialogue.session.standing == "verifying by version"
+    assert dialogue.session.progress == "verifying by version"
     assert dialogue.session.device_left is DeviceLeft.NEW
     assert dialogue.asked() == 0x3300
     return dialogue

@@ -49,26 +49,26 @@ def reported(bench: Bench) -> list[str]:
 
 def test_it_says_where_it_stands_with_packet_and_attempt() -> None:
     bench = Bench(options=UpgradeOptions(timings=HURRIED))
-    stands = [stage(bench).standing]
+    stands = [stage(bench).progress]
     bench.to_boot()
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.say(BOOT)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.expect(UpdateCommand)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.say(RequestTransfer())
     bench.on_to_packet(2, first=1)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.now += 0.1
     bench.say(BOOT)
     bench.expect(UpdateCommand)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.say(RequestTransfer())
     bench.on_to_packet(3, first=1)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     bench.say(Ack(3))
     bench.expect(EndOfTransfer)
-    stands.append(stage(bench).standing)
+    stands.append(stage(bench).progress)
     assert stands == [
         "resetting the application",
         "waiting for the boot version",
@@ -205,7 +205,7 @@ def test_an_end_that_is_sent_again_while_the_version_is_asked_is_waited_for_as_e
     assert bench.expect(Message).command == 0x3300
     bench.say(Nak(3))
     bench.expect(EndOfTransfer)
-    assert stage(bench).standing == "waiting for the final answer"
+    assert stage(bench).progress == "waiting for the final answer"
     bench.wait(9.9)
     assert bench.unread == []
     assert bench.expect(Message, within_s=0.2).command == 0x3300

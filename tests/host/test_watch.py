@@ -49,7 +49,7 @@ def heard_before(options: UpgradeOptions | None = None) -> Bench:
     """An upgrade whose device was heard to announce itself while it was asked."""
     bench = Bench()
     bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps), options)
-    bench.engine._upgrade.heard = BOOT.to_message(BMS.answer_id)
+    bench.engine._upgrade.announcement = BOOT.to_message(BMS.answer_id)
     bench.sent.clear()
     bench.events.clear()
     bench._step()
@@ -178,7 +178,7 @@ def test_another_kind_of_device_that_announces_itself_after_that_reset_is_refuse
 def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
     bench = Bench()
     bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps))
-    bench.engine._upgrade.heard = BOOT.to_message(BMS.answer_id)
+    bench.engine._upgrade.announcement = BOOT.to_message(BMS.answer_id)
     bench.sent.clear()
     bench.engine.tick(bench.now)
     bench.now += 1.0  # the adapter takes nothing
@@ -227,7 +227,7 @@ def test_an_upgrade_begins_with_the_reset_or_with_the_wait(
 def test_before_it_begins_it_says_what_it_will_begin_with() -> None:
     planned = plan(Bench().image, BMS, WELLING.bitrate_bps)
     for options, text in ((UpgradeOptions(), "resetting"), (AWAITED, "waiting for the boot")):
-        assert Upgrade(planned, options)._upgrade.standing.startswith(text)
+        assert Upgrade(planned, options)._upgrade.progress.startswith(text)
 
 
 def test_a_version_that_the_bus_brings_is_no_boot_version() -> None:

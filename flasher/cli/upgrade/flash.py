@@ -269,7 +269,7 @@ class _Upgrade:
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
         release = api.find_release(self.image.image, choices.manifest)
         # What a file is refused for, before an adapter is looked for.
-        image = api.release_checked(self.image.load(force=choices.force), release)
+        image = api.with_release(self.image.load(force=choices.force), release)
         profile.check_fits(image)
         self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
