@@ -279,9 +279,10 @@ def bit_rate(
 class Device:
     """A device on a bus, for blocking programs; created by `Connection.device`.
 
-    Every method takes the keywords of `CallOptions`. It raises BusError if the adapter fails or another
-    tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and UsageError while
-    another call is running on the connection (in another thread, or around `on_event`).
+    Every method takes the keywords of `CallOptions`. It raises BusError if the adapter fails or
+    another tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and
+    UsageError while another call is running on the connection (in another thread, or around
+    `on_event`).
     """
 
     def __init__(

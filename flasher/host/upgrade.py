@@ -128,7 +128,7 @@ class _Attempt:
 
 
 class UpgradeStage:
-    """One upgrade of one device. Begins with a reset, or, if the device was `announcement` announcing its
+    """One upgrade of one device. Begins with a reset, or, after an `announcement` of the device's
     boot version, with the answer to that.
     """
 
@@ -197,7 +197,7 @@ class UpgradeStage:
     # -- progress --------------------------------------------------------------------------------
 
     @property
-    def describe_progress(self) -> str:
+    def progress(self) -> str:
         """Describe phase, packet and attempt."""
         return describe_progress(self._phase, self._packet, self._plan.total_packets, self._attempt)
 

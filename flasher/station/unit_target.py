@@ -137,7 +137,7 @@ class UnitTarget:
         before = self.watcher.announcements
         self.run(asking)
         asked = asking.result
-        announced = asked.heard is not None or self.watcher.announcements > before
+        announced = asked.announcement is not None or self.watcher.announcements > before
         return Identified(asked.seen, announced, asked.two_devices)
 
     def is_silent(self, found: Identified) -> bool:

@@ -182,7 +182,7 @@ class Watched:
     def __init__(self, ends_after: int | None) -> None:
         self.seen: list[object] = []
         self._frames_left = ends_after
-        self.watch: api.Watch = {
+        self.watch: api.CallOptions = {
             "taps": [self._tap],
             "on_event": self.seen.append,
             "cancelled": lambda: self._frames_left is not None and self._frames_left <= 0,

@@ -347,7 +347,7 @@ class _Upgrade:
     @contextmanager
     def _watching(
         self, job: api.Job, connection: api.Connection, record: Recording
-    ) -> Iterator[api.Watch]:
+    ) -> Iterator[api.CallOptions]:
         """Shows the upgrade on the terminal, and ends it when the user wants to."""
         output = self.output
         output.progress(f"on {connection.name} at {connection.bit_rate}")

@@ -313,7 +313,7 @@ class CompiledDevice(Machine):
             self.power_cut(now_us / _US)
             self._due_at = (now_us + share * takes_us) / _US + off_s
             return None
-        self.flash.write_planned(operation)
+        self.flash.execute(operation)
         return pipes.TIME.pack(now_us + takes_us)
 
     def _count_bytes(self, size_bytes: int) -> None:
