@@ -137,7 +137,7 @@ def parse_file(
         refusal = error(
             f"The {what} {shown} is not a readable TOML file: {why}.",
             where=shown,
-            remedy="Texts stand in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
+            remedy="Texts are in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
             "or 0.5.",
         )
         fault = Fault("", f"It is not a TOML file: {why}.", refusal.remedy)

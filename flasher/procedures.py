@@ -151,7 +151,7 @@ class DeviceInfo:
         """
         is_periodic = self.dialect is WELLING
         proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
-        return f"none heard{proviso}"
+        return f"none received{proviso}"
 
 
 @dataclass(frozen=True)

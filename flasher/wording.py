@@ -32,14 +32,14 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "second_tool": "a second tool speaks on the bus",
         "packet_failed": "a packet was not acknowledged",
         "restarted": "the device restarted too often",
-        "broken_protocol": "the device completed before it was told that the transfer had ended",
+        "broken_protocol": "the device confirmed the image before the transfer had ended",
         "out_of_time": "the overall deadline passed",
         "cancelled": "cancelled by the user",
     },
     "DeviceLeft": {
         "untouched": "this run erased nothing: the device is as it was before",
-        "perhaps_erased": "it was told to erase its application and did not say whether it has: "
-        "flash it again, or see after a power cycle what it runs",
+        "perhaps_erased": "it received the command to erase its application and did not answer: "
+        "flash it again, or check after a power cycle what it runs",
         "no_application": "its application is erased or half written: it stays in its "
         "bootloader until an image is flashed completely",
         "unknown": "it has every byte of the image; whether it runs it is not known",
@@ -94,7 +94,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
     "Cause": {
         "completed": "completed",
         "confirmed_by_version": "final answer lost, new application answers",
-        "nobody_acknowledges": "nobody acknowledges on the bus",
+        "nobody_acknowledges": "no node acknowledges on the bus",
         "no_boot_version": "no boot version after the reset",
         "no_request": "no request transfer after the update command",
         "update_not_taken": "the bootloader does not take the update command",
@@ -186,7 +186,7 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
         "Check that the device is a {node} and that the image fits it.",
     ),
     "wrong_device": Explanation(
-        "the connected device is no {node}, whose bootloader calls itself {boot_name}",
+        "the connected device is not a {node}, whose bootloader reports {boot_name}",
         "Check what is connected and which target was named.",
     ),
     "two_devices": Explanation(
@@ -230,7 +230,7 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     ),
     "tool_ended": Explanation(
         "the tool itself ended the upgrade, for the reason that it reported",
-        "Do what the tool said then: it names the state of the device too.",
+        "Follow the message of the tool, which also gives the state of the device.",
     ),
     "refused": Explanation(
         "the image is not meant for this device, or the checksum that it carries is wrong",
@@ -253,15 +253,15 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
         "the recording was stopped or its file was cut off before the upgrade was over",
         "Record a whole upgrade: begin before the tool starts, stop after it has ended.",
     ),
-    "queries_only": Explanation("", "See what is said with flasher monitor TRACE."),
+    "queries_only": Explanation("", "See the messages with flasher monitor TRACE."),
     "foreign_only": Explanation(
         "this is another bus, or another bit rate or filter was set when it was recorded",
         "Record the drive system's bus with all ids.",
     ),
     "empty": Explanation(
-        "nothing was sent while it was recorded, the adapter did not hear it, it holds CAN FD "
-        "frames alone, or the file is no trace of its suffix's format",
-        "See with flasher doctor whether the adapter hears the bus.",
+        "nothing was sent during the recording, the adapter did not receive it, it contains "
+        "only CAN FD frames, or the file is not in the format of its suffix",
+        "Check with flasher doctor whether the adapter receives the bus.",
     ),
 }
 

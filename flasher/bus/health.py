@@ -82,7 +82,7 @@ _CLASSES: Final = (
     (_TX_TIMEOUT, TroubleKind.OTHER, "the driver's transmission timed out"),
     (_LOST_ARBITRATION, TroubleKind.OTHER, "arbitration lost"),
     (_TRANSCEIVER, TroubleKind.OTHER, "trouble of the transceiver (wiring)"),
-    (_NO_ACK, TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"),
+    (_NO_ACK, TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"),
     (_BUS_OFF, TroubleKind.BUS_OFF, "bus-off"),
     (_BUS_ERROR, TroubleKind.OTHER, "bus error"),
     (_RESTARTED, TroubleKind.RESTARTED, "the controller was restarted"),
@@ -126,7 +126,7 @@ def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
     if classes & _PROTOCOL:
         found += [(TroubleKind.OTHER, words) for bit, words in _VIOLATIONS if data[2] & bit]
         if data[3] == _ACK_SLOT:
-            found.append((TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"))
+            found.append((TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"))
     is_active_again = bool(classes & _CONTROLLER and data[1] & _ACTIVE_BIT)
     if is_active_again:
         found.append((TroubleKind.OTHER, "error-active again"))
@@ -145,7 +145,7 @@ def _decode_pcan(kind_of_error: int, data: bytes) -> BusTrouble:
     words = names.get(kind_of_error, "bus error")
     found = [(TroubleKind.OTHER, words)] if words else []
     if kind_of_error and place == _ACK_SLOT and not is_received:
-        found.append((TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"))
+        found.append((TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"))
     if max(rx_errors, tx_errors) >= PASSIVE_LIMIT:
         by = "sending" if tx_errors >= rx_errors else "receiving"
         found.append((TroubleKind.PASSIVE, f"error-passive by {by}"))

@@ -2,8 +2,8 @@
 
 `judge_image` checks the image and its manifest alone, `judge_device` compares them with the answers
 of the running application. The upgrade itself checks name and version of the bootloader when it
-announces itself. Each check has its own option to waive it. If a check is impossible, its result
-says so.
+announces itself. Each check has its own option to waive it. An impossible check has the verdict
+UNKNOWN.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
         )
     else:
         sentence = text(
-            "no manifest, and the image names no device: nobody can tell whether it is for the "
+            "no manifest, and the image names no device: it is unknown whether it is for the "
             "{wanted}",
             wanted=wanted,
         )
@@ -216,7 +216,7 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
         return
     text = f"the image {found.text}"
     if not found.is_certain and identity.cpu is not Cpu.CORTEX_M:
-        text += ": the profile says that the processor is another"
+        text += ": the profile names another processor"
         yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     elif not found.is_certain and identity.vouches_for(image):
         text += ": the manifest was made for these very bytes"
@@ -250,14 +250,14 @@ def _versions_unknown(identity: Identity, target: Target) -> CheckResult:
     previous = release is not None and release.rules_previous
     if not hardware and not previous:
         sentence = text(
-            "the {node}'s application does not tell its versions: neither hardware nor downgrade "
+            "the {node}'s application does not report its versions: neither hardware nor downgrade "
             "can be checked",
             node=target.node.name,
         )
         return CheckResult(IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
     sentence = text(
-        "the {node}'s application does not tell its versions: the manifest's rule on {rules} "
+        "the {node}'s application does not report its versions: the manifest's rule on {rules} "
         "cannot be checked",
         node=target.node.name,
         rules=rules,
@@ -270,12 +270,12 @@ def _versions_unknown(identity: Identity, target: Target) -> CheckResult:
 def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
     release = identity.release
     if release is None or not release.hardware_versions:
-        sentence = text("no manifest says which hardware the image fits")
+        sentence = text("no manifest states which hardware the image fits")
         return CheckResult(IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
         sentence = text(
-            "the device does not tell its hardware; the manifest lists {fits}", fits=fits
+            "the device does not report its hardware; the manifest lists {fits}", fits=fits
         )
         return identity.uncheckable(IdentityCheck.HARDWARE, sentence)
     if release.fits_hardware(hardware):

@@ -231,7 +231,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.NO_ANNOUNCEMENT: _Explanation(
         NoAnswerError,
-        "nobody switched it off and on, it has no power, it is not on this bus, or the bit rate "
+        "it was not switched off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
         "{again} Take the device's supply away for some seconds when you are asked to (a battery "
         "wakes by its key or charger); --wait allows more time.",
@@ -245,13 +245,13 @@ _EXPLANATIONS: Final = {
     ),
     Ending.UNHEARING: _Explanation(
         NoAnswerError,
-        "it is another kind of device than the target, it refuses this size, or it does not hear",
+        "it is not the target device, it refuses this size, or it does not receive",
         "Check that the device is a {node} and that the image fits it.",
         code=ErrorCode.UNHEARING,
     ),
     Ending.WRONG_DEVICE: _Explanation(
         WrongDeviceError,
-        "the connected device is no {node}, whose bootloader calls itself {boot_name} Vx.x.x",
+        "the connected device is not a {node}, whose bootloader reports {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
     Ending.BOOT_TOO_OLD: _Explanation(
@@ -280,7 +280,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.IN_USE: _Explanation(
         WrongDeviceError,
-        "somebody rides it, or a load draws current",
+        "the bike is being ridden, or a load draws current",
         "Let it stand still and switch its loads off; --allow-in-use upgrades it all the same.",
         code=ErrorCode.VEHICLE_IN_USE,
     ),
@@ -359,7 +359,7 @@ def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
             cause = "the device is not there, or not ready in the time allowed"
             return _Explanation(NoAnswerError, cause, remedy)
         case Phase.END if left is not DeviceLeft.UNKNOWN:
-            cause = "no time was left to tell the device that the transfer had ended"
+            cause = "no time was left to send end of transfer"
             return _Explanation(TransferError, cause, remedy)
         case Phase.TRANSFER:
             cause = "the device answers late again and again, or the bus is congested"

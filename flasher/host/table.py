@@ -57,7 +57,7 @@ class UpgradeEvent(Enum):
 
     TWO_DEVICES = "what one device does not send"
     LINK_BACK = "the adapter was lost and is back"
-    SECOND_TOOL = "somebody else speaks as the tool"
+    SECOND_TOOL = "a second tool sends"
     OUT_OF_TIME = "overall deadline"
     CANCEL = "cancelled by the user"
 

@@ -23,7 +23,7 @@ BOOT_VERSION: Final = "boot-version"
 OF_DEVICE: Final[Mapping[str, Waiver]] = {
     IMPLAUSIBLE: Waiver(
         text("bytes that do not look like a program for the device"),
-        text("If they are none, the device does not start any more and has to be rescued."),
+        text("If they are not, the device no longer starts and has to be rescued."),
     ),
     "other-target": Waiver(
         text("an image that its manifest, or a name inside, gives to another target"),

@@ -172,10 +172,7 @@ def target_problem(image: Image, release: Release | None, target: Target) -> str
     """
     asked = target.node.name
     if release is not None and release.target != target:
-        return (
-            f"the manifest says that the image is for the {release.target.node.name}, not the "
-            f"{asked}"
-        )
+        return f"by its manifest the image is for the {release.target.node.name}, not the {asked}"
     if image.named_targets and target not in image.named_targets:
         return f"the image names the {names_of(image.named_targets)} inside, not the {asked}"
     return None

@@ -475,7 +475,7 @@ def _contradictions(profile: Profile) -> Iterator[Fault]:
         yield fault(
             ("reset_data",),
             f"has {len(profile.reset_data)} bytes, but reset_command "
-            f"0x{profile.reset_command:04X} carries {wanted}: its second byte says so.",
+            f"0x{profile.reset_command:04X} carries {wanted}, by its second byte.",
         )
     area = profile.application_area
     if area is not None and area.end > 1 << 32:
@@ -493,8 +493,7 @@ def _contradictions(profile: Profile) -> Iterator[Fault]:
     if data_size(query.command):
         yield fault(
             ("version_query", "command"),
-            f"is 0x{query.command:04X}: its second byte says that it carries data, but a query "
-            "has none.",
+            f"is 0x{query.command:04X}: by its second byte it carries data, but a query has none.",
         )
     size_bytes = data_size(query.answer_command)
     if query.offset + query.size_bytes > size_bytes:

@@ -145,7 +145,7 @@ def test_calls_of_several_tasks_wait_for_each_other() -> None:
 Call = tuple[str, tuple[Any, ...], dict[str, Any]]
 CALLS: list[Call] = [
     ("identify", (), {}),
-    ("is_heard", (), {}),
+    ("is_present", (), {}),
     ("version", (), {}),
     ("read", ("running-information",), {}),
     ("read", (contents.History,), {}),

@@ -30,9 +30,9 @@ def linux(can_id: int, data: str = "00 00 00 00 00 00 00 00") -> BusTrouble:
 LINUX = [
     (0x040, "00 00 00 00 00 00 00 00", TroubleKind.BUS_OFF, "bus-off"),
     (0x100, "00 00 00 00 00 00 00 00", TroubleKind.RESTARTED, "restarted"),
-    (0x020, "00 00 00 00 00 00 00 00", TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"),
+    (0x020, "00 00 00 00 00 00 00 00", TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"),
     # Bus error on transmission, in the acknowledge slot.
-    (0x088, "00 00 80 19 00 00 00 00", TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"),
+    (0x088, "00 00 80 19 00 00 00 00", TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"),
     (0x204, "00 20 00 00 00 00 80 00", TroubleKind.PASSIVE, "error-passive by sending"),
     (0x204, "00 10 00 00 00 00 00 80", TroubleKind.PASSIVE, "error-passive by receiving"),
     (0x204, "00 08 00 00 00 00 60 00", TroubleKind.WARNING, "error-warning by sending"),
@@ -64,7 +64,7 @@ def test_error_counters_are_told_only_when_the_frame_has_them() -> None:
 
 
 PCAN = [
-    (8, "00 19 00 08", TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"),
+    (8, "00 19 00 08", TroubleKind.NOT_ACKNOWLEDGED, "no acknowledgement"),
     (4, "01 0A 09 00", TroubleKind.OTHER, "stuff error"),
     (1, "00 0A 00 80", TroubleKind.PASSIVE, "error-passive by sending"),
     (4, "01 0A 87 00", TroubleKind.PASSIVE, "error-passive by receiving"),

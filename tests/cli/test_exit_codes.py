@@ -255,7 +255,7 @@ CASES = [
     Case("not power-cycled", ExitCode.NO_ANSWER, nobody_cycles_the_power,
          "boot version", "nobody switched it off", "--wait"),
     Case("another device", ExitCode.WRONG_DEVICE, other_boot_name,
-         "boot version", "calls itself BMS", "--allow-boot-name"),
+         "boot version", "reports BMS", "--allow-boot-name"),
     Case("for another target", ExitCode.WRONG_DEVICE, other_target,
          "before anything was sent", "another file", "image-info"),
     Case("loses power", ExitCode.TRANSFER, loses_power, P3, "lost power", "rescue"),

@@ -35,7 +35,7 @@ class Check:
 
 
 CHECKS = [
-    Check("other-target", "the manifest says that the image is for the WMC, not the BMS",
+    Check("other-target", "by its manifest the image is for the WMC, not the BMS",
           {"target": "wmc"}),
     Check("other-target", "the image names the OBC inside, not the BMS",
           image=Image.from_bytes(IMAGE.data + b"\0OBC_UPD\0")),
@@ -156,13 +156,13 @@ def test_a_rule_that_cannot_be_checked_refuses_as_one_that_fails(
     stage = Stage(has_application=False)
     run = bench.flash(stage, manifest=rule)
     assert run.code == ExitCode.WRONG_DEVICE
-    assert "does not tell its versions: the manifest's rule on" in run.err
+    assert "does not report its versions: the manifest's rule on" in run.err
     assert "cannot be checked; --allow-hardware waives this" in run.err
     assert "flasher rescue goes on without it" in run.err
     assert not wrote(stage)
     run = bench.flash(stage, "--allow-hardware", manifest=rule)
     assert run.code == ExitCode.OK, run.err
-    assert "warning: the BMS's application does not tell its versions" in run.err
+    assert "warning: the BMS's application does not report its versions" in run.err
 
 
 def test_a_rescue_says_that_it_goes_on_unchecked(bench: Workbench) -> None:
@@ -177,7 +177,7 @@ def test_where_there_is_nothing_to_check_against_a_line_says_so(bench: Workbench
     assert run.code == ExitCode.OK
     unknown = [line for line in run.err.splitlines() if line.startswith("check: unknown: ")]
     assert len(unknown) == 2
-    assert "nobody can tell whether it is for the OBC" in unknown[0]
+    assert "it is unknown whether it is for the OBC" in unknown[0]
     assert "neither hardware nor downgrade can be checked" in unknown[1]
 
 

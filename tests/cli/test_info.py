@@ -26,8 +26,8 @@ def rows(text: str) -> list[str]:
 
 # Only one document says how often faults are sent: silence proves more there.
 NO_FAULTS = {
-    "welling": "faults none heard",
-    "motinova": "faults none heard; how often they are sent is not documented: see monitor",
+    "welling": "faults none received",
+    "motinova": "faults none received; how often they are sent is not documented: see monitor",
 }
 
 

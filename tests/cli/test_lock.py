@@ -1,4 +1,4 @@
-"""Which commands are refused while somebody else speaks as the tool on the adapter."""
+"""Which commands are refused while a second tool sends on the adapter."""
 
 from __future__ import annotations
 

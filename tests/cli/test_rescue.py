@@ -185,7 +185,7 @@ STAGES = [
     (Phase.IDENTIFY, "this run erased nothing", False),
     (Phase.RESET, "this run erased nothing", False),
     (Phase.BOOT, "this run erased nothing", False),
-    (Phase.UPDATE, "it was told to erase its application", True),
+    (Phase.UPDATE, "it received the command to erase its application", True),
     (Phase.TRANSFER, "its application is erased or half written", True),
     (Phase.END, "it has every byte of the image", True),
 ]

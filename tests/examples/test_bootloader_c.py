@@ -46,7 +46,7 @@ def test_some_of_every_group_under_sanitizers(flasher: Flasher, tmp_path: Path) 
 
 
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:
-    """The one that calls itself PBU."""
+    """The one that reports PBU."""
     _need("make", "gcc")
     make("host", tmp_path, "DEFINES=-DTARGET=TARGET_OBC")
     subject = tmp_path / "libboot.so"

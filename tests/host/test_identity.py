@@ -111,7 +111,7 @@ def test_what_the_device_says_of_the_image(
 def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() -> None:
     found = list(judge_device(IMAGE, OBC, Identity(), DeviceAnswers()))
     assert len(found) == 1
-    assert "the OBC's application does not tell its versions" in found[0].text
+    assert "the OBC's application does not report its versions" in found[0].text
 
 
 @each(
@@ -197,7 +197,7 @@ def judged(
         (Image.from_bytes(bytes(4) + VECTORS), Identity(), REFUSED, "no Cortex-M vector table",
          "--allow-implausible waives this, as does"),
         (Image.from_bytes(bytes(4) + VECTORS), Identity(cpu=Cpu.OTHER), UNKNOWN,
-         "the profile says that the processor is another", ""),
+         "the profile names another processor", ""),
         (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(cpu=Cpu.OTHER), REFUSED, "zip", ""),
         (Image.from_bytes(bytes(4) + VECTORS),
          Identity(waived=frozenset({IdentityCheck.PLAUSIBLE})),
@@ -261,7 +261,7 @@ def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
 ) -> None:
     found = judged(IMAGE, Identity(release(**stated)))[IdentityCheck.HARDWARE]
     assert found.text == (
-        "the BMS's application does not tell its versions: "
+        "the BMS's application does not report its versions: "
         f"the manifest's rule on {rules} cannot be checked"
     )
     assert found.verdict is REFUSED
@@ -300,7 +300,7 @@ def test_hardware_that_is_not_listed_is_named_with_the_list() -> None:
     ]
     assert good.text == "the manifest lists hardware V1r2r0_20220512"
     assert judged(device=seen())[IdentityCheck.HARDWARE].text == (
-        "no manifest says which hardware the image fits"
+        "no manifest states which hardware the image fits"
     )
 
 

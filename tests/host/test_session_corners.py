@@ -120,7 +120,7 @@ def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_no
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))
     hardware = next(found for found in findings if found.check is IdentityCheck.HARDWARE)
     assert hardware.verdict is CheckVerdict.REFUSED
-    assert "does not tell its hardware" in hardware.text
+    assert "does not report its hardware" in hardware.text
     assert hardware.ending is Ending.UNCHECKED
 
 

@@ -262,7 +262,7 @@ IMAGES = (
         with_manifest(content(b"format = " + b"9" * 5000)),
         "flash FILE -t bms --mock --dry-run",
         IMAGE,
-        "no TOML file",
+        "not a readable TOML file",
     ),
 )
 
@@ -273,23 +273,31 @@ TOML = (
     ("pipe", os.mkfifo, "not a regular file"),
     ("folder", Path.mkdir, "is a directory"),
     ("terabyte", sparse(1 << 40, b"a = 1\n"), "too large"),
-    ("digits", content(b"attempts = " + b"9" * 5000), "no TOML file"),
-    ("hex_digits", content(b"attempts = 0x" + b"f" * 5000), "no TOML file"),
-    ("deep", content(b"attempts = " + b"[" * 100_000), "no TOML file"),
-    ("deep_tables", content(b"attempts = " + b"{a=" * 300 + b"1" + b"}" * 300), "no TOML file"),
-    ("deep_key", content(b"a." * 100_000 + b"a = 1\n"), "no TOML file"),
-    ("deep_texts", content(('"\u2028".' * 20_000 + "a = 1\n").encode()), "no TOML file"),
+    ("digits", content(b"attempts = " + b"9" * 5000), "not a readable TOML file"),
+    ("hex_digits", content(b"attempts = 0x" + b"f" * 5000), "not a readable TOML file"),
+    ("deep", content(b"attempts = " + b"[" * 100_000), "not a readable TOML file"),
+    (
+        "deep_tables",
+        content(b"attempts = " + b"{a=" * 300 + b"1" + b"}" * 300),
+        "not a readable TOML file",
+    ),
+    ("deep_key", content(b"a." * 100_000 + b"a = 1\n"), "not a readable TOML file"),
+    (
+        "deep_texts",
+        content(('"\u2028".' * 20_000 + "a = 1\n").encode()),
+        "not a readable TOML file",
+    ),
     (
         "deep_keys",
         content(b"".join(b"[k%d%s]\n" % (n, b".a" * 125) for n in range(900))),
-        "no TOML file",
+        "not a readable TOML file",
     ),
-    ("unterminated", content(b'notes = "' + b"x" * 200_000), "no TOML file"),
+    ("unterminated", content(b'notes = "' + b"x" * 200_000), "not a readable TOML file"),
     ("long_text", content(b'notes = "' + b"x" * 200_000 + b'"\n'), ""),
-    ("nul", content(b"attempts = 1\0\n"), "no TOML file"),
-    ("utf_16", content("attempts = 3\n".encode("utf-16")), "no TOML file"),
+    ("nul", content(b"attempts = 1\0\n"), "not a readable TOML file"),
+    ("utf_16", content("attempts = 3\n".encode("utf-16")), "not a readable TOML file"),
     ("escape", content(b'"\\u001b[2J\\u202e" = 1\n'), ""),
-    ("surrogate", content(b'a = "\\ud800"\n'), "no TOML file"),
+    ("surrogate", content(b'a = "\\ud800"\n'), "not a readable TOML file"),
 )
 
 

@@ -14,7 +14,7 @@ from sphinx.application import Sphinx
 from sphinx.util.typing import ExtensionMetadata
 
 _ID: Final = "merman"
-"""What the drawing calls itself, in its style sheet too: two on a page need two names."""
+"""What the drawing reports, in its style sheet too: two on a page need two names."""
 
 
 def _draw(_app: Sphinx, document: nodes.document) -> None:

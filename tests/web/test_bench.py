@@ -518,7 +518,7 @@ def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_wr
 def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
     state = place.do(order(Bench.use_adapter, Fault.NONE.value))
     found = dict(told(state))
-    assert found["faults"] == [("faults", "none heard")]
+    assert found["faults"] == [("faults", "none received")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
     ((_, faults),) = dict(told(place.do(order(Bench.use_adapter, Fault.HARDWARE.value))))["faults"]

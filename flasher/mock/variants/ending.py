@@ -290,7 +290,7 @@ class RecordErasedLast(_Trusting):
 
 @variant("complete-before-record", "PW-01")
 class CompleteBeforeRecord(MockDevice):
-    """Says complete, and records that the image is whole when it starts it."""
+    """Sends complete, and records that the image is whole when it starts it."""
 
     _owes_record = False
     in_ram = ("_owes_record",)

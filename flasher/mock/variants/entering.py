@@ -304,7 +304,7 @@ class DiesAfter255(HangingDevice):
     also="FR-06 FR-10 CR-03 CR-04 RS-02 UP-02 UP-04 UP-06 SE-04 CO-02 CO-04",
 )
 class FeedbackAfterVersion(MockDevice):
-    """Sends general feedback behind the first boot version. Leaves the answer to a reset to the
+    """Sends general feedback after the first boot version. Leaves the answer to a reset to the
     bootloader.
     """
 

@@ -51,7 +51,7 @@ class ShortFrameEnds(Reassembler):
 
 @variant("header-at-frame-start-only", "FR-02")
 class HeaderAtFrameStart(Reassembler):
-    """Misses a message whose header stands behind junk in the same frame."""
+    """Misses a message whose header follows junk in the same frame."""
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         starts = payload.startswith(HEADER) or HEADER.startswith(payload)
@@ -60,7 +60,7 @@ class HeaderAtFrameStart(Reassembler):
 
 @variant("header-in-data-restarts", "FR-03", also="FR-10")
 class HeaderRestarts(Reassembler):
-    """Begins a new message where 55 AA stands at the start of a frame of data."""
+    """Begins a new message where a frame of data starts with 55 AA."""
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         if payload.startswith(HEADER):
@@ -239,7 +239,7 @@ class CrcOnesAccepted(Reassembler):
 
 @variant("long-commands-accepted", "FR-06", also="RS-04 UP-06")
 class LongCommandsAccepted(Reassembler):
-    """Takes a reset or update command with more data than its command says. Goes by the length
+    """Takes a reset or update command with more data than its command states. Goes by the length
     byte, and looks at as much of the data as it needs.
     """
 

@@ -79,7 +79,7 @@ class StaysOffBus(MockDevice):
 
 @variant("collision-hangs", "BU-06")
 class CollisionHangs(HangingDevice):
-    """Hangs when somebody else sends with its answer id, until power is cut."""
+    """Hangs when another node sends with its answer id, until power is cut."""
 
     def receive(self, frame: Frame, now: float) -> None:
         if frame.can_id == self.target.answer_id and self.has_power and not self.hangs:
@@ -132,8 +132,8 @@ class NoiseHangs(HangingDevice):
 
 @variant("writes-anywhere", "SE-04", also="TX-03")
 class WritesAnywhere(MockDevice):
-    """Writes and acknowledges a packet beyond the total. It goes to where its number says, whatever
-    lies there.
+    """Writes and acknowledges a packet beyond the total. It goes to the address of its number,
+    whatever is there.
     """
 
     store_type = PlainStore

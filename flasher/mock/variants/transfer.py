@@ -58,8 +58,8 @@ class SwallowsAfterBad(MockDevice):
 
 @variant("writes-repeated-twice", "TX-02", also="TX-05 BU-01 BU-02")
 class WritesRepeated(MockDevice):
-    """Writes a repeated packet behind its first copy: the rest of the image is moved. Writes
-    wherever it stopped writing: a packet that is repeated stands there twice.
+    """Writes a repeated packet after its first copy: the rest of the image is moved. Writes
+    at the end of the last write: a repeated packet is there twice.
     """
 
     store_type = PlainStore
@@ -165,7 +165,7 @@ class HangsAfter256(HangingDevice):
 
 @variant("filler-checked", "TX-08")
 class FillerChecked(MockDevice):
-    """Refuses a last packet whose bytes behind the image are not FF."""
+    """Refuses a last packet whose bytes after the image are not FF."""
 
     def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
@@ -288,7 +288,7 @@ class TotalLookedAtOnce(MockDevice):
 
 @variant("sixteen-bit-offsets", "TX-07")
 class SixteenBitOffsets(PlainStore):
-    """Writes what lies behind 64 KiB over the beginning."""
+    """Writes what lies beyond 64 KiB over the beginning."""
 
     def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
         """Offsets are counted in 16 bits."""
