@@ -104,7 +104,7 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
         (lambda t: "allow_completed_not_read_back=false\n" + t + target_table(WMC), "read back"),
         (lambda t: t + target_table(WMC, "verify = 'version'\n"), "asked for its version"),
         (lambda t: t + target_table(WMC, "verify = 'memory'\n"), "cannot be read"),
-        (lambda t: t + "x = [", "not a readable TOML"),
+        (lambda t: t + "x = [", "not a TOML file"),
         (lambda t: t.replace("[[target]]", "[target]"), "target"),
     ],
 )
