@@ -27,6 +27,7 @@ Schema = dict[str, Any]
 _PUBLISHED: Final = {
     "flasher.conformance.results.CaseResult": "ResultDocument",
     "flasher.conformance.results.Histogram": "HistogramDocument",
+    "flasher.conformance.results.KeyAnswer": "AnswerDocument",
     "flasher.conformance.results.RunReport": "ReportDocument",
     "flasher.conformance.results.Times": "TimesDocument",
     "flasher.conformance.results.WalkFinding": "FindingDocument",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from flasher.conformance.json_report import adapter
+from flasher.conformance.reports import adapter
 from flasher.conformance.results import SCHEMA_VERSION, CaseVerdict, RunReport, worst
 from flasher.errors import UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read

@@ -28,7 +28,6 @@ from flasher.conformance.catalogue import (
     known_cases,
     why_unsupported,
 )
-from flasher.conformance.json_report import to_bytes
 from flasher.conformance.profile import ConformanceProfile, check_deviations
 from flasher.conformance.real import HOST_UNCERTAINTY_S, DevicePowerCommand, ReadbackCommand
 from flasher.conformance.reports import (
@@ -38,6 +37,7 @@ from flasher.conformance.reports import (
     distribution,
     failure_details,
     is_traced,
+    to_bytes,
     trace_file_name,
 )
 from flasher.conformance.results import (

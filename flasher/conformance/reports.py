@@ -1,13 +1,15 @@
-"""JUnit XML report of a run for CI servers, and trace files of cases as candump logs, which
-`flasher explain` and python-can read.
+"""Reports of a run for programs: JSON, JUnit XML for CI servers, and trace files of cases as
+candump logs, which `flasher explain` and python-can read.
 """
 
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Final
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
 
 from flasher.conformance.catalogue import GROUPS
 from flasher.conformance.results import (
@@ -25,6 +27,9 @@ from flasher.conformance.results import (
 from flasher.protocol.frame import Frame
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
 from flasher.trace.figures import Distribution
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 TRACED: Final = frozenset(
     {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.DEVIATION}
@@ -102,6 +107,33 @@ def _histogram(values_s: Sequence[float]) -> Histogram:
         counts[min(BINS - 1, int((value_s - low_s) / width_s))] += 1
     edges_s = [low_s + index * width_s for index in range(BINS)] + [high_s]
     return Histogram(edges_s=edges_s, counts=counts)
+
+
+# -- JSON -----------------------------------------------------------------------------------------
+
+# Only `started_at`, keys that end in `_s` and histograms depend on the clock; otherwise two runs
+# with the same seed are equal. Frames are in separate trace files.
+
+
+@cache
+def adapter() -> TypeAdapter[RunReport]:
+    """Reads and writes reports. Raises pydantic.ValidationError for invalid data."""
+    from pydantic import TypeAdapter  # noqa: PLC0415  slow
+
+    return TypeAdapter(RunReport)
+
+
+def to_json(report: RunReport) -> dict[str, Any]:
+    """Convert the report to plain JSON types: output of `--json` and `--json-report`, input of
+    `diff`.
+    """
+    plain: dict[str, Any] = adapter().dump_python(report, mode="json", by_alias=True)
+    return plain
+
+
+def to_bytes(report: RunReport) -> bytes:
+    """Encode the report with one key per line, so that files can be compared as text."""
+    return (json.dumps(to_json(report), indent=1) + "\n").encode("ascii")
 
 
 # -- JUnit ----------------------------------------------------------------------------------------

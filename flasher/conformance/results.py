@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from flasher.conformance.wire import RawFrame
 from flasher.validation import json_keys
+
+if TYPE_CHECKING:
+    from flasher.conformance.profile import ConformanceProfile
 
 FINAL_IMAGE_OK: Final = "verified"
 SCHEMA_VERSION: Final = 2
@@ -480,3 +483,49 @@ class ExploreResult:
     def not_covered(self) -> list[tuple[str, str]]:
         """Pairs of phase and step that no walk reached."""
         return [(each.phase, each.step) for each in self.coverage if not each.count]
+
+
+@dataclass(frozen=True)
+class KeyAnswer:
+    """What is written for a key of the profile."""
+
+    key: str
+    value: str | int | float | None
+    """None (null) where it stays open."""
+    seen: str
+    """What was seen, or why it stays open."""
+
+
+@json_keys("subject target answers toml file stopped")
+@dataclass(frozen=True)
+class InitResult:
+    """What a device answered."""
+
+    subject: str
+    target: str
+    answers: tuple[KeyAnswer, ...]  # every key of the profile, in order
+    stopped: str = ""
+    """Why it ended early; empty when it did not."""
+    # In that case the answers must not be used.
+    was_brought_up: bool = True
+    """False when the good image could not be flashed before the first question."""
+    toml: str = ""
+    """The profile; empty when nothing is written."""
+    file: str = ""
+    """Its file; empty when none was written."""
+
+    def profile(self, start: ConformanceProfile) -> ConformanceProfile:
+        """Make a profile of the answers; open keys keep their values of `start`."""
+        from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415  loads pydantic
+
+        found = {one.key: one for one in self.answers if one.value is not None}
+        given = {key: one.value for key, one in found.items() if one.value is not None}
+        why = {key: one.seen for key, one in found.items()}
+        return ConformanceProfile(
+            {**start.given, **given}, {**start.rationales, **why}, start.deviations
+        )
+
+    @property
+    def open_keys(self) -> dict[str, str]:
+        """Keys that stay open, with the reason."""
+        return {one.key: one.seen for one in self.answers if one.value is None}

@@ -9,10 +9,9 @@ import pytest
 from flasher.cli.bench.conformance import exit_code
 from flasher.conformance.catalogue import Case, Selection
 from flasher.conformance.html_report import html_page
-from flasher.conformance.json_report import to_bytes
 from flasher.conformance.mock import MockSubject, device_maker
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.reports import completed, junit_report
+from flasher.conformance.reports import completed, junit_report, to_bytes
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import RunObserver, run
 from flasher.errors import ExitCode

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.json_report import to_bytes
 from flasher.conformance.mock import MockSubject, variant_maker
-from flasher.conformance.reports import completed
+from flasher.conformance.reports import completed, to_bytes
 from flasher.conformance.runner import run
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher

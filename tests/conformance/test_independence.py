@@ -11,7 +11,7 @@ _PACKAGE = Path(flasher.conformance.__file__).parent
 _EDGES = {"mock", "simulated", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
-    *("trace_excerpt", "diff", "html_report", "json_report", "reports"),
+    *("trace_excerpt", "diff", "html_report", "reports"),
     *("bench_options", "plugin", "summary_page", "side_by_side"),
 }
 """What opens a bench, and what tells about a run: neither makes nor judges a byte."""

@@ -12,7 +12,7 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.subject import open_subject
-from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, InitResult, ask_device
+from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, ask_device
 from flasher.conformance.init.answers import Trial, decide, limit_answer
 from flasher.conformance.mock import (
     GOOD_IMAGE,
@@ -22,6 +22,7 @@ from flasher.conformance.mock import (
     profile_of_mock,
 )
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
+from flasher.conformance.results import InitResult
 from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
 from flasher.mock.model import AnyMessage, MockDevice

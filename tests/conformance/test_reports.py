@@ -13,7 +13,6 @@ from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, MISSING_ON_BARE_BENCH, Requirement, Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
-from flasher.conformance.json_report import to_bytes, to_json
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import (
@@ -22,6 +21,8 @@ from flasher.conformance.reports import (
     completed,
     is_traced,
     junit_report,
+    to_bytes,
+    to_json,
     trace_file_name,
 )
 from flasher.conformance.results import (

@@ -11,10 +11,9 @@ import pytest
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Requirement, Selection
-from flasher.conformance.json_report import to_bytes
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.reports import completed
+from flasher.conformance.reports import completed, to_bytes
 from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame

@@ -354,13 +354,13 @@ def _tell(
 
 def _content(name: str, report: RunReport) -> bytes:
     """What is written into the file of this name."""
-    from flasher.conformance import html_report, json_report, reports, summary_page  # noqa: PLC0415
+    from flasher.conformance import html_report, reports, summary_page  # noqa: PLC0415
 
     match name:
         case "junit":
             return reports.junit_report(report)
         case "json_report":
-            return json_report.to_bytes(report)
+            return reports.to_bytes(report)
         case "html":
             text = html_report.html_page(report)
         case "badge":

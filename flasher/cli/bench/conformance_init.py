@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -15,12 +15,12 @@ from flasher.cli.bench.conformance_bench import (
     described,
     opened,
 )
-from flasher.cli.documents import document_of
 from flasher.cli.files import check_new, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.conformance.bench_options import BenchOptions
+from flasher.conformance.results import InitResult
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
@@ -39,33 +39,7 @@ _OUTPUT: Final = "-o/--output"
 _SEEN_SHOWN: Final = 100
 
 
-@dataclass(frozen=True)
-class AnswerDocument:
-    """What is written for a key of the profile."""
-
-    key: str
-    value: str | int | float | None
-    """None (null) where it stays open."""
-    seen: str
-    """What was seen, or why it stays open."""
-
-
-@dataclass(frozen=True)
-class InitDocument:
-    """What a device answered."""
-
-    subject: str
-    target: str
-    answers: list[AnswerDocument]
-    toml: str
-    """The profile; empty when nothing is written."""
-    file: str
-    """Its file; empty when none was written."""
-    stopped: str
-    """Why it ended early; empty when it did not."""
-
-
-DOCUMENTS: Final = (InitDocument,)
+DOCUMENTS: Final = (InitResult,)
 
 
 _what = partial(option, panel="what is written")
@@ -117,7 +91,7 @@ def init(
         value = "open" if one.value is None else str(one.value)
         rows.append(tuple(map(printable, (one.key, value, seen))))
     output.table(rows)
-    toml, code = "", ExitCode.OK
+    code = ExitCode.OK
     if asked.stopped:
         code = ExitCode.PARTIAL
         if was_stopped:
@@ -130,18 +104,10 @@ def init(
         toml = head + "\n" + asked.profile(start).to_toml(asked.open_keys)
         check_new(path, _OUTPUT, force=force)
         write_whole(path, toml.encode("utf-8"), _OUTPUT)
+        asked = replace(asked, toml=toml, file=str(path))
         total, still_open = len(asked.answers), len(asked.open_keys)
         output.result(
             f"{printable(str(path))}: {total - still_open} of {total} keys, each with its "
             f"observations; {still_open} stay open"
         )
-    return output.document(
-        document_of(
-            InitDocument,
-            asked,
-            answers=[document_of(AnswerDocument, one) for one in asked.answers],
-            toml=toml,
-            file=str(path) if toml else "",
-        ),
-        exit_code=code,
-    )
+    return output.document(asked, exit_code=code)

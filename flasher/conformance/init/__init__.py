@@ -7,17 +7,16 @@ determined stay open, with the reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 from flasher.conformance.init import entry_questions, transfer_questions
-from flasher.conformance.init.answers import Findings, KeyAnswer, Trial, decide, limit_answer
+from flasher.conformance.init.answers import Findings, Trial, decide, limit_answer
 from flasher.conformance.init.session import InitSession
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
 from flasher.conformance.restore import restore
-from flasher.conformance.results import CaseEnded, RunStopped
+from flasher.conformance.results import CaseEnded, InitResult, KeyAnswer, RunStopped
 from flasher.conformance.subject import Subject
 
 UPGRADES: Final = 100
@@ -92,33 +91,6 @@ _PATIENCE: Final[dict[str, Value]] = {
     "limits.window_s": 2.0,
 }
 """Limits to use before anything was measured."""
-
-
-@dataclass(frozen=True)
-class InitResult:
-    """Result of all questions. `answers` has every key of the profile, in order."""
-
-    subject: str
-    target: str
-    answers: tuple[KeyAnswer, ...]
-    stopped: str = ""
-    """Why it ended early, in which case the answers must not be used."""
-    was_brought_up: bool = True
-    """False when the good image could not be flashed before the first question."""
-
-    def profile(self, start: ConformanceProfile) -> ConformanceProfile:
-        """Make a profile of the answers; open keys keep their values of `start`."""
-        found = {one.key: one for one in self.answers if one.value is not None}
-        given = {key: one.value for key, one in found.items() if one.value is not None}
-        why = {key: one.seen for key, one in found.items()}
-        return ConformanceProfile(
-            {**start.given, **given}, {**start.rationales, **why}, start.deviations
-        )
-
-    @property
-    def open_keys(self) -> dict[str, str]:
-        """Keys that stay open, with the reason."""
-        return {one.key: one.seen for one in self.answers if one.value is None}
 
 
 def ask_device(

@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import Final, NamedTuple
 
-from flasher.conformance.profile import Value, profile_keys
+from flasher.conformance.profile import profile_keys
+from flasher.conformance.results import KeyAnswer
 
 MARGIN: Final = 3
 """Factor between the longest measured time and the limit."""
 _SHOWN: Final = 6
 _EITHER: Final = "either"
-
-
-@dataclass(frozen=True)
-class KeyAnswer:
-    """Value determined for a profile key, None where it stays open; `seen` is the observation or
-    the reason.
-    """
-
-    key: str
-    value: Value | None
-    seen: str
 
 
 class Trial(NamedTuple):

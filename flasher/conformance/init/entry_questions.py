@@ -7,11 +7,12 @@ from math import ceil
 from statistics import median
 from typing import Final
 
-from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
+from flasher.conformance.init.answers import Findings, Trial
 from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
 from flasher.conformance.patient_host import UPDATE_SPACING_S
 from flasher.conformance.restore import needs_power
+from flasher.conformance.results import KeyAnswer
 from flasher.conformance.wire import IMAGE_BYTES_MAX, WRITE, RawFrame, Received, Reply, packet_count
 
 _TOLERANCE_S: Final = 0.005

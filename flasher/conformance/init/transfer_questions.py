@@ -7,10 +7,11 @@ from math import floor
 from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
-from flasher.conformance.init.answers import Findings, KeyAnswer, Trial
+from flasher.conformance.init.answers import Findings, Trial
 from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import choice_words
+from flasher.conformance.results import KeyAnswer
 from flasher.conformance.wire import (
     PACKET_BYTES,
     RawFrame,
