@@ -109,7 +109,12 @@ def make_plan(
     else as `plan`.
     """
     chosen = as_dialect(dialect)
-    if not (chosen.has_upgrade if has_upgrade is None else has_upgrade):
+    if chosen.has_upgrade and has_upgrade is False:
+        raise UsageError(
+            "The profile says that the device has no upgrade (has_upgrade).",
+            remedy="Use the profile of the device that the image is for.",
+        )
+    if not (chosen.has_upgrade or has_upgrade):
         raise UsageError(
             f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
             remedy="Use --dialect welling if the device speaks it; a profile can enable it.",

@@ -183,6 +183,8 @@ def test_a_plan_by_names_takes_the_bit_rate_of_the_dialect_unless_one_is_given()
     assert make_plan(image, "bms") == plan(image, BMS, 250_000)
     assert make_plan(image, "pbu", "welling", bitrate_bps=500_000) == plan(image, OBC, 500_000)
     assert make_plan(image, WMC, MOTINOVA, has_upgrade=True).bitrate_bps == 125_000
-    for dialect, has_upgrade in ((MOTINOVA, None), ("welling", False)):
+    for has_upgrade in (None, False):
         with pytest.raises(UsageError, match="dialect has no upgrade"):
-            make_plan(image, "bms", dialect, has_upgrade=has_upgrade)
+            make_plan(image, "bms", MOTINOVA, has_upgrade=has_upgrade)
+    with pytest.raises(UsageError, match="profile says that the device has no upgrade"):
+        make_plan(image, "bms", "welling", has_upgrade=False)

@@ -178,6 +178,11 @@ def test_a_profile_of_the_working_directory_does_not_matter(
     assert make_recipe(tmp_path).targets[0].profile.attempts != 9
 
 
+def test_a_device_without_an_upgrade_is_reported_before_the_line_runs(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text("[bms]\nhas_upgrade = false\n")
+    assert "has no upgrade" in said(tmp_path, "profile = 'own.toml'\n" + USUAL)
+
+
 def test_a_profile_of_the_recipe_gives_the_version_query(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text(
         "[wmc.version_query]\ncommand = 0x3300\nanswer_id = 0x715\nanswer_command = 0x1540\n"
