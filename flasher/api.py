@@ -150,9 +150,7 @@ class Connection:
     def listen_first(
         self, dialect: str | Dialect = "welling", **watch: Unpack[CallOptions]
     ) -> None:
-        """Listen briefly for another tool, as every query does before it is sent. Raises BusError
-        if one is detected.
-        """
+        """Listen briefly for another tool. Raises BusError if one is detected."""
         with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
             steps.listen_first()
 
@@ -318,9 +316,7 @@ class Device:
             return steps.identify()
 
     def is_present(self, **watch: Unpack[CallOptions]) -> bool:
-        """True if it sends a message, or answers a version query; nothing else is sent to it. Takes
-        5 s at most.
-        """
+        """True if it sends or answers anything. Sends only a version query; takes 5 s at most."""
         with self._turn(watch) as steps:
             return steps.is_present()
 
@@ -455,9 +451,7 @@ class Device:
             return steps.verify(image, as_level(level))
 
     def reset(self, **watch: Unpack[CallOptions]) -> None:
-        """Restart its application. Raises NoAnswerError if it does not confirm, or has no
-        documented reset.
-        """
+        """Restart its application. Raises NoAnswerError if unconfirmed or not documented."""
         with self._turn(watch) as steps:
             steps.reset()
 
@@ -618,9 +612,7 @@ class _LoopBridge:
         return self.cancelled is not None and self.cancelled()
 
     def handle_in_loop(self, event: object) -> None:
-        """Handle an event in the loop, and wait for that in the thread while the loop exists.
-        Raises exceptions of the handler.
-        """
+        """Handle an event in the loop, and wait for that. Raises exceptions of the handler."""
         from concurrent.futures import Future, wait  # noqa: PLC0415  only needed with a loop
 
         handled: Future[None] = Future()
@@ -675,9 +667,7 @@ class Job:
         return self
 
     def in_session(self) -> Job:
-        """Return this job for a device that an earlier upgrade may have left in its session
-        (R26).
-        """
+        """Return this job for a device that may have been left in its session (R26)."""
         return replace(self, options=replace(self.options, in_session=True))
 
     def run(self, device: Device, **watch: Unpack[CallOptions]) -> Result:

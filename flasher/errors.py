@@ -134,9 +134,7 @@ class ErrorCode(StrEnum):
 def did_you_mean(
     word: str, known: Iterable[str], spelled: Callable[[str], str] = lambda known: known
 ) -> str:
-    """Suggest the closest known word, `spelled` for people, as a sentence with a trailing space; ""
-    if none is close.
-    """
+    """Suggest the closest known word as a sentence with a trailing space; "" if none is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f"Did you mean {spelled(close[0])}? " if close else ""
 

@@ -161,9 +161,7 @@ def parse_toml(raw: bytes) -> dict[str, Any]:
 
 
 def parse_json(raw: bytes) -> Any:
-    """Parse JSON. Raises ValueError as `parse_toml`, and for infinite numbers, which Python accepts
-    but JSON does not have.
-    """
+    """Parse JSON. Raises ValueError as `parse_toml`, and for infinite numbers."""
     try:
         document = json.loads(raw)
     except RecursionError as error:

@@ -163,9 +163,7 @@ T = TypeVar("T", Began, Ended)
 
 
 class FlashHistory:
-    """The history file. Writing raises OSError, or TimeoutError if another program holds the
-    lock.
-    """
+    """The history file. Writing raises OSError, or TimeoutError if it is locked."""
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or user_data_path("flasher", appauthor=False) / "history.jsonl"

@@ -71,9 +71,7 @@ logging.getLogger(ROOT).addHandler(logging.NullHandler())
 
 
 def log_event(event: object) -> None:
-    """Log an event: phases as INFO, problems as WARNING, others as DEBUG. The record has the event
-    as `event`.
-    """
+    """Log an event: phases as INFO, problems as WARNING, others as DEBUG; `event` in `extra`."""
     logger = _DEVICE if type(event) in BY_DEVICE else _HOST
     level = level_of(event)
     if logger.isEnabledFor(level):

@@ -146,9 +146,7 @@ class DeviceInfo:
 
     @property
     def no_faults(self) -> str:
-        """Meaning of no received faults: they are sent unasked, and only one document gives their
-        interval.
-        """
+        """Text for no received faults; only one document gives their interval."""
         is_periodic = self.dialect is WELLING
         proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
         return f"none received{proviso}"
@@ -201,9 +199,7 @@ class Procedures:
         )
 
     def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:
-        """Wait until this time. Return True if the user cancelled, or the terminal was closed and
-        that ends the call.
-        """
+        """Wait until this time; True if cancelled, or the terminal closed and may end it."""
         self.clock.wait_until(moment)
         return self._is_cancelled(hang_up_ends)
 
@@ -222,9 +218,7 @@ class Procedures:
     # -- asking ----------------------------------------------------------------------------------
 
     def listen_first(self, *, may_cancel: bool = True) -> None:
-        """Listen for another tool before a query, which would disturb its transfer. Raises BusError
-        if one is detected.
-        """
+        """Listen for another tool before a query. Raises BusError if one is detected."""
         if not self.is_alone:
             _check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
 
@@ -516,9 +510,7 @@ class Procedures:
         return result
 
     def _end_when_off(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Tap that raises BusError when the adapter reports bus-off: messages of the device are
-        lost until it is back.
-        """
+        """Tap that raises BusError at bus-off, because messages are lost until it ends."""
         if frame[4] and self.link.is_off:
             raise bus_off_error(str(self.link))
 
@@ -622,9 +614,7 @@ def check_sample(image: Image, link: Link) -> None:
 
 
 def _may_end(session: UpgradeSession) -> Callable[[], bool]:
-    """Return whether a closed terminal may end a session: while the device still has its
-    application.
-    """
+    """Return whether a closed terminal may end a session: before the device erases."""
     return lambda: not session.has_begun_to_erase
 
 

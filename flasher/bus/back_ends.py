@@ -107,9 +107,7 @@ def meaning_in_sending(error: Exception, interface: str) -> Meaning:
 
 
 def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTrouble:
-    """Classify an exception raised by `recv`; return the trouble if the controller reports trouble
-    on the bus and the adapter works.
-    """
+    """Classify an exception raised by `recv`; a BusTrouble is reported by a working adapter."""
     chain = list(causes(error))
     if _is_bus_off(chain, interface):
         return Meaning.BUS_OFF
@@ -124,9 +122,7 @@ def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTroub
 
 
 def is_foreign_datagram(error: Exception) -> bool:
-    """True for a datagram on udp_multicast's port that is not a CAN frame; any program may send
-    one.
-    """
+    """True for a datagram on udp_multicast's port that is not a CAN frame."""
     return _FOREIGN_DATAGRAM in str(error)
 
 

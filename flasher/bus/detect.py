@@ -137,9 +137,7 @@ class Detection:
         self._end()
 
     def collect(self, cancelled: Callable[[], bool] = lambda: False) -> DetectionResult:
-        """Return the result; waits at most for the rest of the time, or until `cancelled` (checked
-        five times a second).
-        """
+        """Return the result; `cancelled` is called five times a second and ends the wait."""
         self._cancelled = cancelled
         detected = DetectionResult()
         if self._asks_kernel:

@@ -71,9 +71,7 @@ class Echoes:
         self.ids.add(frame[0])
 
     def reopened(self) -> None:
-        """Note that the link has a new handle: it receives frames that the driver's queue still
-        contained.
-        """
+        """Expect echoes of the old handle's frames: the driver may still send them."""
         self._expected.extend(self._unreturned)
         self._unreturned.clear()
 

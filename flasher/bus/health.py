@@ -137,9 +137,7 @@ def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
 
 
 def _decode_pcan(kind_of_error: int, data: bytes) -> BusTrouble:
-    """Decode a frame of PCAN-Basic: the id is the kind of error; the data are direction, position
-    and both counters.
-    """
+    """Decode a frame of PCAN-Basic: id = kind of error; data = direction, position, counters."""
     is_received, place, rx_errors, tx_errors = data[:4]
     names = {0: "", 1: "bit error", 2: "form error", 4: "stuff error"}
     words = names.get(kind_of_error, "bus error")
@@ -311,9 +309,7 @@ class HealthKeeper:
         tx_errors: int | None = None,
         rx_errors: int | None = None,
     ) -> LinkHealth:
-        """Return the current health; values reported by the adapter itself take precedence over
-        error frames.
-        """
+        """Return the health; values from the adapter override those from error frames."""
         if state is ControllerState.UNKNOWN:
             state = self.state
         if tx_errors is None:

@@ -117,9 +117,7 @@ def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
 
 
 def start_command(channel: object, bitrate_bps: object) -> str:
-    """Command for root to start a SocketCAN interface; virtual ones, recognised by name, have no
-    options.
-    """
+    """Command for root to start a SocketCAN interface; virtual ones need no options."""
     if str(channel).startswith(tuple(VIRTUAL_KINDS)):
         return f"ip link set {channel} up"
     return f"ip link set {channel} up type can bitrate {bitrate_bps}"
@@ -142,9 +140,7 @@ def find_commands(channel: object) -> tuple[str, str]:
 
 
 def restart_commands(channel: object) -> tuple[str, str]:
-    """Commands for root to restart an interface after bus-off with its settings. `type can restart`
-    depends on the driver.
-    """
+    """Commands for root to restart an interface after bus-off; works with every driver."""
     return (f"ip link set {channel} down", f"ip link set {channel} up")
 
 

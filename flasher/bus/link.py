@@ -99,16 +99,12 @@ class StampingLink(Link, Protocol):
 
     @property
     def received_at(self) -> float | None:
-        """Arrival time of the frame that `receive` last returned, in seconds on the link's clock;
-        None without a reliable stamp.
-        """
+        """Arrival time of the last frame on the link's clock; None if not reliable."""
         ...
 
 
 class MonotonicClock:
-    """The computer's finest clock, `time.perf_counter`; not affected by changes of the wall
-    clock.
-    """
+    """The finest clock, `time.perf_counter`; unaffected by changes of the wall clock."""
 
     speed: Final = 1.0
     now = staticmethod(time.perf_counter)

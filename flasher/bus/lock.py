@@ -88,9 +88,7 @@ def acquire(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]
 
 
 def lock_name(config: Mapping[str, Any]) -> str:
-    """Return the file name that identifies an adapter, however it is named. The folder may be
-    shared with other computers.
-    """
+    """File name for an adapter, however it is named, on this computer."""
     interface = str(config["interface"])
     place = {key: str(config[key]) for key in _PLACE if config.get(key) is not None}
     if interface == _ON_A_PORT:

@@ -110,9 +110,7 @@ def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) -> bool:
-    """True if arguments, a variable or a file name an adapter, or only its channel. Raises
-    UsageError as `bus_config`.
-    """
+    """True if arguments, a variable or a file name an adapter. Raises as `bus_config`."""
     try:
         return bool(bus_config(given, fallback))
     except BusError:

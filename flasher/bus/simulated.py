@@ -114,9 +114,7 @@ class SimulatedBus:
         self._silence_hosts()
 
     def bus_off(self, restart_after_s: float | None = None) -> None:
-        """Set the host's controller bus-off: nothing is sent or received until `plug`, or until it
-        restarts automatically.
-        """
+        """Set the host's controller bus-off until `plug`, or for `restart_after_s`."""
         now = self.clock.now()
         self.faults.go_off(now, None if restart_after_s is None else now + restart_after_s)
         self._silence_hosts()
@@ -127,9 +125,7 @@ class SimulatedBus:
 
     @property
     def is_unacknowledged(self) -> bool:
-        """True while the host's adapter is alone: its frames are never sent, its queue fills up,
-        and it receives nothing.
-        """
+        """True while the host is alone: it can neither send nor receive, and its queue fills up."""
         return self.faults.is_alone
 
     @is_unacknowledged.setter

@@ -19,9 +19,7 @@ _ERROR_BITS: Final = 20
 
 
 def _error_frame(classes: int, controller: int = 0, tx_errors: int = 0) -> Frame:
-    """Create a frame in Linux's format: class bits in the id, controller state and counters in the
-    data.
-    """
+    """Create a frame in Linux's format: class bits in the id, state and counters in the data."""
     return Frame(classes, bytes((0, controller, 0, 0, 0, 0, tx_errors, 0)), is_error=True)
 
 
@@ -84,9 +82,7 @@ class AdapterFaults:
         self._look_ahead()
 
     def try_in_vain(self, now: float, frame_s: float, bit_s: float) -> None:
-        """Repeat a frame without acknowledgement: the error counter rises to error-passive and
-        stays there.
-        """
+        """Send without acknowledgement: the error counter rises to error-passive."""
         if not self.is_alone or self._has_reported:
             return
         self._has_reported = True

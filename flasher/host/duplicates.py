@@ -119,9 +119,7 @@ class _Announcements:
 
 
 class _Balance:
-    """Counts messages sent against answers. A device that hung answers late, so unanswered messages
-    keep waiting.
-    """
+    """Counts messages sent against answers, which may come late from a device that hung."""
 
     def __init__(self) -> None:
         self._open = 0
@@ -132,9 +130,7 @@ class _Balance:
         self._has_left = True
 
     def is_odd(self) -> bool:
-        """Count an answer; True if it is an excess one. Before anything was sent, it belongs to
-        another tool.
-        """
+        """Count an answer; True if it is an excess one (never before anything was sent)."""
         if not self._open:
             return self._has_left
         self._open -= 1
@@ -142,9 +138,7 @@ class _Balance:
 
 
 class _Runs:
-    """Runs of ACKs with and without general feedback: one device confirms every message or none
-    (R15).
-    """
+    """Runs of ACKs with and without feedback: one device confirms all messages or none (R15)."""
 
     def __init__(self) -> None:
         self._has_feedback = False

@@ -184,9 +184,7 @@ def new_version(image: Image, release: Release | None) -> str | None:
 
 
 def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[CheckResult]:
-    """Check whether the image and its manifest match the target, and whether it can be a
-    program.
-    """
+    """Check whether image and manifest match the target, and whether it can be a program."""
     yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
@@ -231,9 +229,7 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
 def judge_device(
     image: Image, target: Target, identity: Identity, seen: DeviceAnswers
 ) -> Iterator[CheckResult]:
-    """Compare the image with the answers of the running application; `seen` is empty if it did not
-    answer.
-    """
+    """Compare the image with the application's answers; `seen` is empty without any."""
     if seen.version is None:
         yield _versions_unknown(identity, target)
     else:

@@ -219,9 +219,7 @@ def ask_all(
 
 
 def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
-    """Wait for answers of a second device to the last queries, and repeat those with an excess
-    answer (R27).
-    """
+    """Wait for a second device's answers, and repeat queries with an excess answer (R27)."""
     if not any(query.answers for query in queries):
         return
     if (yield from run.await_second_device()):
@@ -277,9 +275,7 @@ class Queries(Runner[None]):
 
 
 def memory_requests(start: int, end: int) -> Iterator[Request]:
-    """Yield the requests for the bytes from `start` up to `end`, exclusive (R5), each for 128 bytes
-    at most.
-    """
+    """Yield requests for `start` up to `end`, exclusive (R5), of 128 bytes at most."""
     for at in range(start, end, MEMORY_PIECE_SIZE):
         yield Request(READ_MEMORY, ReadMemory(at, min(at + MEMORY_PIECE_SIZE, end)))
 

@@ -135,9 +135,7 @@ class Runner(Generic[T]):
         return came is Signal.CANCEL
 
     def finish_message(self) -> Stage[None]:
-        """Wait until a partly sent message is complete, but not for an adapter that accepts nothing
-        more.
-        """
+        """Finish a partly sent message, unless the adapter accepts nothing more."""
         self.tx.drop_unstarted()
         give_up_at = self.now + self.timings.command_timeout_s
         while not self.tx.idle and self.now < give_up_at:
@@ -238,9 +236,7 @@ class Runner(Generic[T]):
 
 
 def filtered(stage: Stage[T], look: Callable[[StageInput], StageInput]) -> Stage[T]:
-    """Run a stage whose inputs are first processed by `look`, which returns the input to pass
-    on.
-    """
+    """Run a stage whose inputs first pass through `look`."""
     try:
         until = next(stage)
         while True:

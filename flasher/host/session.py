@@ -160,9 +160,7 @@ class UpgradeSession(Runner[Result]):
 
     @property
     def has_begun_to_erase(self) -> bool:
-        """True once an update command is being sent or was sent: ending the session then leaves the
-        device without an application.
-        """
+        """True once an update command is being sent or was sent, which may erase."""
         return self._upgrade.has_begun_to_erase
 
     @property
@@ -256,9 +254,7 @@ class UpgradeSession(Runner[Result]):
         return self._judge(findings)
 
     def _postponed(self, finding: CheckResult) -> CheckResult:
-        """Postpone an uncheckable rule of a silent device until it has shown whether it has an
-        application.
-        """
+        """Postpone an uncheckable rule until a silent device shows its application."""
         if finding.ending is None or not finding.is_unchecked:
             return finding
         self._upgrade.unchecked = finding

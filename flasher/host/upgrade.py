@@ -240,9 +240,7 @@ class UpgradeStage:
 
     @property
     def _is_updating(self) -> bool:
-        """True once the update command of this attempt was sent: after that, a restored adapter
-        continues the same attempt.
-        """
+        """True once this attempt sent its update command; it then survives a lost adapter."""
         return self._at.first_update_left_at is not None
 
     @property
@@ -649,9 +647,7 @@ class UpgradeStage:
             self._run.emit(events.CheckMade("boot-version", "passed", text))
 
     def _miss_boot(self, row: ReceivedContent) -> None:
-        """Handle a missing boot version; a device that may be in an open session gets an update
-        command (R26).
-        """
+        """Handle a missing boot version; an open session gets an update command (R26)."""
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
@@ -960,9 +956,7 @@ class UpgradeStage:
         self._end(Ending.TWO_DEVICES, row, self._duplicates.evidence)
 
     def _end_out_of_time(self, row: ReceivedContent) -> None:
-        """End like an earlier attempt, if the upgrade continued only because nothing could be
-        lost.
-        """
+        """End like an earlier attempt if only retries without risk followed it."""
         ending = Ending.OUT_OF_TIME
         if self.is_yielding:
             ending = Ending.SECOND_TOOL

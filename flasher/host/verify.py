@@ -172,9 +172,7 @@ def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
 def memory_check(
     plan: Plan, options: UpgradeOptions, running_version: str | None
 ) -> Runner[Verification]:
-    """Create an engine that reads the whole image back. Raises ValueError for an image without
-    base.
-    """
+    """Create an engine that reads the image back. Raises ValueError without a base."""
     if plan.image.base is None:
         raise ValueError("an image without a base cannot be read back")
     return Runner(
@@ -185,9 +183,7 @@ def memory_check(
 
 
 def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stage[Verification]:
-    """Wait for the new application and ask for its version. Raises ValueError if the target has no
-    version query.
-    """
+    """Wait for the application and ask for its version. Raises ValueError without a query."""
     request = options.version_request_for(plan.target)
     if request is None:
         raise ValueError("this target has no version query")

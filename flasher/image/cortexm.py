@@ -141,9 +141,7 @@ def check_starts_inside(image: Image) -> None:
 
 
 def _inner_tables(image: Image) -> list[int]:
-    """Addresses in an image of known base at which a second program seems to start, as in a merged
-    file.
-    """
+    """Addresses at which a second program seems to start, as in a merged file."""
     if image.base is None:
         return []
     found = []

@@ -99,9 +99,7 @@ def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
 
 
 def machine_of(head: bytes) -> int | None:
-    """Return the processor of an ELF file that starts with `head` (e_machine); None for a truncated
-    header.
-    """
+    """Return the processor (e_machine) of a file with this `head`; None if truncated."""
     order = _BYTE_ORDERS.get(head[_BYTE_ORDER_AT]) if len(head) >= _MACHINE_END else None
     return None if order is None else int(Struct(f"{order}H").unpack_from(head, _MACHINE_AT)[0])
 
@@ -134,9 +132,7 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
 def _table(
     data: bytes, source: str, what: str, entry: Struct, place: tuple[int, int, int]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the entries of a table; `place` is its offset, and the size and number of its
-    entries.
-    """
+    """Yield the entries of a table at `place`: offset, size and number of entries."""
     at, size, count = place
     if count and (size != entry.size or at + count * size > len(data)):
         raise _refuse(source, f"{what} truncated")

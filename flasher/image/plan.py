@@ -203,9 +203,7 @@ def _packet_wire(data: bytes, number: int, total: int, can_id: int) -> bytes:
 
 
 def _packet_bits(data: bytes, total: int, can_id: int) -> array[int]:
-    """Return the bit times of each packet. Packets are whole frames, so that they form one
-    stream.
-    """
+    """Bit times of each packet. Packets are whole frames, so they form one stream."""
     bits = array("H")
     for first in range(1, total + 1, _CHUNK_PACKETS):
         numbers = range(first, min(first + _CHUNK_PACKETS, total + 1))

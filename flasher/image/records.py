@@ -146,9 +146,7 @@ class _Reading:
         self._loads_left = PIECES_MAX
 
     def add(self, address: int, data: bytes, text: str, prefix: str = "") -> None:
-        """Add a record. Raises ImageError outside the 32-bit address space, and as
-        `SparseBytes.add`.
-        """
+        """Add a record. Raises ImageError past 32-bit addresses, and as `SparseBytes.add`."""
         end = address + len(data)
         if end > ADDRESS_SPACE:
             raise self._scanner.refuse("the record runs past the last 32-bit address, 0xFFFFFFFF")

@@ -144,9 +144,7 @@ class Release:
         )
 
     def check_bytes(self, image: Image) -> None:
-        """Raise ImageError if size, SHA-256 or firmware version of the bytes to send differ from
-        this release.
-        """
+        """Raise ImageError if size, SHA-256 or version of the image differ from this release."""
         for finding in self.findings(image):
             if finding.agrees is False and finding.key != "target":
                 raise ImageError(
@@ -167,9 +165,7 @@ def _compared(key: str, stated: str | None, found: str | None) -> Comparison:
 
 
 def target_problem(image: Image, release: Release | None, target: Target) -> str | None:
-    """Why an image is not meant for `target`, by its manifest or the names inside it; None if
-    nothing contradicts.
-    """
+    """Why manifest or names inside contradict `target`; None if nothing does."""
     asked = target.node.name
     if release is not None and release.target != target:
         return f"by its manifest the image is for the {release.target.node.name}, not the {asked}"

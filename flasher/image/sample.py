@@ -19,9 +19,7 @@ _MARK_IN_RECORDS: Final = MARK.hex().encode("ascii")
 
 
 def is_sample(image: Image) -> bool:
-    """True if the image is, or contains, a firmware sample, even if a record file was read as a raw
-    binary.
-    """
+    """True if the image contains a firmware sample, even as an unparsed record file."""
     return MARK in image.data or _MARK_IN_RECORDS in image.data.lower()
 
 

@@ -115,9 +115,7 @@ class SparseBytes:
         return self._starts[index] + len(self._pieces[index])
 
     def _insert(self, index: int, start: int, data: bytes) -> int:
-        """Insert `data` before piece `index`, or append it to the previous one; return the next
-        index.
-        """
+        """Insert `data` before piece `index` or append it there; return the next index."""
         self.size_bytes += len(data)
         if self.size_bytes > IMAGE_MAX_SIZE:
             raise too_large_error(self.source, self.size_bytes, more=True)

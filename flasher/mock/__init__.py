@@ -1,3 +1,1 @@
-"""Device model of upgradable devices, written from the documents alone: it shares only
-`flasher.protocol` with the host.
-"""
+"""Device model, written from the documents: shares only `flasher.protocol` with the host."""

@@ -63,9 +63,7 @@ class BatteryReading:
 
 
 class Battery:
-    """Alternates between riding and charging, or rests; `seed` determines the differences between
-    its cells.
-    """
+    """Alternates between riding and charging, or rests; `seed` varies its cells."""
 
     def __init__(self, use: Use = "riding", seed: int = 1) -> None:
         self._use = use

@@ -188,9 +188,7 @@ class MockDevice(Machine):
         return self.erase_count + self.program_count
 
     def readback(self, size_bytes: int | None = None) -> bytes:
-        """First `size_bytes` of the application area (None: all), complete or torn, as read by a
-        debugger.
-        """
+        """First `size_bytes` (None: all) of the application area, complete or torn."""
         return self.store.read(
             self.profile.application_area_bytes if size_bytes is None else size_bytes
         )

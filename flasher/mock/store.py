@@ -42,9 +42,7 @@ def with_checksum(body: bytes, size_bytes: int) -> bytes:
 
 
 def factory_image(profile: DeviceProfile) -> bytes:
-    """Initial application of a device: its version among filler, and the checksum of R7, so that
-    every profile accepts it.
-    """
+    """Initial application: its version among filler, with the checksum of R7."""
     size_bytes = min(_FACTORY_IMAGE_BYTES, profile.application_area_bytes)
     body = b"factory application " + profile.factory_version.encode("ascii") + b"\x00"
     body += bytes(index % 251 for index in range(size_bytes - len(body) - _CHECKSUM.size))

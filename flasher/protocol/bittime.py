@@ -109,9 +109,7 @@ def frame_bits(frame: Frame) -> int:
 
 
 def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
-    """Return the tables of `frame_bits` for these ids, for generators of code in another
-    language.
-    """
+    """Return the tables of `frame_bits` for these ids, for generated code."""
     return {
         "fixed": [fixed_bits(size) for size in range(FRAME_DATA_SIZE + 1)],
         "heads": {
@@ -133,9 +131,7 @@ def message_bits(frames: Iterable[Frame]) -> int:
 
 
 class _Columns:
-    """Run the same state machine on `count` frames of one id and size, one byte column at a
-    time.
-    """
+    """The same state machine for `count` frames at once, one byte column at a time."""
 
     def __init__(self, can_id: int, size: int, count: int) -> None:
         state, inserted, crc = _head(can_id, size)

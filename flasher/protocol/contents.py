@@ -1,6 +1,4 @@
-"""Contents of the messages of chapter 3, one class each (5.1, 5.2). `catalogue` lists who sends
-them.
-"""
+"""Contents of the messages of chapter 3, one class each (5.1, 5.2); senders are in `catalogue`."""
 
 from __future__ import annotations
 
@@ -118,9 +116,7 @@ class GeneralFeedback(Content):
 
 @dataclass(frozen=True)
 class RunningInformation(Content):
-    """Present state of the battery; current is negative while it discharges. Four bytes are
-    reserved (R1).
-    """
+    """Present state of the battery. Four bytes are reserved (R1)."""
 
     voltage_mv: int = number(2, "mV")
     mean_current_ma: int = number(2, "mA", signed=True)

@@ -141,9 +141,7 @@ class Transmitter:
             self.due_at = 0.0
 
     def all_left(self, now: float) -> None:
-        """Assume that everything was on the wire by `now`, because it was answered: an in-process
-        bus is faster than its bit rate.
-        """
+        """Assume that all was sent by `now`: an answer came, as on a fast in-process bus."""
         self.left_at = min(self.left_at, now)
 
     def abandon(self, quiet_until: float) -> None:

@@ -325,9 +325,7 @@ class Content:
         return cls(*values)
 
     def shown(self) -> Iterator[tuple[str, str, str]]:
-        """Yield label, value and unit of every field for people; reserved bytes only if not
-        zero.
-        """
+        """Yield label, value and unit of every field; reserved bytes only if not zero."""
         for name, codec in self.LAYOUT:
             value = getattr(self, name)
             if not isinstance(codec, ReservedField) or any(value):

@@ -241,9 +241,7 @@ class Ack(_Numbered):
 
 @dataclass(frozen=True)
 class Nak(_Numbered):
-    """Bootloader to tool: packet not received correctly; after the end of transfer: image refused
-    (R6).
-    """
+    """Bootloader to tool: packet not received; after the end of transfer: image refused (R6)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.NAK

@@ -68,9 +68,7 @@ def can_id(sender: Node, receiver: Node | None) -> int:
 
 
 class Command(IntEnum):
-    """Commands in wire order: the first byte is the serial number, the second the size of the
-    data.
-    """
+    """Commands in wire order: serial number, then size of the data."""
 
     RESET = 0x4205
     GENERAL_FEEDBACK = 0x5503

@@ -70,9 +70,7 @@ def encode_text(text: str, size_bytes: int) -> bytes:
 
 
 def decode_text(field: bytes) -> str:
-    """Decode a field to escaped text: up to the terminator, or the whole field if the rule is
-    broken.
-    """
+    """Decode a field to escaped text: up to the terminator, or all if the rule is broken."""
     text, end, rest = field.partition(TEXT_END)
     if end and rest.strip(TEXT_FILLER):
         text = field

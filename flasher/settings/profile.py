@@ -287,9 +287,7 @@ class Profile:
         return self.sources.get(name, DEFAULT) != DEFAULT
 
     def identity(self, **overrides: Any) -> Identity:
-        """Create the requirements for an upgrade, with the limits of this product. `overrides` are
-        the other fields of `Identity`.
-        """
+        """Create the checks' settings; `overrides` are the other fields of `Identity`."""
         return Identity(
             low_charge_percent=self.low_charge_percent,
             in_use_ma=self.in_use_ma,
@@ -298,9 +296,7 @@ class Profile:
         )
 
     def values(self) -> Iterator[tuple[str, object]]:
-        """Yield every value with its name; those of a table as TABLE.NAME. A missing table is one
-        value, None.
-        """
+        """Yield every value with its name (TABLE.NAME in a table); None for a missing table."""
         for name in (known.name for known in fields(self)):
             value = getattr(self, name)
             if name in _TABLES and value is not None:

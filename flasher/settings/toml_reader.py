@@ -362,9 +362,7 @@ def _number(value: float) -> str:
 
 
 def _found(document: Any, location: Location) -> tuple[Location, object]:
-    """Return the part of a location that exists, without names added by the library, and its
-    value.
-    """
+    """Return the existing part of a location, without the library's names, and its value."""
     for at, part in enumerate(location):
         is_there = (isinstance(document, dict) and part in document) or (
             isinstance(document, list) and isinstance(part, int) and part < len(document)

@@ -280,9 +280,7 @@ class UpdateTextOfFour(MockDevice):
 
 @variant("reset-from-any-node", "RS-04")
 class ResetFromAnyNode(MockDevice):
-    """Takes a reset that another node than the tool sends. Goes by the receiver in an id, not by
-    the sender.
-    """
+    """Takes a reset that another node than the tool sends. Checks only the receiver."""
 
     def _take_message(self, message: Message, now: float) -> None:
         if messages.decode(message) == messages.ResetCommand():

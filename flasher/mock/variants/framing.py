@@ -30,9 +30,7 @@ from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler, en
 
 _CRC_AT: Final = slice(-CRC_SIZE - len(TAIL), -len(TAIL))
 _BACK_TO_BACK_S: Final = 0.0007
-"""A frame that ends so soon after the last one followed it without a pause: at 250 kbit/s a frame
-takes 0.4 to 0.55 ms.
-"""
+"""Maximum distance of frames without a pause; at 250 kbit/s one takes 0.4 to 0.55 ms."""
 _KNOWN_COMMANDS: Final = frozenset(Command) | {item.command for item in ITEMS}
 _KNOWN_MODES: Final = frozenset(Mode)
 _WRITTEN: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
@@ -221,9 +219,7 @@ class FeedbackCrcMirrored(MockDevice):
 
 @variant("crc-zero-accepted", "CR-03")
 class CrcZeroAccepted(Reassembler):
-    """Takes a message whose CRC is 00000000. Has a way past the check, for the first tests on a
-    desk.
-    """
+    """Takes a message whose CRC is 00000000. Kept for bench tests."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or wire[_CRC_AT] == bytes(CRC_SIZE)
