@@ -42,23 +42,23 @@ _Static_assert(sizeof BOOT_VERSION == 7, "BOOT_VERSION has the form Vx.x.x");
 
 typedef enum {
     ANNOUNCING, /* until an update command comes; due: the next version, or the window's end */
-    ERASING,    /* one sector in each turn */
-    TRANSFER,   /* due: the end of a pause that is too long */
-    STARTING,   /* the last frames leave, then the application starts; due: without them */
-    RESTARTING, /* the same, then a reset */
+    ERASING,    /* one sector per pass */
+    TRANSFER,   /* due: the end of the longest pause */
+    STARTING,   /* the application starts when the last frames have left, or when due */
+    RESTARTING, /* likewise, with a reset */
 } phase;
 
 static struct {
     phase phase;
     uint32_t due_ms;
     bool has_application;
-    uint8_t versions; /* of this burst */
+    uint8_t versions; /* sent in this burst */
 
     uint32_t erase_step;
-    uint32_t size; /* of the image, as the update command says */
-    uint32_t crc;  /* of the packets stored */
+    uint32_t size; /* of the image, from the update command */
+    uint32_t crc;  /* of the stored packets */
     uint16_t packets;
-    uint16_t next; /* packet wanted, from 1; packets + 1 when all are there */
+    uint16_t next; /* next packet, from 1; packets + 1 when all are stored */
 
     message_receiver receiver;
     can_frame queue[QUEUE_FRAMES];
@@ -68,7 +68,7 @@ static struct {
 
 /* -- sending ---------------------------------------------------------------------------------- */
 
-/* What does not fit is not sent: nobody takes the frames, and the tool asks again. */
+/* Drops a message when the queue is full: no node acknowledges frames, and the tool repeats. */
 static void report(uint16_t command, const uint8_t *data)
 {
     uint8_t bytes[REPORT_MAX_BYTES];
@@ -110,7 +110,7 @@ static void enter(phase next_phase, uint32_t due_in_ms)
     boot.due_ms = hal_ms() + due_in_ms;
 }
 
-/* A time up to 2^31 ms ago, not one ahead; right across the overflow of hal_ms. */
+/* True for a time up to 2^31 ms ago, correct across the overflow of hal_ms. */
 static bool is_due(void)
 {
     return hal_ms() - boot.due_ms < 0x80000000u;
@@ -128,7 +128,7 @@ void boot_start(void)
     announce();
 }
 
-/* NAK of the packet that is wanted, or of the last one. */
+/* NAK with the number of the next packet, or of the last one. */
 static void refuse(void)
 {
     report_number(REPORT_NAK, boot.next > boot.packets ? boot.packets : boot.next);
@@ -150,9 +150,9 @@ static void on_update(const uint8_t *data)
     if (!same(data, UPDATE_NAME, 7) || size == 0 || size > APPLICATION_BYTES)
         return; /* before anything is erased */
     if (boot.phase == ERASING && size == boot.size)
-        return; /* repeated: one request will answer both */
+        return; /* repeated: one request answers both */
     if (boot.phase == TRANSFER && size == boot.size && boot.next == 1) {
-        report_number(REPORT_REQUEST, 0); /* repeated: all is erased */
+        report_number(REPORT_REQUEST, 0); /* repeated: already erased */
         enter(TRANSFER, PAUSE_MS);
         return;
     }
@@ -180,13 +180,13 @@ static void on_packet(const uint8_t *data)
         const uint32_t size = left < PACKET_BYTES ? left : PACKET_BYTES;
         if (!store_write(offset, data + 5, size)) {
             refuse();
-            announce(); /* what was written cannot be written again: it has to be erased */
+            announce(); /* written flash cannot be written again without an erase */
             return;
         }
         boot.crc = crc_add(boot.crc, data + 5, size);
         ++boot.next;
     }
-    report_number(REPORT_ACK, number); /* an older one too: its ACK was lost */
+    report_number(REPORT_ACK, number); /* also of an older packet, whose ACK was lost */
 }
 
 static void on_end(const uint8_t *data)
@@ -227,12 +227,12 @@ static void on_message(void)
         if (RESET_RESTARTS && same(data, "RESET", 5))
             enter(RESTARTING, DRAIN_MS);
         break;
-    default: /* the application's */
+    default: /* commands of the application */
         break;
     }
 }
 
-/* A message of the transfer did not arrive whole. */
+/* A message of the transfer arrived damaged or incomplete. */
 static void on_damage(void)
 {
     const uint16_t command = message_command(&boot.receiver);
@@ -258,7 +258,7 @@ void boot_receive(const can_frame *frame)
     }
 }
 
-/* -- one turn --------------------------------------------------------------------------------- */
+/* -- main loop -------------------------------------------------------------------------------- */
 
 static void send_version(void)
 {

@@ -1,16 +1,16 @@
-/* The upgrade protocol (Welling V1.0.0, chapter 5), as the device speaks it. */
+/* The device's side of the upgrade protocol (Welling V1.0.0, chapter 5). */
 #ifndef BOOT_H
 #define BOOT_H
 
 #include "hal.h"
 
-/* After each reset, before all others. */
+/* To be called once after each reset, before the other functions. */
 void boot_start(void);
 
-/* A frame was received, of any kind. boot_poll follows. */
+/* Processes a received frame of any kind. Call boot_poll next. */
 void boot_receive(const can_frame *frame);
 
-/* One turn: returns after how many milliseconds the next one is due at the latest; sooner is fine. */
+/* One pass of the main loop; returns the longest time until the next one, in milliseconds. */
 uint32_t boot_poll(void);
 
 /* The next frame to send, if there is one. */

@@ -1,8 +1,8 @@
-/* What a product decides. Each value can be given to the compiler (-DSECTOR_BYTES=1024) instead. */
+/* Settings of the product. The compiler can override each value (-DSECTOR_BYTES=1024). */
 #ifndef CONFIG_H
 #define CONFIG_H
 
-/* -- who it is -------------------------------------------------------------------------------- */
+/* -- identity --------------------------------------------------------------------------------- */
 
 #define TARGET_WMC 1
 #define TARGET_BMS 2
@@ -18,8 +18,8 @@
 
 /* -- flash memory, in bytes ------------------------------------------------------------------- */
 
-/* From the first byte of the application on. The record that says that an application is whole has
- * the sector behind the application to itself, and nothing else may write there. */
+/* Offsets start with the application. The record that marks the application as complete occupies
+ * the sector after it, which nothing else may write. */
 #ifndef APPLICATION_BYTES
 #define APPLICATION_BYTES (118u * 1024u)
 #endif
@@ -32,35 +32,35 @@
 
 /* -- behaviour that the documents leave open, times in ms ------------------------------------- */
 
-/* RESET is the application's command. 1: a RESET restarts the bootloader as well. 0: ignored. */
+/* RESET is a command of the application. 1: it restarts the bootloader too. 0: ignored. */
 #ifndef RESET_RESTARTS
 #define RESET_RESTARTS 0
 #endif
 
 /* The protocol sends no checksum of the whole image. 1: each image ends with one, the CRC-32 of all
- * before it (that of zip, low byte first), and an image whose checksum is wrong is refused. */
+ * before it (that of zip, low byte first), and an image with a wrong checksum is rejected. */
 #ifndef IMAGE_CHECKSUM
 #define IMAGE_CHECKSUM 0
 #endif
 
-/* How long an update command is waited for behind the last boot version of a burst. */
+/* How long to wait for an update command after the last boot version of a burst. */
 #ifndef WINDOW_MS
 #define WINDOW_MS 200u
 #endif
 
-/* A transfer ends when nothing of it was heard for so long. The tool may repeat a packet five times
- * at intervals of 500 ms: shorter than that would end a transfer that can be saved. */
+/* Longest pause in a transfer. The tool may repeat a packet five times at intervals of 500 ms; a
+ * shorter limit would end transfers that can still succeed. */
 #ifndef PAUSE_MS
 #define PAUSE_MS 4000u
 #endif
 
-/* Frames of one message follow each other within this time. */
+/* Longest gap between two frames of a message. */
 #ifndef INTER_FRAME_MS
 #define INTER_FRAME_MS 100u
 #endif
 
-/* How long the last frames may wait for the bus before the application starts without them: nobody
- * takes frames from a device that is alone on the bus, and it has to start all the same. */
+/* How long the last frames may wait for the bus before the application starts without them: no node
+ * acknowledges frames of a device that is alone on the bus, and it has to start anyway. */
 #ifndef DRAIN_MS
 #define DRAIN_MS 200u
 #endif

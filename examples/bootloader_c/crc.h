@@ -5,7 +5,7 @@
 
 #define CRC_START 0xFFFFFFFFu
 
-/* The CRC of appendix 1. Begins with CRC_START; goes on with what an earlier call returned. */
+/* CRC of appendix 1. Start with CRC_START; continue with the result of the previous call. */
 uint32_t crc_add(uint32_t crc, const uint8_t *data, uint32_t size);
 
 #endif

@@ -1,4 +1,4 @@
-/* The hardware that the bootloader needs. A port implements these functions and a main loop:
+/* Hardware functions of the bootloader. A port implements them and a main loop:
  *
  *   boot_start();
  *   for (;;) {
@@ -23,10 +23,10 @@ typedef struct {
     uint8_t data[8];
 } can_frame;
 
-/* Milliseconds since any moment; begins again at 0 after 2^32 - 1. */
+/* Milliseconds since an arbitrary time; wraps to 0 after 2^32 - 1. */
 uint32_t hal_ms(void);
 
-/* No frame that was given to the controller still waits for the bus. */
+/* True when no frame in the controller is waiting for the bus. */
 bool hal_sent_all(void);
 
 /* Offsets count from the first byte of the application. Sizes and offsets of writing are multiples
@@ -35,7 +35,7 @@ void hal_flash_read(uint32_t offset, uint8_t *data, uint32_t size);
 bool hal_flash_erase(uint32_t offset);
 bool hal_flash_write(uint32_t offset, const uint8_t *data, uint32_t size);
 
-/* These two do not return. Peripherals and interrupts are left as after a reset. */
+/* These two do not return, and leave peripherals and interrupts in their reset state. */
 _Noreturn void hal_start_application(void);
 _Noreturn void hal_reset(void);
 

@@ -3,14 +3,14 @@
 #include "config.h"
 #include "crc.h"
 
-/* Over the header, the id, high byte first, and all from the mode to the last byte of data. */
+/* Covers the header, the id (high byte first), and the mode to the last data byte. */
 static uint32_t message_crc(const uint8_t *bytes, uint16_t size, uint32_t id)
 {
     const uint8_t around[4] = {bytes[0], bytes[1], (uint8_t)(id >> 8), (uint8_t)id};
     return crc_add(crc_add(CRC_START, around, 4), bytes + 2, size - 7u);
 }
 
-/* A message begins with a frame, and the shortest has 11 bytes: its first frame is full. */
+/* A message starts with a frame, which is full since the shortest message has 11 bytes. */
 static bool begins_message(const can_frame *frame)
 {
     const uint8_t *data = frame->data;

@@ -14,22 +14,22 @@ enum {
 
 /* Puts the messages of one id together. All zero: nothing received. */
 typedef struct {
-    uint8_t bytes[MESSAGE_MAX_BYTES]; /* not at the end, where a sanitizer lets an index be too big */
+    uint8_t bytes[MESSAGE_MAX_BYTES]; /* not last: a sanitizer would miss an overrun */
     uint16_t have;                    /* bytes received; 0 between messages */
     uint16_t want;
-    uint32_t last_ms; /* when the last frame of the message came */
+    uint32_t last_ms; /* time of the last frame of the message */
 } message_receiver;
 
 typedef enum {
-    RECEIVED_NOTHING, /* so far */
-    RECEIVED_MESSAGE, /* the functions below tell its parts, until the next frame */
+    RECEIVED_NOTHING, /* complete so far */
+    RECEIVED_MESSAGE, /* the functions below return its parts, until the next frame */
     RECEIVED_DAMAGED, /* complete, but its tail or its CRC is wrong */
 } reception;
 
 /* A data frame of the id. */
 reception message_receive(message_receiver *receiver, const can_frame *frame, uint32_t now_ms);
 
-/* Part of a message came, and then too long nothing: drops it. */
+/* Drops a partial message after a pause that is too long; returns true then. */
 bool message_expired(message_receiver *receiver, uint32_t now_ms);
 
 static inline uint8_t message_mode(const message_receiver *receiver)
@@ -37,7 +37,7 @@ static inline uint8_t message_mode(const message_receiver *receiver)
     return receiver->bytes[2];
 }
 
-/* Its second byte is the size of the data, which is held against the length before. */
+/* Its second byte is the size of the data, which was compared with the length. */
 static inline uint16_t message_command(const message_receiver *receiver)
 {
     return (uint16_t)(receiver->bytes[4] << 8 | receiver->bytes[5]);

@@ -29,7 +29,7 @@ static uint32_t stored_crc(uint32_t size)
     return crc;
 }
 
-/* Of the images of a product, not of the protocol. */
+/* A checksum of the product's images; the protocol has none. */
 static bool has_checksum(uint32_t size)
 {
     uint8_t part[PACKET_BYTES];
@@ -57,9 +57,9 @@ bool store_has_application(void)
            size >= 1 && size <= APPLICATION_BYTES && get32(record + 8) == stored_crc(size);
 }
 
-/* Sectors that look empty are erased too: a cut in the middle of erasing leaves cells that read as
- * erased and do not hold what is written then. The whole area is erased, so that nothing of a longer
- * application stays behind a shorter one. */
+/* Erases empty sectors too: after an interrupted erase, cells can read as erased without being able
+ * to hold data. Erases the whole area, so that no bytes of a longer application remain after a
+ * shorter one. */
 bool store_erase(uint32_t step)
 {
     return hal_flash_erase(step == 0 ? RECORD_AT : (step - 1) * SECTOR_BYTES);

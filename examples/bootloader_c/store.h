@@ -1,4 +1,4 @@
-/* The application in flash memory, and the record that says that it is whole.
+/* The application in flash memory, and the record that marks it as complete.
  *
  * The record holds the size and the CRC of the application. It is erased before anything else is
  * touched and written when all else is right, so that a power cut at any moment leaves either a
@@ -16,17 +16,17 @@
 
 enum { PACKET_BYTES = 128 };
 
-/* A whole application is stored. Reads all of it. */
+/* True when a complete application is stored. Reads all of it. */
 bool store_has_application(void);
 
-/* Erasing takes STORE_ERASE_STEPS steps, counted from 0, in this order. */
+/* Erases in steps 0 to STORE_ERASE_STEPS - 1, to be called in this order. */
 enum { STORE_ERASE_STEPS = 1 + APPLICATION_BYTES / SECTOR_BYTES };
 bool store_erase(uint32_t step);
 
-/* Writes `size` bytes, 1 to PACKET_BYTES, of which `data` has PACKET_BYTES. */
+/* Writes `size` bytes, 1 to PACKET_BYTES; `data` has PACKET_BYTES. */
 bool store_write(uint32_t offset, const uint8_t *data, uint32_t size);
 
-/* Makes what was written the application, when it is what was received. */
+/* Writes the record if the written bytes equal the received ones. */
 bool store_finish(uint32_t size, uint32_t crc);
 
 #endif

@@ -1,4 +1,4 @@
-/* A BMS as small as can be: it says its version, shows its memory, and takes RESET. */
+/* A minimal BMS application: answers version and memory queries and RESET. */
 #include "board.h"
 #include "message.h"
 
@@ -16,7 +16,7 @@ enum {
     REPORT_VERSION = 0x1540,
     REPORT_FEEDBACK = 0x5503,
     REPORT_MEMORY = 0x5688,
-    MEMORY_BYTES = 128, /* at once */
+    MEMORY_BYTES = 128, /* of one answer */
     FLASH_END = 0x20000,
 };
 
@@ -34,7 +34,7 @@ static void report(uint16_t id, uint16_t command, const uint8_t *data)
 
 static void report_version(void)
 {
-    /* A text ends with a full stop, and spaces fill its 16 bytes. */
+    /* A text ends with a full stop and is padded with spaces to 16 bytes. */
     static const uint8_t version[] = "EXAMPLE.        "
                                      "0.              "
                                      "A0.             "

@@ -45,7 +45,7 @@ void systick_handler(void)
 void uart_handler(void)
 {
     if (ring_in - ring_out == RING_BYTES) {
-        INTERRUPT_DISABLE = 1u << UART_NUMBER; /* until there is room; the line waits */
+        INTERRUPT_DISABLE = 1u << UART_NUMBER; /* until there is room for more characters */
         return;
     }
     UART_INTERRUPT = RECEIVE_INTERRUPT;
@@ -57,7 +57,7 @@ void board_start(void)
 {
     SYSTICK_RELOAD = CLOCK_HZ / 1000 - 1;
     SYSTICK_VALUE = 0;
-    SYSTICK_CONTROL = 7; /* runs, interrupts, by the processor's clock */
+    SYSTICK_CONTROL = 7; /* enabled, with interrupt, processor clock */
     UART_DIVIDER = 16;
     UART_CONTROL = SEND_ENABLE | RECEIVE_ENABLE | RECEIVE_INTERRUPT_ENABLE;
     INTERRUPT_ENABLE = 1u << UART_NUMBER;
@@ -98,7 +98,7 @@ bool board_sent_all(void)
     return !(UART_STATE & SEND_FULL);
 }
 
-/* False: the line is too short, or there are no digits. */
+/* Returns false when the line is too short or has no digits. */
 static bool get_hex(uint32_t *at, unsigned digits, uint32_t *value)
 {
     *value = 0;
@@ -144,13 +144,13 @@ bool board_receive(can_frame *frame)
         INTERRUPT_ENABLE = 1u << UART_NUMBER;
         if (character != '\r') {
             if (line_length < LINE_BYTES)
-                line[line_length++] = character; /* a longer line is no frame */
+                line[line_length++] = character; /* a longer line is not a frame */
             continue;
         }
         const bool is_frame = get_frame(frame);
         line_length = 0;
         if (is_frame)
-            put('z'); /* sent; all else, as open, close and bit rate: done */
+            put('z'); /* frame sent; other commands (open, close, bit rate) need no action */
         put('\r');
         if (is_frame)
             return true;
@@ -158,7 +158,7 @@ bool board_receive(can_frame *frame)
     return false;
 }
 
-/* Interrupts end the sleep also while they are held back, so that none is missed before it. */
+/* Masked interrupts end the sleep too, so that none is missed before it. */
 void board_sleep(void)
 {
     __asm volatile("cpsid i");
@@ -167,7 +167,7 @@ void board_sleep(void)
     __asm volatile("cpsie i");
 }
 
-/* -- ways out ---------------------------------------------------------------------------------- */
+/* -- reset and start of a program -------------------------------------------------------------- */
 
 _Noreturn void board_reset(void)
 {

@@ -1,5 +1,5 @@
-/* What bootloader and application share of the board: QEMU's mps2-an385, a Cortex-M3 whose CAN
- * controller is a UART that speaks slcan.
+/* Board functions of bootloader and application: QEMU's mps2-an385, a Cortex-M3 whose CAN
+ * controller is a UART with the slcan protocol.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -17,12 +17,12 @@ bool board_receive(can_frame *frame);
 void board_send(const can_frame *frame);
 bool board_sent_all(void);
 
-/* Until something was received, or 1 ms. */
+/* Sleeps until a character is received, for at most 1 ms. */
 void board_sleep(void);
 
 _Noreturn void board_reset(void);
 
-/* Stops the clock and the UART, and enters the program whose vector table is there. */
+/* Stops the clock and the UART, and starts the program with this vector table. */
 _Noreturn void board_enter(uint32_t vectors);
 
 #endif

@@ -1,4 +1,4 @@
-/* The bootloader's hardware: flash memory is the board's memory, used as flash memory would be. */
+/* Hardware of the bootloader; the board's memory simulates flash memory. */
 #include "board.h"
 #include "boot.h"
 #include "config.h"
@@ -24,7 +24,7 @@ void hal_flash_read(uint32_t offset, uint8_t *data, uint32_t size)
         data[i] = memory(offset)[i];
 }
 
-/* The processor stands still meanwhile, as that of a chip does; a chip's takes longer. */
+/* Blocks the processor like the erase of a real chip, which takes longer. */
 enum { ERASE_MS = 5 };
 
 bool hal_flash_erase(uint32_t offset)

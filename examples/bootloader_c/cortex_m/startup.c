@@ -1,4 +1,4 @@
-/* Vector table and the way from a reset to main, of bootloader and application alike. */
+/* Vector table and start-up code of bootloader and application. */
 #include "board.h"
 
 #include <stddef.h>
@@ -38,7 +38,7 @@ __attribute__((section(".vectors"), used)) const struct {
     },
 };
 
-/* The compiler calls these by itself, also without a library. */
+/* The compiler generates calls of these even without a library. */
 void *memcpy(void *restrict to, const void *restrict from, size_t size)
 {
     uint8_t *target = to;

@@ -1,4 +1,4 @@
-/* The bootloader on a computer: its hardware is that of flasher_dut.h. */
+/* The bootloader on a computer, with the hardware functions of flasher_dut.h. */
 #include "boot.h"
 #include "config.h"
 #include "flasher_dut.h"
@@ -11,7 +11,7 @@ static const flasher_dut_facts facts = {
     .write_bytes = WRITE_BYTES,
     .application_offset = 0,
     .application_bytes = APPLICATION_BYTES,
-    .erase_us = 22000, /* as of a microcontroller of this size */
+    .erase_us = 22000, /* typical for a microcontroller of this size */
     .write_us = 85,
     .receive_frames = 32,
     .name = "example bootloader in C",
@@ -20,7 +20,7 @@ static const flasher_dut_facts facts = {
 static const flasher_host *host;
 static uint64_t started_us;
 
-/* The counter overflows shortly after each start, so that no time is right by luck alone. */
+/* The counter overflows shortly after each start, to expose comparisons that ignore it. */
 #define MS_AT_START (UINT32_MAX - 120)
 
 uint32_t hal_ms(void)
@@ -71,7 +71,7 @@ const flasher_dut_facts *flasher_dut_about(void)
 
 void flasher_dut_start(const flasher_host *given, uint32_t cause)
 {
-    (void)cause; /* all starts are alike */
+    (void)cause; /* all starts are equal */
     host = given;
     started_us = host->now_us();
     boot_start();

@@ -1,9 +1,9 @@
-/* Makes a program of a bootloader that implements flasher_dut.h: link it, and give the program to
- * `flasher conformance --subject`. It talks to the suite on standard input and output; what the
- * bootloader prints goes to standard error.
+/* Main program for a bootloader that implements flasher_dut.h: link both, and test the program by
+ * `flasher conformance --subject`. It talks to the suite on standard input and output; output of
+ * the bootloader goes to standard error.
  *
  * Each message is a header of 8 bytes (type, three zeros, size of the rest as uint32) and the rest;
- * integers are little-endian, frames are `flasher_frame` as it lies in memory.
+ * integers are little-endian, frames have the memory layout of `flasher_frame`.
  *
  *   program to suite, first:   'f' facts: nine uint32 in the order of flasher_dut_facts, name
  *   suite to program:          'S' start: uint64 now, uint32 cause
@@ -73,7 +73,7 @@ static uint32_t next_message(uint8_t *type)
 
 static uint64_t now_us(void)
 {
-    return now++; /* so that a loop that waits for a time ends */
+    return now++; /* so that a loop that polls the time ends */
 }
 
 static void flash_read(uint32_t offset, void *data, uint32_t size)
