@@ -253,7 +253,7 @@ CASES = [
          "packet", "another program", "End the other"),
     Case("silent", ExitCode.NO_ANSWER, silent, "boot version", "no power", "Check supply"),
     Case("not power-cycled", ExitCode.NO_ANSWER, nobody_cycles_the_power,
-         "boot version", "nobody switched it off", "--wait"),
+         "boot version", "it was not switched off", "--wait"),
     Case("another device", ExitCode.WRONG_DEVICE, other_boot_name,
          "boot version", "reports BMS", "--allow-boot-name"),
     Case("for another target", ExitCode.WRONG_DEVICE, other_target,

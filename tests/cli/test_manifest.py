@@ -273,7 +273,7 @@ def test_image_info_tells_what_is_wrong_and_goes_on(
 ) -> None:
     run = flasher("image-info", image, "-t", "obc")
     assert run.code == ExitCode.OK
-    assert "The manifest says that the image is for the BMS, not the OBC." in run.out
+    assert "By its manifest the image is for the BMS, not the OBC." in run.out
     manifest.write_text("format = 7\n")
     run = flasher("image-info", image, "--json")
     assert run.code == ExitCode.OK

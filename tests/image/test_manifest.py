@@ -94,9 +94,9 @@ def test_the_manifest_lies_beside_its_image(tmp_path: Path) -> None:
 # -- refusals -------------------------------------------------------------------------------------
 
 WRONG: list[tuple[str, str, str]] = [
-    ("", "does not state its format", "no manifest"),
+    ("", "does not state its format", "not a manifest"),
     (LEAST.replace("format = 1", "format = 2\nunheard_of = 5"), "has the format 2", "newer"),
-    (LEAST.replace("format = 1", "format = true"), "has the format True", "no manifest"),
+    (LEAST.replace("format = 1", "format = true"), "has the format True", "not a manifest"),
     (LEAST.replace("format = 1", 'format = "1"'), "has the format '1'", "format = 1"),
     (LEAST + "hardware_version = []", "unknown key 'hardware_version'", "hardware_versions?"),
     (LEAST + "Sha265 = 1", "unknown key 'Sha265'", "Did you mean sha256?"),
