@@ -19,7 +19,7 @@ PROFILE = profile_of_mock()
 
 
 class DeafDevice(MockDevice):
-    """Hears nothing once it is told to hang; `hangs_for_good` survives a power cycle."""
+    """Ignores all frames once told to hang; with `hangs_for_good` even after a power cycle."""
 
     hangs = False
     hangs_for_good = False
@@ -40,7 +40,7 @@ class DeafDevice(MockDevice):
 
 
 class RestlessDevice(MockDevice):
-    """Loses its power for a moment after every 60th frame that it hears."""
+    """Loses its power briefly after every 60th received frame."""
 
     heard = 0
 
@@ -90,14 +90,14 @@ def subject(
 
 
 def one(report: RunReport, case_id: str) -> CaseResult:
-    """The result of a case that was run once."""
+    """The result of a case that ran once."""
     (result,) = (result for result in report.results if result.case_id == case_id)
     return result
 
 
 @dataclass
 class Log(RunObserver):
-    """An observer that writes down what it is told."""
+    """An observer that logs its calls."""
 
     lines: list[str] = field(default_factory=list)
 
@@ -125,7 +125,7 @@ def run_case(
     before_others: bool = False,
     log: Log | None = None,
 ) -> RunReport:
-    """A run of one case that does `action` and is called FR-00; with `before_others`, RS-04 too."""
+    """Run one case, FR-00, that performs `action`; with `before_others`, RS-04 too."""
     CASES["FR-00"] = Case(
         "FR-00", "a test", "R12", "something", "something", action, requires, limit_s=limit_s
     )

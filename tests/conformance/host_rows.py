@@ -1,7 +1,7 @@
-"""Rows of the catalogue that bind a host, and the tests of this project that show each of them.
+"""Catalogue rows that concern a host, and the tests of this project that cover each of them.
 
-A row that names nobody binds both sides; the bootloader's half is a case of the suite. Paths are
-those of `tests/`; `test_host_rows` holds that every test exists and that no row is forgotten.
+A row that names no side concerns both; the bootloader's half is a case of the suite. Paths are
+relative to `tests/`. `test_host_rows` checks that every test exists and no row is missing.
 """
 
 from __future__ import annotations

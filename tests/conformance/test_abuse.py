@@ -1,4 +1,4 @@
-"""Devices that do not play along: every run ends in bounded time, with a report that is true."""
+"""Misbehaving devices: every run ends in bounded time with a correct report."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ IMPATIENT = ConformanceProfile(
 
 
 class MoodyDevice(MockDevice):
-    """Loses its power for a moment now and then: by chance, with a fixed seed."""
+    """Loses its power briefly at random times, with a fixed seed."""
 
     def __init__(self, *arguments: object, **options: object) -> None:
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ class MoodyDevice(MockDevice):
 
 
 class Unplugger(RunObserver):
-    """Pulls the adapter out when a case begins."""
+    """Unplugs the adapter when a case begins."""
 
     def __init__(self, subject: MockSubject, case_id: str) -> None:
         self._subject = subject
@@ -71,7 +71,7 @@ class Unplugger(RunObserver):
 
 
 def assert_true_report(report: RunReport) -> None:
-    """Bounded, every selected case has a verdict, and all reports can be made of it."""
+    """The run is bounded, every selected case has a verdict, and all reports can be written."""
     assert report.duration_s < BOUND_S
     assert {result.case_id for result in report.results} == {text.id for text in report.cases}
     assert all(
@@ -116,7 +116,7 @@ def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
 
 
 class BabblingDevice(MockDevice):
-    """Sends boot versions all the time on its own id, whatever it is asked."""
+    """Sends boot versions all the time on its own id."""
 
     def next_frame(self, now: float) -> Frame | None:
         return Frame(0x725, b"\x55\xaa\x0c\x0bBMSV")

@@ -1,4 +1,4 @@
-"""The bench: faults on the line, waits, and the mock's powers."""
+"""The bench: faults on the line, waits, and capabilities of the mock."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
     bench.reset_to_bootloader()
     bench.subject.cut_in_operation(0, 0.5, 0.3)
     bench.send(bench.encoder.update(len(GOOD_IMAGE)))
-    # Torn while it was erased: no application, and the bootloader announces itself.
+    # Cut during the erase: no application, so the bootloader announces itself.
     assert bench.wait_for(Reply.REQUEST, within_s=0.2) is None
     assert bench.subject.take_cut()
     assert bench.wait_for(Reply.BOOT_VERSION, within_s=1.0) is not None

@@ -1,4 +1,4 @@
-"""The cases on the mock: a right device passes them, by every choice, and a wrong one does not."""
+"""The cases on the mock: a correct device passes with every choice, a wrong one fails."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MINE = ("RS", "UP")
 def failed(
     name: str | None = None, *, only: tuple[str, ...] = (), target: str = "bms", **choices: Any
 ) -> list[str]:
-    """The cases of these groups, or `only` those, that a device does not pass."""
+    """Cases of these groups, or of `only`, that a device does not pass."""
     profile = replace(MOCK_PROFILE, **choices)
     make_device = None if name is None else variant_maker(name)
     subject = MockSubject(target, profile=profile, make_device=make_device)
-    # A variant's own choices are part of what it is.
+    # A variant includes choices of its own.
     judged_by = profile_of_mock(subject.device.profile)
     selection = Selection(only) if only else Selection(groups=MINE)
     report = run(subject, judged_by, selection=selection)

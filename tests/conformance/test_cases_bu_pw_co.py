@@ -1,4 +1,4 @@
-"""BU, PW and CO on the mock: a right device passes by every choice, and each wrong one fails."""
+"""BU, PW and CO on the mock: a correct device passes with every choice, each wrong one fails."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ QUICK = tuple(case_id for case_id in MINE if case_id not in ("PW-01", "CO-01"))
 
 
 def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseResult:
-    """A run of one case on a bench that lacks some powers."""
+    """Run one case on a bench without some capabilities."""
     subject = MockSubject(make_device=None if variant is None else variant_maker(variant))
     for name, value in powers.items():
         setattr(subject, name, value)
@@ -91,7 +91,7 @@ def test_others_take_nine_tenths_of_the_bus() -> None:
 
 
 def test_every_frame_of_every_message_is_disturbed() -> None:
-    """Each one in each way: as many steps as there are frames and ways."""
+    """Each frame in each way: as many steps as there are frames and kinds of fault."""
     result = result_of("BU-01")
     steps = " ".join(check.step for check in result.checks)
     for frame in range(1, 19):
@@ -110,7 +110,7 @@ def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation(
     packets = {f"after frame {f} of packet {n}" for f in range(1, 19) for n in range(1, 7)}
     assert packets <= steps
     assert {f"after frame {frame} of end of transfer" for frame in (1, 2)} <= steps
-    # A page to erase, six packets, the record.
+    # Erase of a page, six packets, the record.
     operations = {
         f"flash operation {n}, {share} of it done" for n in range(1, 9) for share in SHARES
     }

@@ -1,5 +1,5 @@
-"""Framing, checksum and timing on the mock: a right device passes, by every choice of the profile
-that a case depends on; a wrong one fails the case of its clause.
+"""Framing, checksum and timing on the mock: a correct device passes with every profile choice that
+a case depends on; a wrong one fails the case of its clause.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def report(
     judged_by: Mapping[str, str | float] | None = None,
     **choices: Any,
 ) -> RunReport:
-    """A run of `only` those cases, the profile being that of the device but for `judged_by`."""
+    """Run only these cases with the device's own profile, changed by `judged_by`."""
     profile = replace(MOCK_PROFILE, **choices)
     make_device = None if name is None else variant_maker(name)
     subject = MockSubject(target, profile=profile, make_device=make_device)
@@ -103,7 +103,7 @@ def test_no_damaged_packet_is_taken_by_the_mock() -> None:
 def test_what_a_product_documents_otherwise_is_right_and_has_to_be_true(
     name: str, case_id: str, key: str, value: str
 ) -> None:
-    """The P rows: the device's own choice passes, "either" passes too, the other one fails."""
+    """The P rows: the device's own choice and "either" pass, the other choice fails."""
     only = (case_id,)
     assert failed(report(name, only=only, judged_by={key: value})) == []
     assert failed(report(name, only=only, judged_by={key: "either"})) == []
@@ -128,7 +128,7 @@ def test_gaps_that_no_product_promises_are_observed_only() -> None:
 
 
 def test_times_are_judged_all_together_and_tell_how_they_are_spread() -> None:
-    """TM-05: one slow answer in many is in the report, with the limit that it breaks."""
+    """TM-05: the report shows one slow answer among many, and the exceeded limit."""
     done = report("slow-sixteenth-packet", only=("TM-05",))
     (check,) = (one for one in done.results[0].checks if one.outcome is CheckOutcome.FAIL)
     assert check.expected == "packet to ACK at most 500 ms"

@@ -1,4 +1,4 @@
-"""TX on the mock: a right device passes by every choice, and each wrong one fails its case."""
+"""TX on the mock: a correct device passes with every choice, each wrong one fails its case."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cases are judged by: clauses as the vendor's document numbers them, and readings."""
+"""Clauses of the vendor's document and readings of this project."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_reading_has_a_case_or_a_test_that_exists() -> None:
 
 
 def test_the_options_that_readings_name_exist() -> None:
-    """The project's numbers are complete, and no option was renamed."""
+    """The project's numbers are complete, and all options exist."""
     assert list(READINGS) == [f"R{number}" for number in range(1, 29)]
     area = ApplicationArea(start=0, size_bytes=1)
     of_host = dict(Profile(TARGETS["bms"], application_area=area).values())

@@ -1,4 +1,4 @@
-"""`flasher conformance` as a user meets it: summary, selection, reports as files, exit codes."""
+"""The command `flasher conformance`: summary, selection, report files, exit codes."""
 
 from __future__ import annotations
 
@@ -341,7 +341,7 @@ def test_an_adapter_that_fails_gives_its_exit_code_and_the_report(
 def test_the_exit_code_says_how_a_run_ended() -> None:
     assert exit_code(run_case(passes_once), was_stopped=False) is ExitCode.OK
     assert exit_code(run_case(fails_once), was_stopped=False) is ExitCode.PARTIAL
-    # Stopped after the last case: nothing is missing.
+    # Stopped after the last case, so nothing is missing.
     assert exit_code(run_case(passes_once), was_stopped=True) is ExitCode.OK
 
 

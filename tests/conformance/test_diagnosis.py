@@ -1,5 +1,5 @@
-"""What is said of a device that cannot be upgraded: frames as they would be heard, typed by hand or
-made from the document's rules with one of them broken.
+"""Diagnosis of a device that cannot be upgraded, from literal frames or from frames that break one
+rule of the document.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_the_id_comes_as_an_extended_one(can_id: int) -> None:
 @pytest.mark.parametrize(
     ("crc", "way"),
     [
-        # Computed apart from the suite, bit by bit, over 55 AA 07 25 and mode to data.
+        # Computed independently of the suite, bit by bit, over 55 AA 07 25 and mode to data.
         ("start", _Crc(start=0)),
         ("plain", _Crc(is_widened=False)),
         ("no_id", _Crc(id_order="none")),
@@ -133,7 +133,7 @@ def test_messages_that_are_right_are_counted() -> None:
 
 
 class StartsAtZero(PythonBootloader):
-    """Its CRC begins with 0, in both directions."""
+    """Its CRC starts with 0 in both directions."""
 
     crc_start = 0
 

@@ -1,4 +1,4 @@
-"""Two runs compared."""
+"""Comparison of two runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Change = Callable[[dict[str, Any]], None]
 
 @pytest.fixture(scope="module")
 def made() -> bytes:
-    """The report of a run in which RS-01 fails and EN-04 is not judged."""
+    """Report of a run in which RS-01 fails and EN-04 is not judged."""
     subject = MockSubject("bms", make_device=variant_maker("announces-three-times"))
     selection = Selection(cases=("RS-01", "RS-04", "UP-05", "EN-04"))
     report = run(subject, PROFILE, selection=selection)
@@ -39,7 +39,7 @@ def old(made: bytes, tmp_path: Path) -> Path:
 
 
 def changed(old: Path, change: Change) -> Path:
-    """The same report with something else in it."""
+    """The same report with one change."""
     document = json.loads(old.read_text())
     change(document)
     path = old.with_name("new.json")

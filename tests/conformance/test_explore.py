@@ -1,4 +1,4 @@
-"""Random walks: what they find, how short they make it, and that they find nothing else."""
+"""Random walks: their findings, how they are shrunk, and that there are no false ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Forms of a packet that the profile decides about: one list for cases, `init` and walks."""
+"""Packet forms that the profile decides about: one list for cases, `init` and walks."""
 
 from __future__ import annotations
 

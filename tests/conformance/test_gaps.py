@@ -1,6 +1,6 @@
-"""What a bench cannot judge: what the suite says beforehand is what comes of the run.
+"""Gaps of a bench: the suite's forecast matches the result of the run.
 
-`python -m tests.campaigns.whole_suites` does the same with the longest cases too.
+`python -m tests.campaigns.whole_suites` includes the longest cases.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ AREA_BYTES = 34 * 1024
 LONGEST = ("CR-01", "CR-02", "TX-07", "TM-05", "BU-01", "PW-01", "SE-01", "SE-03", "CO-01")
 SHORT = [case_id for case_id in catalogue_order(CASES) if case_id not in LONGEST]
 BENCHES = [("bms", 0), ("bms", AREA_START), ("wmc", AREA_START)]
-"""Targets, with the address by which the bench knows the memory that the application tells."""
+"""Targets, with the address at which the bench can query the application's memory."""
 
 
 def bare(target: str) -> MockSubject:
-    """A device on a bench of nothing but adapter and good image."""
+    """A device on a bench with only an adapter and a good image."""
     subject = MockSubject(target, profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES))
     subject.has_power = subject.has_readback = False
     subject.has_bus_off = subject.has_timed_cuts = False
@@ -54,7 +54,7 @@ def bare(target: str) -> MockSubject:
 
 
 def check_bare_bench(target: str, address: int, cases: Sequence[str]) -> None:
-    """What such a bench cannot judge of these cases is said beforehand."""
+    """The forecast of a bare bench names what it cannot judge of these cases."""
     subject = bare(target)
     given = profile_of_mock(subject.device.profile).given
     profile = ConformanceProfile({**given, "device.application_address": address})
@@ -76,7 +76,7 @@ def check_bare_bench(target: str, address: int, cases: Sequence[str]) -> None:
 
 
 def check_full_bench(cases: Sequence[str]) -> None:
-    """On a bench with everything, each of these cases passes in full."""
+    """On a complete bench each of these cases passes in full."""
     subject = MockSubject(
         profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, image_checksum="crc32")
     )

@@ -26,7 +26,7 @@ ROWS = {
     "SE": 4,
     "CO": 4,
 }
-"""How many rows each group of the catalogue has."""
+"""Number of rows of each group of the catalogue."""
 NO_HOST = {
     "BR-01",
     *("RS-01", "RS-02", "RS-03", "RS-04", "RS-05"),
@@ -35,12 +35,12 @@ NO_HOST = {
     *("EN-01", "EN-02", "EN-04", "EN-07", "EN-08"),
     *("TM-05", "BU-07", "PW-01", "PW-02", "SE-04", "CO-04"),
 }
-"""Rows about a bootloader alone."""
+"""Rows that only concern a bootloader."""
 
 
 @cache
 def functions(path: Path) -> frozenset[str]:
-    """The test functions at the top of a file."""
+    """Names of the test functions at the top of a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return frozenset(
         node.name

@@ -1,4 +1,4 @@
-"""The contract that keeps the suite's bytes its own names every module that it has to name."""
+"""The import contract that keeps the suite independent lists every module that it must."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import flasher.conformance
 
 _PACKAGE = Path(flasher.conformance.__file__).parent
 _EDGES = {"mock", "simulated", "real"}
-"""Where the suite meets the rest of flasher."""
+"""Modules that depend on the rest of flasher."""
 _REPORTING = {
     *("trace_excerpt", "diff", "html_report", "reports"),
     *("bench_options", "plugin", "summary_page", "side_by_side"),
 }
-"""What opens a bench, and what tells about a run: neither makes nor judges a byte."""
+"""Modules that open a bench or report a run, but neither make nor judge bytes."""
 
 
 def test_every_module_but_the_edges_is_under_the_contract() -> None:

@@ -1,4 +1,4 @@
-"""A profile from a device: what is written is what the device does, seen on the bus alone."""
+"""`init`: the written profile matches the device, observed on the bus alone."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ OPEN: Final = {"en_04", "limits.inter_frame_s", "limits.refused_s", "limits.sile
     "device.application_bytes",
     "device.application_address",
 }
-"""What nobody sees from outside."""
+"""Keys that cannot be observed from outside."""
 
 
 class FullFrames(MockDevice):
-    """Takes short frames at the end of a message only."""
+    """Accepts short frames only at the end of a message."""
 
     def receive(self, frame: Frame, now: float) -> None:
         if len(frame.data) == 8 or frame.data.endswith(b"\xf0"):
@@ -77,8 +77,8 @@ class FullFrames(MockDevice):
 
 
 class OtherDevice(MockDevice):
-    """Answers an update command that it rejects by NAK, rejects a last packet that is not filled
-    with FF, and gives up a message after 50 ms.
+    """Answers a rejected update command by NAK, rejects a last packet that is not padded with FF,
+    and drops a partial message after 50 ms.
     """
 
     def __init__(self, *given: Any, **named: Any) -> None:
@@ -112,7 +112,7 @@ class MoodyDevice(MockDevice):
 
 
 class Confirming(MockDevice):
-    """Its bootloader confirms every write by general feedback; one ACK is lost."""
+    """Its bootloader sends general feedback to every write; one ACK is lost."""
 
     acks = 0
 
@@ -130,7 +130,7 @@ class Confirming(MockDevice):
 
 
 class Witness(MockDevice):
-    """Takes note of every image that is completed."""
+    """Records every completed image."""
 
     completed: set[bytes]
 
@@ -280,7 +280,7 @@ def test_the_suite_passes_by_the_profile_that_is_written(seed: str) -> None:
 
 
 def check_python_bootloader(cases: Sequence[str]) -> None:
-    """It passes these cases by the profile that its answers give."""
+    """It passes these cases with the profile determined from its answers."""
     what, start = "tests.peers.python_bootloader:PythonBootloader", ConformanceProfile()
     with open_subject(what, "bms", start, good_image=None, second_image=None) as (subject, _):
         profile = ask_device(subject, start).profile(start)

@@ -1,8 +1,7 @@
-"""A right device that others made: the referee of tests/peers, which shares no code with flasher.
+"""A correct independent device, the referee of tests/peers, which shares no code with flasher.
 
-The suite has nothing to say against it once a profile tells its choices, neither when it is slow
-nor when it takes other ways that the document leaves open. `python -m tests.campaigns.whole_suites`
-runs the longest cases on it too.
+With a profile of its choices it passes, when it is slow and when it behaves differently where the
+document allows it. `python -m tests.campaigns.whole_suites` includes the longest cases.
 """
 
 from __future__ import annotations
@@ -39,13 +38,13 @@ _PROFILE: Final[dict[str, Value]] = {
 _AT_THE_BURST: Final = ("FR-07", "FR-08", "UP-04", "UP-05", "CO-01", "CO-02")
 _LONGEST: Final = ("CR-01", "CR-02", "TX-07", "BU-01", "PW-01", "SE-01")
 _HELD: Final = (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.UNSUPPORTED)
-"""Its bench has no second image, and its adapter sends standard data frames only."""
+"""Its bench has no second image, and its adapter only sends standard data frames."""
 _BAD_PACKETS: Final = ("CR-03", "TX-01", "TX-03", "TX-04", "TX-06")
 
 
 class SlowDevice(ScriptedDevice):
-    """Writes each packet before it acknowledges it, and looks at the whole image at the end. Its
-    application thinks longer than the tool waits before it asks again.
+    """Writes each packet before its ACK, and verifies the whole image at the end. Its application
+    answers more slowly than the tool repeats a query.
     """
 
     def _ack(self, number: int, at: float) -> None:
@@ -60,7 +59,7 @@ class SlowDevice(ScriptedDevice):
 
 
 class LateListener(ScriptedDevice):
-    """Takes the update command when the burst is over, for 0.2 s, and not before (R2)."""
+    """Accepts the update command only for 0.2 s after the burst (R2)."""
 
     def _hear_update(self, data: bytes, now: float) -> None:
         has_application = self.completed or self.old_application_whole
@@ -75,7 +74,7 @@ class LateListener(ScriptedDevice):
 
 
 class BurstAnnouncer(ScriptedDevice):
-    """Without an application it announces itself in bursts, a second of silence between them."""
+    """Without an application it announces itself in bursts, one second apart."""
 
     def _announce(self, now: float) -> None:
         whole = self.completed or self.old_application_whole
@@ -87,7 +86,7 @@ class BurstAnnouncer(ScriptedDevice):
 
 
 class ChoosyDevice(ScriptedDevice):
-    """Asks for a damaged packet again, and says nothing to one that makes no sense."""
+    """Answers NAK to a damaged packet, and nothing to an impossible one."""
 
     def _nak(self, number: int, at: float) -> None:
         if self.log[-1].what in ("damaged", "end"):
@@ -95,7 +94,7 @@ class ChoosyDevice(ScriptedDevice):
 
 
 class PageDevice(ScriptedDevice):
-    """Keeps what it receives in memory until a page of 1 KiB is full, or the end has come."""
+    """Buffers packets until a page of 1 KiB is full or the transfer ends."""
 
     @property
     def image(self) -> bytes:
@@ -104,7 +103,7 @@ class PageDevice(ScriptedDevice):
 
 
 def bench(device: ScriptedDevice) -> RealSubject:
-    """The device on a simulated bus, as a real one: no echoes, power by a function."""
+    """The device on a simulated bus, like a real one: no echoes, power by a function."""
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock)
     bus.attach(device)
@@ -123,7 +122,7 @@ def bench(device: ScriptedDevice) -> RealSubject:
 
 
 def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> dict[str, str]:
-    """What the suite holds against such a device: the first failure of each case."""
+    """The first failure of each case on such a device."""
     keys = {key.replace("__", "."): value for key, value in given.items()}
     device = kind("bms", capacity_bytes=_AREA_BYTES)
     profile = ConformanceProfile({**_PROFILE, **keys}, source="another product")
@@ -138,7 +137,7 @@ def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> 
 
 
 def check_right_device(cases: Sequence[str]) -> None:
-    """Nothing is held against it in these cases."""
+    """It fails none of these cases."""
     assert judged(ScriptedDevice, cases) == {}
 
 

@@ -165,7 +165,7 @@ def test_power_and_readback_can_be_functions_of_a_conftest(pytester: pytest.Pyte
         """
     )
     pytester.makepyfile("def test_it(btl_device): pass")
-    # A mock has its own: that the function is refused shows that it came through.
+    # A mock has its own power control; rejecting the function shows that it was passed on.
     done = pytester.runpytest_inprocess(*MOCK)
     done.assert_outcomes(errors=1)
     done.stdout.fnmatch_lines(["*The mock has its own power control and readback.*"])

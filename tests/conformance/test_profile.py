@@ -1,4 +1,4 @@
-"""The profile: what a file may hold, and what is said of one that is wrong."""
+"""The profile: allowed content of a file, and error messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A device behind a link, as a real one is: no echoes, power and readback by commands."""
+"""A device on a link, like a real one: no echoes, power and readback by commands."""
 
 from __future__ import annotations
 

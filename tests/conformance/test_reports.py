@@ -1,4 +1,4 @@
-"""JUnit XML, JSON and the page: what is in them, that they are well-formed and harmless."""
+"""JUnit XML, JSON and HTML reports: content, well-formedness, escaping."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_two_runs_with_one_seed_differ_in_times_only() -> None:
 
 
 def without_times(value: Any) -> Any:
-    """A document without what a clock says."""
+    """A document without fields that depend on the clock."""
     if isinstance(value, dict):
         return {
             key: without_times(item)
@@ -180,7 +180,7 @@ def without_times(value: Any) -> Any:
 
 
 def assert_valid(root: ET.Element) -> None:
-    """As the schema that CI servers go by: elements, their order, and their attributes."""
+    """Follows the schema used by CI servers: elements, their order and their attributes."""
     assert root.tag == "testsuites"
     for suite in root:
         assert suite.tag == "testsuite"
@@ -202,7 +202,7 @@ def assert_valid(root: ET.Element) -> None:
 
 
 def verdict_of(report: RunReport) -> tuple[str, str]:
-    """The element that says how the one case ended, and its message."""
+    """Name of the element for the verdict of the one case, and its message."""
     root = junit_of(report)
     assert_valid(root)
     case = root[0].find("testcase")

@@ -1,4 +1,4 @@
-"""A right device passes, whatever it chooses where the document leaves it open.
+"""A correct device passes with every choice that the document allows.
 
 `python -m tests.campaigns.right_devices` runs the whole suite on hundreds of them.
 """

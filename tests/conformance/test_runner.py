@@ -1,4 +1,4 @@
-"""How a run goes: verdicts, the known state, rescue, and ends that are not the planned one."""
+"""Runs of the suite: verdicts, known state, rescue, and early ends."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def fails(bench: Bench) -> None:
 
 
 def hang(bench: Bench) -> None:
-    """What a case does to a device that it kills."""
+    """The fatal action of a case."""
     assert isinstance(bench.subject, MockSubject)
     assert isinstance(bench.subject.device, DeafDevice)
     bench.subject.device.hangs = True

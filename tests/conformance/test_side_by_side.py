@@ -1,4 +1,4 @@
-"""Runs beside each other."""
+"""Comparison of several runs in columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CASES = ("--case", "RS-01", "--case", "RS-04", "--case", "EN-04")
 
 @pytest.fixture
 def reports(flasher: Flasher, tmp_path: Path) -> list[Path]:
-    """A right device, a wrong one, and one of which less was judged."""
+    """A correct device, a wrong one, and one that was judged only in part."""
     right, wrong, less = (tmp_path / f"{name}.json" for name in ("right", "wrong", "less"))
     bench = ("conformance", "-t", "bms", "--mock", *CASES)
     flasher(*bench, "--json-report", right)

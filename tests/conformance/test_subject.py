@@ -1,4 +1,4 @@
-"""A bootloader under test in a process of its own: `--subject`."""
+"""`--subject`: a bootloader under test in its own process."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class LogsForEver(PythonBootloader):
 
 
 class EndsItsGroup(PythonBootloader):
-    """Gets what `timeout` and a cancelled build send to all processes of the group."""
+    """Receives the signal that `timeout` or a cancelled build sends to the process group."""
 
     def _begin(self, size: int) -> None:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -117,7 +117,7 @@ class WaitsForTheClock(PythonBootloader):
 
 
 class LosesComplete(PythonBootloader):
-    """Starts the application while its last answer is on its way."""
+    """Starts the application before its last answer has left."""
 
     def _end(self) -> None:
         super()._end()
@@ -125,7 +125,7 @@ class LosesComplete(PythonBootloader):
 
 
 class SendsWithoutEnd(PythonBootloader):
-    """Has always another frame, which tells how many are in the controller, and waits for none."""
+    """Always has another frame to send, with the number of pending frames, and never waits."""
 
     def tick(self, now_us: int) -> None:
         pass
@@ -135,7 +135,7 @@ class SendsWithoutEnd(PythonBootloader):
 
 
 class Restarts(PythonBootloader):
-    """Resets itself in the midst of a transfer."""
+    """Resets itself during a transfer."""
 
     def _store(self, data: bytes) -> None:
         if self._stored == 3:
@@ -201,7 +201,7 @@ def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
 
 
 class IsSanitized(PythonBootloader):
-    """Ends as a program ends that AddressSanitizer ends."""
+    """Ends like a program stopped by AddressSanitizer."""
 
     def _end(self) -> None:
         os.write(2, b"ERROR: AddressSanitizer: stack-buffer-overflow\nSUMMARY: message.c:70\n")

@@ -1,4 +1,4 @@
-"""What goes with a release: the badge and the summary."""
+"""Badge and summary of a run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Every wrong bootloader is caught by the case of its clause, and every case catches one.
+"""Every wrong bootloader fails the case of its clause, and every case detects one.
 
-The table is docs/reference/variants.md; the gate compares more of it, with
-`tests.variant_matrix --quick`.
+The table is docs/reference/variants.md; the gate compares more of it by `tests.variant_matrix
+--quick`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ SAMPLE = [
     "accepts-skipped-number",
     _NAMES[-1],
 ]
-"""Some of each clause; the gate judges every variant. Those by name have branches that no other
-test takes."""
+"""Some variants of each clause (the gate judges all); those listed by name cover branches that no
+other test reaches.
+"""
 
 
 def test_the_table_has_every_variant() -> None:
@@ -45,14 +46,14 @@ def test_every_variant_fails_the_case_of_its_clause() -> None:
 
 
 def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
-    """None of them is deaf: each is right in everything but its clause."""
+    """Each variant is correct except for its clause."""
     named = {VARIANTS[name].clause for name in LISTED}
     assert set(CASES).difference(WEAR, {BRING_UP}) == named
 
 
 def test_a_variant_that_takes_no_upgrade_fails_the_bring_up() -> None:
     failing = {name for name, fails in LISTED.items() if BRING_UP in fails}
-    # The suite's tester upgrades one that the host takes for two devices (R27).
+    # The host takes its device for two devices (R27), but the suite's tester upgrades it.
     takes_none = {name for name in LISTED if not VARIANTS[name].upgrade_works} - {"acks-twice"}
     assert failing >= takes_none
 

@@ -1,4 +1,4 @@
-"""SO and SP: run only when they are named, name the upgrade that failed, and see what is slower."""
+"""SO and SP: run only by name, list failed upgrades, and detect slower answers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.loops import each
 
 
 class TiredDevice(MockDevice):
-    """Never acknowledges packet 3 of its fourth and its seventh upgrade."""
+    """Never acknowledges packet 3 of its fourth and seventh upgrade."""
 
     erasures = 0
 
@@ -31,7 +31,7 @@ class TiredDevice(MockDevice):
 
     def _acknowledge(self, now: float) -> str:
         said = super()._acknowledge(now)
-        # The suite's own upgrade before the case is the first one.
+        # The first upgrade is the suite's own, before the case.
         if self.erasures in (5, 9) and self._transfer.stored == 3:
             self._transmitter.drop_unstarted()
         return said
@@ -102,7 +102,7 @@ def test_a_window_that_ends_elsewhere_is_found(window_s: float, verdict: CaseVer
     report = worn("SP-02", 30, profile=profile_of_mock(), window_s=window_s)
     assert one(report, "SP-02").verdict is verdict
     (end,) = report.measured()["last boot version to the window's end"]
-    # The model's window begins when it queues the last announcement, 1.2 ms before it is there.
+    # The model's window starts when it queues the last announcement, 1.2 ms before it arrives.
     assert end.value_s == pytest.approx(window_s - 0.0012, abs=0.02)
     taken = report.measured()["last boot version to an update command that is taken"]
     assert max(time.value_s for time in taken) < window_s

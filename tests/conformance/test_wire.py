@@ -1,4 +1,4 @@
-"""The suite's own framing, held against messages that were computed elsewhere."""
+"""The suite's own framing, compared with independently computed messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BMS = Encoder("bms")
 
 
 def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Received]:
-    """What is made of frames, given in hexadecimal."""
+    """Decode frames given in hexadecimal."""
     listener = DeviceDecoder(BMS)
     return [
         reply

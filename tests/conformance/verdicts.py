@@ -1,4 +1,4 @@
-"""What the suite says about the mock and about wrong devices, in short."""
+"""Verdicts of the suite on the mock and on wrong devices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import execute
 
 SMALL_AREA = {"application_area_bytes": 34 * 1024}
-"""272 packets: enough for all but images beyond 64 KiB, and quickly filled."""
+"""272 packets: enough for all images up to 64 KiB, and quick to fill."""
 
 
 def verdicts(
@@ -28,9 +28,9 @@ def verdicts(
     with_power: bool = True,
     **choices: Any,
 ) -> dict[str, CaseVerdict]:
-    """The verdict on each case of a device with these choices, or of that variant.
+    """Verdict on each case of a device with these choices or of this variant.
 
-    The profile states what the device chooses, and `states` besides, or instead.
+    The profile states the device's choices, changed by `states`.
     """
     profile = replace(MOCK_PROFILE, **(SMALL_AREA | choices))
     make_device = None if variant is None else variant_maker(variant)
@@ -39,14 +39,14 @@ def verdicts(
         subject.second_image = None
     if not with_power:
         subject.has_power = False
-    # A variant's own choices are part of what it is.
+    # A variant includes choices of its own.
     stated = profile_of_mock(subject.device.profile)
     judged_by = replace(stated, given={**stated.given, **(states or {})})
     return {case_id: _verdict(CASES[case_id], subject, judged_by) for case_id in cases}
 
 
 def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> CaseVerdict:
-    """As a run of this case alone, but for what a run does afterwards."""
+    """Like a run of this case alone, without the restore afterwards."""
     if why_unsupported(case, subject, profile):
         return CaseVerdict.UNSUPPORTED
     bench = Bench(subject, profile, limit_s=case.limit_s, seed=f"1/{case.id}/1")
@@ -57,7 +57,7 @@ def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> C
 
 
 def _put_image(subject: MockSubject) -> None:
-    """As a debugger does it: no frame is spent on it."""
+    """Write the image directly to flash, without frames."""
     image, store = subject.good_image, subject.device.store
     subject.power(on=False)
     if store.image() != image:
@@ -69,7 +69,7 @@ def _put_image(subject: MockSubject) -> None:
 
 
 def not_passed(*cases: str, **kwargs: Any) -> list[str]:
-    """The cases that are not passed."""
+    """Cases that did not pass."""
     found = verdicts(cases, **kwargs)
     return [case_id for case_id, status in found.items() if status is not CaseVerdict.PASS]
 

@@ -20,7 +20,7 @@ _PACKAGES = {
 
 
 def missing(*programs: str) -> str:
-    """Which of these programs are not installed, and how they come; empty when all are there."""
+    """Which of these programs are missing, with the packages that provide them; "" for none."""
     absent = [program for program in programs if shutil.which(program) is None]
     if not absent:
         return ""
@@ -29,7 +29,7 @@ def missing(*programs: str) -> str:
 
 
 def make(what: str, folder: Path, *settings: str, source: Path = SOURCE) -> str:
-    """`make host` or `make arm` of the example into a folder; returns what it printed."""
+    """`make host` or `make arm` of the example into a folder; returns the output."""
     made = subprocess.run(
         ["make", "-C", source, what, f"BUILD={folder}", *settings],
         capture_output=True,
@@ -42,8 +42,8 @@ def make(what: str, folder: Path, *settings: str, source: Path = SOURCE) -> str:
 
 @contextmanager
 def emulated(program: Path, monitor: Path) -> Iterator[str]:
-    """Runs a program on an emulated Cortex-M3; yields the channel of its slcan line. QEMU takes
-    orders at the socket `monitor`.
+    """Run a program on an emulated Cortex-M3 and yield the channel of its slcan line. QEMU takes
+    commands at the socket `monitor`.
     """
     with socket.create_server(("127.0.0.1", 0)) as line:
         number = line.fileno()
@@ -51,7 +51,7 @@ def emulated(program: Path, monitor: Path) -> Iterator[str]:
             *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(program)),
             *("-nographic", "-serial", "chardev:line"),
             *("-monitor", f"unix:{monitor},server=on,wait=off"),
-            # Without delay: the line's characters are sent one by one.
+            # No delay, since characters are sent one at a time.
             *("-chardev", f"socket,id=line,fd={number},server=on,wait=off,nodelay=on"),
         ]
         process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)

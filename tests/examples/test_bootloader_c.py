@@ -1,4 +1,4 @@
-"""The example bootloader in C: under the whole suite, and on an emulated Cortex-M."""
+"""The example bootloader in C: conformance suite, and an emulated Cortex-M."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _need(*programs: str) -> None:
 
 
 def test_some_of_every_group_under_sanitizers(flasher: Flasher, tmp_path: Path) -> None:
-    """The whole suite on it is a command: `python -m tests.campaigns.planted_bugs none`."""
+    """`python -m tests.campaigns.planted_bugs none` runs the whole suite on it."""
     _need("make", "gcc")
     make("host", tmp_path, "DEFINES=-DIMAGE_CHECKSUM=1")
     profile = tmp_path / "profile.toml"
@@ -46,7 +46,7 @@ def test_some_of_every_group_under_sanitizers(flasher: Flasher, tmp_path: Path) 
 
 
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:
-    """The one that reports PBU."""
+    """A target whose bootloader reports the name PBU."""
     _need("make", "gcc")
     make("host", tmp_path, "DEFINES=-DTARGET=TARGET_OBC")
     subject = tmp_path / "libboot.so"
