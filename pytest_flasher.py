@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from flasher.conformance.subject import BusPort, Subject
 
 _MARKERS = (
-    "destructive: erases the application of the device under test, which is put back afterwards",
+    "destructive: erases the application of the device under test, which is restored afterwards",
     "needs_power: switches the device under test off and on; skipped without power control",
-    "timing: judges times; what the adapter's time stamps are worth decides",
+    "timing: judges times, so the accuracy of the adapter's time stamps matters",
 )
 
 
@@ -33,30 +33,34 @@ _FLAG: dict[str, Any] = {"action": "store_true"}
 BENCH_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "--btl-target": ("wmc|bms|obc", "the device (default without hardware: bms)", {}),
     "--btl-interface": ("BACKEND", "python-can's back end for the adapter", {}),
-    "--btl-channel": ("CHANNEL", "which adapter or port: can0, ...", {}),
+    "--btl-channel": ("CHANNEL", "the adapter or port: can0, ...", {}),
     "--btl-bitrate": ("BPS", "bits per second (default 250000)", {"type": int}),
-    "--btl-bus-kwarg": ("KEY=VALUE", "one more argument for the back end; repeatable", _SEVERAL),
+    "--btl-bus-kwarg": ("KEY=VALUE", "additional argument for the back end; repeatable", _SEVERAL),
     "--btl-profile": ("FILE", "the product's choices and limits (TOML)", {}),
     "--btl-good-image": ("IMAGE", "an image that runs on the device", {}),
     "--btl-second-image": ("IMAGE", "another one, smaller, of another version", {}),
-    "--btl-allow-implausible": ("", "whatever these images look like", _FLAG),
-    "--btl-power-cmd": ("COMMAND", "switches the device, as 'relay 3 {on|off}'", {}),
-    "--btl-readback-cmd": ("COMMAND", "dumps the flash, as 'dump {file}'", {}),
-    "--btl-uncertainty": ("SECONDS", "how far times may be off", {"type": float}),
+    "--btl-allow-implausible": ("", "accept images that do not look like programs", _FLAG),
+    "--btl-power-cmd": ("COMMAND", "command that switches the device: 'relay 3 {on|off}'", {}),
+    "--btl-readback-cmd": ("COMMAND", "command that dumps the flash: 'dump {file}'", {}),
+    "--btl-uncertainty": ("SECONDS", "uncertainty of measured times", {"type": float}),
     "--btl-mock": ("", "test the built-in device model, on a virtual clock", _FLAG),
-    "--btl-subject": ("BOOTLOADER", "test one that is compiled for the computer", {}),
-    "--btl-variant": ("NAME", "with --btl-mock: one that is deliberately wrong", {}),
-    "--btl-set": ("KEY=VALUE", "with --btl-mock: a choice of it; repeatable", _SEVERAL),
-    "--btl-seed": ("SEED", "decides all that is left to chance", {"default": "1"}),
+    "--btl-subject": ("BOOTLOADER", "test a bootloader compiled for this computer", {}),
+    "--btl-variant": ("NAME", "with --btl-mock: a deliberately wrong device", {}),
+    "--btl-set": (
+        "KEY=VALUE",
+        "with --btl-mock: an option of the device model; repeatable",
+        _SEVERAL,
+    ),
+    "--btl-seed": ("SEED", "determines all random values", {"default": "1"}),
 }
 """Options that select and describe the device: metavar (none for a flag), help, and arguments."""
 _RUN_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "--btl-suite": ("", "collect the cases of the conformance suite too", _FLAG),
-    "--btl-quick": ("", "of the suite only what takes under a minute", _FLAG),
-    "--btl-strict": ("", "a pass in part fails, and a deviation that is none any more", _FLAG),
+    "--btl-quick": ("", "only the cases that take less than a minute", _FLAG),
+    "--btl-strict": ("", "fail on a pass in part and on a resolved deviation", _FLAG),
     "--btl-json-report": ("FILE", "the suite's report, for `flasher conformance diff`", {}),
-    "--btl-html": ("FILE", "the same as one self-contained page", {}),
-    "--btl-trace-dir": ("DIR", "folder for the frames (candump) of what does not pass", {}),
+    "--btl-html": ("FILE", "the report as one self-contained page", {}),
+    "--btl-trace-dir": ("DIR", "directory for the frames (candump) of failed cases", {}),
 }
 
 
@@ -84,7 +88,7 @@ def _is_active(config: pytest.Config) -> bool:
     return any(config.getoption(f"btl_{name}") for name in ("mock", "subject", "target"))
 
 
-# -- the bench, once a session --------------------------------------------------------------------
+# -- bench, once per session --------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")

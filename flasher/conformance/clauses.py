@@ -18,7 +18,7 @@ _DOCUMENT: Final = {
     "2.2.1 (4, 5)": "the command has two bytes, the second one is the length of the data: the "
     "message's length less 2",
     "2.2.1 (6)": "the CRC runs from the header to the last byte of the data, with the CAN id, high "
-    "byte first, put behind the header; it is sent high byte first",
+    "byte first, inserted after the header; it is sent high byte first",
     "2.2.1 (7)": "numbers in the data are sent low byte first",
     "2.2.2, table 2": "the CAN id names the sender and the receiver: 7, the digit of the sender (1 "
     "WMC, 2 BMS, 3 OBC, 5 CDL), the digit of the receiver (0 for all)",
@@ -75,35 +75,34 @@ READINGS: Final = {
     "R2": ClauseReading(
         "the tool answers every boot version with the update command until request transfer "
         "comes; a device may listen during the announcements or only after them",
-        "The flow chart does not tell when the device listens. A device that waits for the end of "
-        "its burst and one that listens from the first announcement on are both upgraded by a tool "
-        "that answers each announcement, at least 30 ms after its last update command: a second "
-        "one may begin a second erase. Into silence it sends none, as a silent device may be "
-        "erasing (but R26).",
+        "The flow chart does not define when the device listens. Answering each announcement works "
+        "for a device that listens from the first one on and for one that waits for the end of its "
+        "burst. Update commands are at least 30 ms apart: a second one may start a second erase. "
+        "During silence the tool sends none, as a silent device may be erasing (but R26).",
         suite=("up_04", "up_04_burst", "up_08", "limits.window_s"),
         host=("timings.update_spacing_s",),
         model=("window_s", "update_in_transfer"),
     ),
     "R3": ClauseReading(
         "reset and general feedback of WMC and OBC are those of the BMS on their own ids",
-        "They are said to stand in chapter 3, which has them for the BMS alone.",
+        "The document refers to chapter 3, which only has them for the BMS.",
         suite=("device.reset_command", "device.reset_data"),
         host=("reset_command", "reset_data"),
     ),
     "R4": ClauseReading(
         "packet numbers are sent low byte first in packet, ACK and NAK alike",
-        "The tables do not say it of these numbers; all data are sent so (2.2.1 (7)).",
+        "The tables do not define it for these numbers; 2.2.1 (7) applies to all data.",
     ),
     "R5": ClauseReading(
-        "a memory query names the first byte and the one behind the last",
-        "The answer is filled up where the end less the start is below 128: so that difference "
-        "is the number of bytes.",
+        "a memory query names the first byte and the byte after the last one",
+        "The answer is padded where the difference of end and start is below 128, so that "
+        "difference is the number of bytes.",
     ),
     "R6": ClauseReading(
-        "a NAK after end of transfer may be a damaged message: the tool sends it once more, and "
-        "a second NAK means that the image was refused",
-        "The flow chart has two branches there, one for a message that was not received rightly "
-        "and one for an upgrade that has failed, and NAK in both.",
+        "a NAK after end of transfer may mean a damaged message: the tool repeats it once, and "
+        "a second NAK means that the image was rejected",
+        "The flow chart has two branches there, one for a damaged message and one for a failed "
+        "upgrade, both with NAK.",
         suite=("en_02", "limits.refused_s"),
         host=("timings.end_tries",),
         model=("repeated_end", "refused_hold_s"),
@@ -111,7 +110,7 @@ READINGS: Final = {
     "R7": ClauseReading(
         "no CRC of the image is sent: the device checks that all packets are there and fit the "
         "size, and the image's own checksum where the product has one",
-        "The document calls it a CRC32 check of what was received, but gives the device nothing "
+        "The document calls it a CRC32 check of the received data, but gives the device no value "
         "to compare with.",
         suite=("en_04",),
         model=("image_checksum",),
@@ -120,7 +119,7 @@ READINGS: Final = {
         "the image has no address: it is sent from its lowest byte on, gaps filled with FF, and "
         "has to fit the application area",
         "No message carries an address. A file with bootloader and application in one would be "
-        "written to the wrong place, so the host refuses what lies outside of the area.",
+        "written to the wrong place, so the host rejects bytes outside the area.",
         suite=("device.application_bytes", "device.largest_image_bytes"),
         host=("application_area.start", "application_area.size_bytes", "image_limit_bytes", "cpu"),
         model=("application_area_bytes", "largest_image_bytes"),
@@ -135,7 +134,7 @@ READINGS: Final = {
         model=("largest_image_bytes",),
     ),
     "R10": ClauseReading(
-        "a packet that is stored and comes again is acknowledged again and not stored again",
+        "a repeated packet that is already stored is acknowledged again, not stored again",
         "A lost ACK makes every tool repeat the packet. Some bootloaders answer NAK n+1 then "
         '("I want the next one"), which is an ACK only where a profile says so and the packet was '
         "sent more than once. An ACK or NAK of an older packet is stale. After a repetition the "
@@ -146,12 +145,11 @@ READINGS: Final = {
         model=("repeated_packet", "older_packet"),
     ),
     "R11": ClauseReading(
-        "a boot version in the midst of a transfer is a restart; after end of transfer it is "
-        "not answered",
-        "A device that announces itself has left the transfer, so the upgrade begins again, a "
-        "bounded number of times; up to 60 ms after request transfer it is a leftover of the "
-        "burst. Behind the end the device may be on the way into its new application, which an "
-        "update command would erase: the version answer decides, else the outcome is unconfirmed.",
+        "a boot version during a transfer is a restart; after end of transfer it is not answered",
+        "A device that announces itself has left the transfer, so the upgrade restarts, a limited "
+        "number of times. Up to 60 ms after request transfer a boot version is a leftover of the "
+        "burst. After the end the device may be starting its new application, which an update "
+        "command would erase: the version answer decides, else the outcome is unconfirmed.",
         suite=("en_03",),
         host=("attempts", "timings.leftover_boot_version_s", "timings.announcing_on_s"),
         model=("after_complete",),
@@ -185,8 +183,8 @@ READINGS: Final = {
         "bytes.",
     ),
     "R14": ClauseReading(
-        "without a valid application the bootloader announces itself until an update command comes",
-        "The document does not describe such a device. One that is silent after its burst can be "
+        "without a valid application the bootloader announces itself until an update command",
+        "The document does not describe this case. A device that is silent after its burst can be "
         "upgraded too, but only after power-up.",
         suite=("rs_03", "tx_12"),
         host=("power_up_timeout_s",),
@@ -194,99 +192,98 @@ READINGS: Final = {
     ),
     "R15": ClauseReading(
         "the bootloader answers update command, packet and end of transfer with its own "
-        "messages; general feedback beside them, or to an unknown write, is right too",
-        "2.2.1 (2) has every device confirm a write by general feedback, appendix 3 gives the "
-        "bootloader answers of its own. Both devices are right.",
+        "messages; additional general feedback, also to an unknown write, is correct too",
+        "2.2.1 (2) requires general feedback to every write, appendix 3 defines other answers of "
+        "the bootloader. Both are correct.",
     ),
     "R16": ClauseReading(
         "request transfer again before the first ACK: the tool sends packet 1 again",
-        "An update command would make the device erase again; later than that it is a restart "
+        "An update command would make the device erase again. After the first ACK it is a restart "
         "(R11).",
     ),
     "R17": ClauseReading(
-        "an application that runs answers upgrade messages with general feedback or nothing, "
+        "a running application answers upgrade messages with general feedback or not at all, "
         "and erases nothing",
-        "They are writes, but belong to the bootloader.",
+        "They are writes, but meant for the bootloader.",
         suite=("up_03",),
         model=("upgrade_in_application",),
     ),
     "R18": ClauseReading(
         "the bootloader ignores reset, which belongs to the application",
-        "The document places the command in the application (5.2). A bootloader that restarts is a "
-        "choice.",
+        "The document assigns the command to the application (5.2). A bootloader may also restart.",
         suite=("rs_02", "tx_13"),
         model=("reset_in_bootloader", "reset_in_transfer"),
     ),
     "R19": ClauseReading(
-        "power-up passes through the bootloader; without update command it starts the "
-        "application, after complete the new one; a message begins at the beginning of a frame",
-        "Not said in words, but nothing else makes sense of the flow chart and of the way in which "
-        "messages are put into frames. A temperature is degrees Celsius + 40, the 32 fault bits "
-        "stand low byte first as all data.",
+        "power-up starts the bootloader; without update command it starts the application, "
+        "after complete the new one; a message starts at the start of a frame",
+        "Not explicit, but the only consistent reading of the flow chart and of the division into "
+        "frames. A temperature is degrees Celsius + 40; the 32 fault bits are sent low byte first "
+        "like all data.",
         suite=("fr_02", "en_03", "limits.start_s"),
         model=("after_complete", "start_delay_s"),
     ),
     "R20": ClauseReading(
-        "texts that break the rule of the terminator are shown as they are",
-        "Real devices fill a field to its last byte; control characters are shown escaped. The "
-        "project itself writes only texts that keep the rule.",
+        "texts without a valid terminator are shown unchanged",
+        "Real devices fill a field to its last byte; control characters are shown escaped. This "
+        "project only writes texts with a valid terminator.",
     ),
     "R21": ClauseReading(
         "status 00 of the battery means that no flag is set",
-        "The table calls 00 asleep, and the byte flags joined by or: an awake battery without a "
-        "charger is 00 too.",
+        "The table calls 00 asleep, but also defines the byte as combined flags: an awake battery "
+        "without a charger is 00 too.",
     ),
     "R22": ClauseReading(
         "state of health 0 may be that of an older device",
-        "The byte was one of five reserved zero bytes before (R1). It is shown as received; more "
-        "than 100 % is marked.",
+        "The byte used to be one of five reserved zero bytes (R1). It is shown as received; values "
+        "above 100 % are marked.",
         model=("older_battery",),
     ),
     "R23": ClauseReading(
         "SHUTDOWN is repeated every 200 ms, for 1 s at most",
-        "The document gives this rhythm for the tool's commands and none for SHUTDOWN.",
+        "The document gives this interval for the tool's commands and none for SHUTDOWN.",
         model=("idle_shutdown",),
     ),
     "R24": ClauseReading(
         "fault bits 25 to 31 have no meaning",
-        "They are not in the document, and not called reserved either: shown by their numbers.",
+        "The document neither defines nor reserves them; they are shown by number.",
     ),
     "R25": ClauseReading(
         "a second update command before the first packet may be answered by a second request "
         "transfer, or not",
-        "The device may erase again, or see that it has done so.",
+        "The device may erase again, or recognise that it already has.",
     ),
     "R26": ClauseReading(
-        "a device that sits silent in a broken transfer gets one update command into the silence",
-        "No end of a transfer is given, so a device whose tool was lost may wait for ever, without "
-        "an announcement and without knowing reset. When both stayed unanswered and the erase "
-        "limit has passed in silence, the tool tries the update command once, as a new attempt; "
-        "where the device has no application to lose, again after each further erase limit. It "
-        "does so for the upgrade of an earlier run too: where the history of this computer knows "
-        "one of this device on this adapter that did not end, or left it without an application, "
-        "or where --in-session says so. A station does not: it has a rule of its own.",
+        "a silent device in an interrupted transfer gets one update command during the silence",
+        "The document defines no time limit, so a device whose tool was lost may wait forever, "
+        "without announcing itself or accepting a reset. After a reset without an answer and the "
+        "erase limit in silence, the tool sends the update command once, as a new attempt; if "
+        "the device has no application to lose, again after each further erase limit. This also "
+        "applies to an upgrade of an earlier run that did not end or left the device without an "
+        "application, according to the history of this computer for this adapter or to "
+        "--in-session. A station has its own rule.",
         suite=("tx_12", "tx_13"),
         host=("attempts", "timings.request_transfer_timeout_s"),
         model=("pause_in_transfer",),
     ),
     "R27": ClauseReading(
-        "a question that is answered twice, a packet with more answers than copies, announcements "
-        "that overlap: two devices of one kind are on the bus",
-        "The document has one device of a kind. Nothing is written then, and in a transfer no "
-        "success is claimed. Two that answer bit for bit alike in the same slot cannot be told "
-        "apart, and one that is silent cannot be found.",
+        "a query that is answered twice, a packet with more answers than copies, or overlapping "
+        "announcements: two devices of the same kind are on the bus",
+        "The document has one device of each kind. The tool then writes nothing, and reports no "
+        "success of a transfer. Two devices that send equal bits at the same time cannot be "
+        "distinguished, and a silent one cannot be detected.",
         host=("timings.boot_watch_s",),
     ),
     "R28": ClauseReading(
-        "an announcement that the tool did not cause means another unit, or a lost supply",
-        "The announcement after power-up is that after a reset, and names no unit. An upgrade "
-        "takes it for a restart of the device that it has reset (R11); a run of the station ends.",
+        "an announcement that the tool did not cause means another unit or a power loss",
+        "The announcement after power-up equals that after a reset and identifies no unit. An "
+        "upgrade treats it as a restart of its device (R11); a run of the station ends.",
     ),
 }
 CLAUSES: Final = {
     **{f"Welling {number}": content for number, content in _DOCUMENT.items()},
     **{number: reading.asks for number, reading in READINGS.items()},
-    ROBUSTNESS: "no clause asks for it, but a bootloader on a real bus meets it",
+    ROBUSTNESS: "not required by a clause, but it happens on a real bus",
 }
 """Text of every clause by its label."""
 

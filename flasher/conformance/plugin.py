@@ -270,9 +270,9 @@ def open_run(
 
 def _report(node: pytest.Item, result: CaseResult) -> None:
     """Add untried parts, and the frames of a failure, to the report of a test."""
-    said = [f"not tried: {part}" for part in result.not_tried]
-    if said:
-        node.add_report_section("call", "conformance", "\n".join([result.verdict.text, *said]))
+    parts = [f"not tried: {part}" for part in result.not_tried]
+    if parts:
+        node.add_report_section("call", "conformance", "\n".join([result.verdict.text, *parts]))
     if result.verdict in TRACED:
         part = excerpt(result, _MESSAGES, _FRAMES)
         lines = [part.text, *map(str, part.messages), *frame_lines(part.frames)]
@@ -359,11 +359,11 @@ class Hooks:
         if self._run is None:
             return
         report, measurements = self._run.report(), self._run.measurements
-        said = [report.in_full, *(f"this bench is {gap}" for gap in report.gaps)]
-        said += [f"good image at the end: {report.final_image_text}"] if report.final_image else []
-        if any(said):
+        lines = [report.in_full, *(f"this bench is {gap}" for gap in report.gaps)]
+        lines += [f"good image at the end: {report.final_image_text}"] if report.final_image else []
+        if any(lines):
             terminalreporter.section("bootloader under test")
-        for line in filter(None, said):
+        for line in filter(None, lines):
             terminalreporter.write_line(printable(line))
         if not measurements.times:
             return

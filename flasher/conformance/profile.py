@@ -294,8 +294,8 @@ def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile
         why = content.get("rationale", "")
         if set(content) - {"value", "rationale"} or "value" not in content:
             remedy = f'Write {path.rpartition(".")[2]} = {{ value = ..., rationale = "why" }}.'
-            said = f"{path} must be a value, or a table of value and rationale."
-            faults.append(Fault(path, said, remedy))
+            text = f"{path} must be a value, or a table of value and rationale."
+            faults.append(Fault(path, text, remedy))
             return _READER.keys[path].default
         if not isinstance(why, str):
             faults.append(Fault(f"{path}.rationale", f"The rationale of {path} must be a text."))

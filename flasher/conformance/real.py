@@ -210,8 +210,8 @@ def _run(words: Sequence[str], limit_s: float, what: str) -> None:
     except OSError as error:
         raise _failed(what, f"cannot be run: {error.strerror}", words) from error
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip()[-300:]
-        raise _failed(what, f"failed with exit code {done.returncode}", words, ascii(said)[1:-1])
+        output = done.stderr.decode(errors="replace").strip()[-300:]
+        raise _failed(what, f"failed with exit code {done.returncode}", words, ascii(output)[1:-1])
 
 
 def _failed(what: str, how: str, words: Sequence[str], cause: str = "") -> BusError:

@@ -225,8 +225,8 @@ class Gap:
     def __str__(self) -> str:
         """One line without the names of the cases."""
         costs = {"cannot be run": len(self.unsupported), "judged in part": len(self.in_part)}
-        said = ", ".join(f"{count} {what}" for what, count in costs.items() if count)
-        return f"without {self.lacks}: {said} (needs {self.remedy})"
+        counts = ", ".join(f"{count} {what}" for what, count in costs.items() if count)
+        return f"without {self.lacks}: {counts} (needs {self.remedy})"
 
 
 @dataclass(frozen=True)

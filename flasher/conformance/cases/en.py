@@ -114,7 +114,7 @@ def _restart_transfer(
     found = reply if reply is not None and reply.kind is Reply.BOOT_VERSION else None
     found = found or bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
     if bench.choice("rs_03") == "announces":
-        bench.require_received(found, "the transfer goes on, or boot version", within_s)
+        bench.require_received(found, "continued transfer or boot version", within_s)
     bench.update(len(image))
     bench.packets(image, 1, stored)
 

@@ -60,10 +60,10 @@ def _upgrade_once(bench: Bench, image: bytes) -> bool:
         bench.check_image(image)
     except CaseStopped:
         pass
-    said = {(one.outcome, one.expected) for one in checks[:begin]}
+    known = {(one.outcome, one.expected) for one in checks[:begin]}
     found, checks[begin:] = checks[begin:], []
     for one in found:
-        is_new = (one.outcome, one.expected) not in said
+        is_new = (one.outcome, one.expected) not in known
         is_untried = one.outcome is CheckOutcome.UNSUPPORTED
         if one.outcome is not CheckOutcome.PASS and (is_new or not is_untried):
             checks.append(one)

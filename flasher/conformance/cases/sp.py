@@ -41,7 +41,7 @@ def answer_times(bench: Bench) -> None:
     image = bench.good_image
     tells = reported_version(bench.subject.target, image) is not None
     if not tells:
-        why = "the device does not tell which application runs"
+        why = "the device does not report which application runs"
         bench.unsupported("the time to an application that answers", why)
     for turn in range(1, bench.upgrades + 1):
         with bench.step(f"upgrade {turn}"):

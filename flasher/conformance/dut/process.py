@@ -155,8 +155,8 @@ class BootloaderProcess:
         """What the process printed, such as a sanitizer report without its memory dump."""
         self._stderr.seek(0)
         lines = self._stderr.read(_OUTPUT_SIZE).decode(errors="replace").splitlines()
-        said = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)
-        return " | ".join(printable(line) for line in said if line.strip(" ="))
+        report = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)
+        return " | ".join(printable(line) for line in report if line.strip(" ="))
 
     def _become_bootloader(self, read_fd: int, write_fd: int) -> Never:
         """Replace this child process by the bootloader."""

@@ -70,5 +70,5 @@ def open_subject(
         profile = profile or ConformanceProfile()
         size_bytes = subject.device.facts.application_bytes
         area_bytes = profile.given.get("device.application_bytes", size_bytes)
-        told = {"device.application_bytes": size_bytes, "device.largest_image_bytes": area_bytes}
-        yield subject, replace(profile, given={**told, **profile.given})
+        sizes = {"device.application_bytes": size_bytes, "device.largest_image_bytes": area_bytes}
+        yield subject, replace(profile, given={**sizes, **profile.given})

@@ -57,10 +57,10 @@ def burst(session: InitSession) -> Findings:
     yield KeyAnswer("device.reset_data", text, f"{command} was sent with {text}")
     shown = ", ".join(map(str, counts))
     alike = len(set(counts)) == 1
-    said = f"{shown} boot versions after {REPEATS} resets"
+    seen = f"{shown} boot versions after {REPEATS} resets"
     if len(turns) > REPEATS:
-        said += f" and {REPEATS} power cycles"
-    yield KeyAnswer("device.versions", counts[0] if alike else None, said)
+        seen += f" and {REPEATS} power cycles"
+    yield KeyAnswer("device.versions", counts[0] if alike else None, seen)
     if not gaps_s:
         why = "a single boot version has no spacing"
         yield KeyAnswer("limits.version_spacing_s", None, why)
@@ -371,10 +371,10 @@ def largest_image(session: InitSession) -> Findings:
         low, high = (size, high) if is_taken(size) else (low, size)
     session.update()
     session.finish()
-    said = f"update command for {low} bytes accepted"
+    seen = f"update command for {low} bytes accepted"
     if high:
-        said += f", for {high} bytes rejected, by bisection"
-    yield KeyAnswer("device.largest_image_bytes", low, said)
+        seen += f", for {high} bytes rejected, by bisection"
+    yield KeyAnswer("device.largest_image_bytes", low, seen)
 
 
 def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float) -> bool:

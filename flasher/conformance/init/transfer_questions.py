@@ -213,8 +213,8 @@ def padded(session: InitSession) -> Findings:
         taken = session.offer_update(
             padded_to_frame(bench.encoder.update(len(session.image)), byte)
         )
-        said = f"padded with {byte:02X}"
-        yield _accepted_trial(taken, f"update command {said}", "ignored", "rejected")
+        form = f"padded with {byte:02X}"
+        yield _accepted_trial(taken, f"update command {form}", "ignored", "rejected")
         if not taken:  # the window has ended
             session.await_application()
             session.begin()
@@ -222,7 +222,7 @@ def padded(session: InitSession) -> Findings:
         bench.forget()
         sent = bench.send(padded_to_frame(bench.encoder.end(), byte))
         reply = bench.wait_for(Reply.COMPLETE, within_s=within_s)
-        yield _accepted_trial(reply is not None, f"end {said}", "ignored", "rejected")
+        yield _accepted_trial(reply is not None, f"end {form}", "ignored", "rejected")
         if reply is None:
             bench.forget()
             bench.end_transfer()
