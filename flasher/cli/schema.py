@@ -36,6 +36,7 @@ _PUBLISHED: Final = {
     "flasher.host.write.FieldChange": "ChangeDocument",
     "flasher.image.image.AddressSpan": "SegmentDocument",
     "flasher.mock.variants.base.Variant": "VariantDocument",
+    "flasher.station.records.model.ReportedRun": "ReportedRunDocument",
 }
 """Types whose definitions were published under another name than their own."""
 

@@ -13,11 +13,17 @@ from typing import Any, Final
 
 from flasher.protocol.text import no_formula
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
-from flasher.station.records.model import Figures, RunFilter, RunKind, RunState, utc_text
+from flasher.station.records.model import (
+    Figures,
+    ReportedRun,
+    RunFilter,
+    RunKind,
+    RunState,
+    utc_text,
+)
 from flasher.station.records.queries import Records
 
 SCHEMA_VERSION: Final = 1
-Row = dict[str, str | int | float | bool | None]
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class Report:
         return self.records.figures(self.chosen)
 
     @cached_property
-    def runs(self) -> list[Row]:
+    def runs(self) -> list[ReportedRun]:
         """As `Records.table` gives them, the oldest first."""
         return self.records.table(self.chosen)
 
@@ -51,7 +57,7 @@ class Report:
                 for name, value in asdict(self.chosen).items()
             },
             "figures": asdict(self.figures) | shares,
-            "runs": self.runs,
+            "runs": [vars(run) for run in self.runs],
         }
 
     def to_json(self) -> str:
@@ -59,7 +65,7 @@ class Report:
 
     def to_csv(self) -> str:
         """One row a run under a line of headings, for a spreadsheet; empty without runs."""
-        return csv_text([*self.runs[:1], *(run.values() for run in self.runs)])
+        return csv_text([*map(vars, self.runs[:1]), *(vars(run).values() for run in self.runs)])
 
     def to_junit(self) -> str:
         """One test case a run: FAIL is a failure, ERROR and INTERRUPTED are errors, ABORTED is
@@ -68,7 +74,7 @@ class Report:
         cases = [
             _junit_case(run)
             for run in self.runs
-            if run["kind"] != RunKind.GOLDEN.value and run["state"] != RunState.RUNNING.value
+            if run.kind is not RunKind.GOLDEN and run.state is not RunState.RUNNING
         ]
         return junit_xml("station", [JUnitSuite("station", cases)]).decode("ascii")
 
@@ -91,22 +97,22 @@ def csv_cell(value: object) -> str:
     return "" if value is None else str(value)
 
 
-_JUNIT_RESULTS: Final[dict[object, JUnitResult]] = {
-    RunState.FAIL.value: JUnitResult.FAILURE,
-    RunState.ERROR.value: JUnitResult.ERROR,
-    RunState.INTERRUPTED.value: JUnitResult.ERROR,
-    RunState.ABORTED.value: JUnitResult.SKIPPED,
+_JUNIT_RESULTS: Final = {
+    RunState.FAIL: JUnitResult.FAILURE,
+    RunState.ERROR: JUnitResult.ERROR,
+    RunState.INTERRUPTED: JUnitResult.ERROR,
+    RunState.ABORTED: JUnitResult.SKIPPED,
 }
 
 
-def _junit_case(run: Row) -> JUnitCase:
-    virtual = "virtual " if run["is_virtual"] else ""
+def _junit_case(run: ReportedRun) -> JUnitCase:
+    virtual = "virtual " if run.is_virtual else ""
     return JUnitCase(
-        f"{virtual}{run['recipe']} {run['recipe_revision']}",
-        str(run["serial"]),
-        float(run["duration_s"] or 0.0),
-        _JUNIT_RESULTS.get(run["state"], JUnitResult.PASSED),
-        message=str(run["text"]),
-        type=str(run["code"]),
-        timestamp=str(run["begun_at"]),
+        f"{virtual}{run.recipe} {run.recipe_revision}",
+        run.serial,
+        run.duration_s or 0.0,
+        _JUNIT_RESULTS.get(run.state, JUnitResult.PASSED),
+        message=run.text,
+        type=run.code,
+        timestamp=run.begun_at,
     )

@@ -600,7 +600,7 @@ def test_a_second_ctrl_c_stops_the_runs_which_are_recorded_as_aborted(
     (unit,) = lines_of(run)[1]["units"]
     assert (unit["outcome"], unit["code"]) == ("aborted", "OPERATOR_ABORT")
     with Store.open(str(database), station="reader", create=False) as store:
-        assert [each["state"] for each in store.read.table()] == [RunState.ABORTED.value]
+        assert [each.state for each in store.read.table()] == [RunState.ABORTED]
 
 
 def press_when(monkeypatch: pytest.MonkeyPatch, event: str, *, times: int) -> None:

@@ -71,13 +71,14 @@ def test_a_report_s_rows_are_the_runs(plant: Bench, report: Report) -> None:
     with plant.outsider() as connection:
         run_ids = connection.execute("SELECT id FROM run ORDER BY id").fetchall()
     runs = [plant.store.read.run(run_id).run for (run_id,) in run_ids]
-    assert [row["run_id"] for row in report.runs] == [run.run_id for run in runs]
+    assert [row.run_id for row in report.runs] == [run.run_id for run in runs]
     for row, run in zip(report.runs, runs, strict=True):
-        told = {name: getattr(run, name) for name in row}
-        shared = [name for name in row if name not in ("begun_at", "ended_at", "verified")]
-        assert {name: row[name] for name in shared} == {name: told[name] for name in shared}
+        same = vars(row).keys() - {"begun_at", "ended_at", "verified"}
+        assert {name: getattr(row, name) for name in same} == {
+            name: getattr(run, name) for name in same
+        }
         verified = None if run.verified is None else run.verified.name.lower()
-        assert row["verified"] == verified
+        assert row.verified == verified
 
 
 def test_a_json_report_is_json_with_its_shares(report: Report) -> None:

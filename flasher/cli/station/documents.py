@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, get_args
+from typing import Final, get_args
 
 from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
@@ -12,7 +11,7 @@ from flasher.station.records.model import (
     Backup,
     Examination,
     Figures,
-    RunKind,
+    ReportedRun,
     RunState,
     UnitLife,
 )
@@ -106,40 +105,11 @@ class StationRunDocument:
 
 
 @dataclass(frozen=True)
-class ReportedRunDocument:
-    """A run. Times are in UTC."""
-
-    run_id: int
-    serial: str
-    part: str
-    lot: str | None
-    kind: RunKind
-    is_virtual: bool
-    """The unit was a virtual one: no product."""
-    state: RunState
-    code: str
-    text: str
-    begun_at: str
-    ended_at: str | None
-    duration_s: float | None
-    station: str
-    socket: str
-    operator: str
-    recipe: str
-    recipe_revision: str
-    recipe_sha256: str
-    verified: str | None
-    """The weakest of its targets: completed, version or memory."""
-    log_sha256: str | None
-    reason: str
-
-
-@dataclass(frozen=True)
 class StationReportDocument:
     """Runs with their figures."""
 
     figures: FiguresDocument
-    runs: list[ReportedRunDocument]
+    runs: list[ReportedRun]
 
 
 @dataclass(frozen=True)
@@ -235,9 +205,3 @@ LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 def figures_document(figures: Figures) -> FiguresDocument:
     by_state = {RunState(state).name.lower(): n for state, n in figures.by_state.items()}
     return document_of(FiguresDocument, figures, by_state=by_state, failures=dict(figures.failures))
-
-
-def run_document(row: Mapping[str, Any]) -> ReportedRunDocument:
-    """A row of `Records.table` as JSON."""
-    choices = {"kind": RunKind(row["kind"]), "state": RunState(row["state"])}
-    return ReportedRunDocument(**{**row, **choices})

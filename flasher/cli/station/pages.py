@@ -84,7 +84,7 @@ class OperatorView:
         rule = self._station.recipe.recipe
         if rule.lot.quantity_max and line.lot != self._lot:
             runs = self._station.store.read.table(RunFilter(lot=line.lot, part=rule.part))
-            self._good = {str(run["serial"]): run["state"] == RunState.PASS for run in runs}
+            self._good = {run.serial: run.state is RunState.PASS for run in runs}
         self._lot = line.lot
         lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
         operator = line.operator or text("nobody: scan a badge")
@@ -112,11 +112,9 @@ def operator_page(
     tally = Tally(config.shifts)
     began = tally.began(datetime.now().astimezone())
     store = station.store
-    for row in store.read.table(RunFilter(since=began)):
-        state = RunState(str(row["state"]))
-        if row["station"] == store.station and state is not RunState.RUNNING:
-            at = utc_moment(str(row["begun_at"]))
-            tally.add(EndedRun(at, str(row["serial"]), state, str(row["code"])))
+    for run in store.read.table(RunFilter(since=began)):
+        if run.station == store.station and run.state is not RunState.RUNNING:
+            tally.add(EndedRun(utc_moment(run.begun_at), run.serial, run.state, run.code))
     clock = station.clock
     watch = Watch(store.files.folder, clock.utc, clock.monotonic_s, store.signer.unkept)
     screen = Screen(tally, watch)

@@ -18,7 +18,6 @@ from flasher.cli.station.documents import (
     UnitDocument,
     UnitTraceDocument,
     figures_document,
-    run_document,
 )
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
@@ -82,7 +81,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             return code  # the runs are read for the document alone
         document = StationReportDocument(
             figures=figures_document(made.figures),
-            runs=[run_document(row) for row in made.runs],
+            runs=made.runs,
         )
         return output.document(document, exit_code=code)
 
@@ -113,7 +112,7 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
             remedy="Name a folder in a folder that exists.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
-    units = sorted({(str(row["serial"]), str(row["part"])) for row in report.runs})
+    units = sorted({(run.serial, run.part) for run in report.runs})
     serials = [serial for serial, _ in units]
     lives = [store.read.unit(serial, part) for serial, part in units]
     refused = 0

@@ -330,6 +330,35 @@ class RunRecord:
 
 
 @dataclass(frozen=True)
+class ReportedRun:
+    """A run. Times are in UTC."""
+
+    run_id: int
+    serial: str
+    part: str
+    lot: str | None
+    kind: RunKind
+    is_virtual: bool
+    """The unit was a virtual one: no product."""
+    state: RunState
+    code: str
+    text: str
+    begun_at: str
+    ended_at: str | None
+    duration_s: float | None
+    station: str
+    socket: str
+    operator: str
+    recipe: str
+    recipe_revision: str
+    recipe_sha256: str
+    verified: str | None
+    """The weakest of its targets: completed, version or memory."""
+    log_sha256: str | None
+    reason: str
+
+
+@dataclass(frozen=True)
 class RunDetails:
     """A run with all its parts."""
 

@@ -18,9 +18,11 @@ from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import Head
 from flasher.station.records.model import (
     Figures,
+    ReportedRun,
     RunDetails,
     RunFilter,
     RunId,
+    RunKind,
     RunState,
     UnitLife,
     UnitState,
@@ -46,15 +48,16 @@ class Records:
         self._database = database
         self._rollup = Rollup(database)
 
-    def table(
-        self, chosen: RunFilter = _EVERYTHING
-    ) -> list[dict[str, str | int | float | bool | None]]:
-        """The runs of a filter as plain rows, for reports over many of them: names as in
-        `RunRecord`, times as texts in UTC, verification by its word.
-        """
+    def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
+        """The runs of a filter, for reports over many of them."""
         query = filtered(run_query(VERIFIED), chosen).order_by(schema.run.c.id)
         with self._database.reading() as connection:
-            return [dict(row) for row in connection.execute(query).mappings()]
+            return [
+                ReportedRun(
+                    **{**row, "kind": RunKind(row["kind"]), "state": RunState(row["state"])}
+                )
+                for row in connection.execute(query).mappings()
+            ]
 
     def run(self, run_id: RunId) -> RunDetails:
         """A run with its parts. Raises NotFoundError."""

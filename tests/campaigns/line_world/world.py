@@ -868,7 +868,7 @@ class World:
     def _look_at_records(self) -> None:
         """Every PASS that was shown is in the records."""
         rows = self.bench.store.read.table(RunFilter(state=RunState.PASS))
-        lost = self.passed - {str(row["serial"]) for row in rows}
+        lost = self.passed - {run.serial for run in rows}
         if lost:
             raise Violation("LOST", f"PASS of {_words(sorted(lost))} was shown, and is not saved")
 

@@ -147,7 +147,7 @@ def test_every_filter_finds_what_a_report_finds(
     ]  # fmt: skip
     for words in filters:
         chosen = RunFilter(**words)  # type: ignore[arg-type]
-        wanted = [row["run_id"] for row in store.read.table(chosen)][::-1]
+        wanted = [run.run_id for run in store.read.table(chosen)][::-1]
         for short, lead in ((20_000, 50), (0, 50), (0, 0)):
             monkeypatch.setattr(newest, "_SHORT", short)
             monkeypatch.setattr(newest, "_LEAD_MAX", lead)

@@ -119,8 +119,10 @@ def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureReque
         assert len(store.recover()) == 1  # the run that its station left
         rows = store.read.table()
         assert len(rows) == 50
-        assert {row["kind"] for row in rows} == {kind.value for kind in RunKind}
-        assert {row["state"] for row in rows} == {state.value for state in RunState} - {"RUNNING"}
+        assert {row.kind for row in rows} == set(RunKind)
+        assert {row.state.value for row in rows} == {state.value for state in RunState} - {
+            "RUNNING"
+        }
         assert not store.examine().problems
     with old.open("line-3") as other:
         other.recover()
