@@ -112,12 +112,12 @@ def gap_options(function: Callable[..., int]) -> Callable[..., int]:
     """--frame-gap and --packet-gap."""
     frame_gap_max_s = FRAME_GAP_SHARE * DEFAULT_TIMINGS.inter_frame_timeout_s
     function = option(
-        "--packet-gap", type=values.seconds, metavar="S", panel="upgrade",
+        "--packet-gap", "packet_gap_s", type=values.seconds, metavar="S", panel="upgrade",
         help="seconds of silence before each packet, for slow receivers; at most "
         f"{PACKET_GAP_MAX_S:g}",
     )(function)  # fmt: skip
     decorated: Callable[..., int] = option(
-        "--frame-gap", type=values.seconds, metavar="S", panel="upgrade",
+        "--frame-gap", "frame_gap_s", type=values.seconds, metavar="S", panel="upgrade",
         help="seconds of silence between the frames of a message, for slow receivers; at most "
         f"{frame_gap_max_s:g}, or as a profile's inter_frame_timeout_s allows",
     )(function)  # fmt: skip

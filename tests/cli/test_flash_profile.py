@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from flasher.cli.upgrade.flash import UpgradeChoices
 from flasher.errors import ExitCode
+from flasher.protocol.spec import TARGETS, WELLING
+from flasher.protocol.timing import Timings
+from flasher.settings.profile import Profile, load_profile
 from tests.cli.conftest import SAMPLES, Flasher, Run
 
 BMS = SAMPLES / "bms.hex"
@@ -84,3 +90,36 @@ def test_a_misspelt_key_is_wrong_usage_with_a_suggestion(flash: Flasher) -> None
     run = flash("[bms]\natempts = 2\n", BMS, "-t", "bms")
     assert run.code == ExitCode.USAGE
     assert "attempts" in run.err
+
+
+NO_CHOICES = {each.name: None for each in fields(UpgradeChoices)}
+IN_BOTH = {
+    "packet_tries": ("[timings]\npacket_tries = 5\n", 5, 2),
+    "attempts": ("attempts = 5\n", 5, 2),
+    "timeout_s": ("timeout_s = 600.0\n", 600.0, 5.0),
+    "adapter_return_s": ("adapter_return_s = 9.0\n", 9.0, 0.0),
+    "frame_gap_s": ("frame_gap_s = 0.01\n", 0.01, 0.0),
+    "packet_gap_s": ("packet_gap_s = 0.5\n", 0.5, 0.0),
+    "nak_next_is_ack": ("nak_next_is_ack = false\n", False, True),
+}
+"""Options that a profile has too: its text, its value, and another one of the command line."""
+
+
+def test_every_option_that_a_profile_has_too_is_among_these() -> None:
+    keys = {each.name for each in (*fields(Profile), *fields(Timings))}
+    assert NO_CHOICES.keys() & keys == IN_BOTH.keys()
+
+
+@pytest.mark.parametrize("name", IN_BOTH)
+def test_an_option_goes_before_the_key_of_its_name_also_where_it_is_zero(
+    tmp_path: Path, name: str
+) -> None:
+    text, stated, typed = IN_BOTH[name]
+    path = tmp_path / "profile.toml"
+    path.write_text(text, encoding="utf-8")
+    profile = load_profile(str(path), TARGETS["bms"], WELLING)
+    for value, expected in ((None, stated), (typed, typed)):
+        given: dict[str, Any] = {**NO_CHOICES, "allow_boot_name": False, "force": False}
+        options = UpgradeChoices(**{**given, name: value}).options(profile, None)
+        where = options.timings if name == "packet_tries" else options
+        assert getattr(where, name) == expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Final
 
 import click
@@ -44,7 +44,7 @@ from flasher.host.verify import Level
 from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
-from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.settings.profile import Profile, load_profile
 
 DOCUMENTS: Final = (UpgradeDocument, DryRunDocument)
@@ -111,8 +111,8 @@ class UpgradeChoices:
         help="after the upgrade: ask the new application for its version, or read the whole image "
         "back as well (default: version where the target has a query for it, else none)",
     )]  # fmt: skip
-    retries: Annotated[int | None, option(
-        "--retries", type=values.count, metavar="N", panel="upgrade",
+    packet_tries: Annotated[int | None, option(
+        "--retries", "packet_tries", type=values.count, metavar="N", panel="upgrade",
         help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries}, and "
         f"{PATIENT_TRIES} once the device has no application)",
     )]  # fmt: skip
@@ -122,18 +122,18 @@ class UpgradeChoices:
         f"or the adapter comes back (default {DEFAULT_ATTEMPTS}, and until the overall deadline "
         "once the device has no application)",
     )]  # fmt: skip
-    timeout: Annotated[float | None, option(
-        "--timeout", type=values.seconds, metavar="S", panel="upgrade",
+    timeout_s: Annotated[float | None, option(
+        "--timeout", "timeout_s", type=values.seconds, metavar="S", panel="upgrade",
         help="overall deadline in seconds, of all attempts together (default: computed from the "
         "plan)",
     )]  # fmt: skip
-    adapter_wait: Annotated[float | None, option(
-        "--adapter-wait", type=values.seconds, metavar="S", panel="upgrade",
+    adapter_return_s: Annotated[float | None, option(
+        "--adapter-wait", "adapter_return_s", type=values.seconds, metavar="S", panel="upgrade",
         help="seconds that a lost adapter may take to come back, once anything was sent "
         f"(default {UpgradeOptions.adapter_return_s:g})",
     )]  # fmt: skip
-    frame_gap: Annotated[float | None, gap_options]
-    packet_gap: float | None
+    frame_gap_s: Annotated[float | None, gap_options]
+    packet_gap_s: float | None
     nak_next_is_ack: Annotated[bool, option(
         "--nak-next-is-ack", is_flag=True, panel="upgrade",
         help="for bootloaders that answer a repeated packet n with NAK n+1",
@@ -169,18 +169,11 @@ class UpgradeChoices:
         """The profile's choices, the command line's where it makes any. Raises UsageError where
         they do not go together.
         """
-        return profile.upgrade_options(
-            packet_tries=self.retries,
-            attempts=self.attempts,
-            timeout_s=self.timeout,
-            adapter_return_s=self.adapter_wait,
-            frame_gap_s=self.frame_gap,
-            packet_gap_s=self.packet_gap,
-            nak_next_is_ack=self.nak_next_is_ack or None,
-            in_session=self.in_session,
-            allow_boot_name=self.allows("boot-name") or None,
-            power_up_timeout_s=wait,
-        )
+        names = {each.name for each in (*fields(UpgradeOptions), *fields(Timings))}
+        chosen = {name: value for name, value in vars(self).items() if name in names}
+        chosen["allow_boot_name"] = self.allows("boot-name")
+        given = {name: None if value is False else value for name, value in chosen.items()}
+        return profile.upgrade_options(**given, power_up_timeout_s=wait)
 
 
 _upgrade_options: Final = option_set("choices", UpgradeChoices)

@@ -62,8 +62,8 @@ def image_info(
     *,
     dialect_name: str,
     profile: str | None,
-    frame_gap: float | None,
-    packet_gap: float | None,
+    frame_gap_s: float | None,
+    packet_gap_s: float | None,
     allow_implausible: bool,
 ) -> int:
     """Show what is in an image file and what an upgrade would send. Opens no adapter. A file that
@@ -76,7 +76,7 @@ def image_info(
     plan = api.make_plan(
         loaded, settings.target, settings.dialect, has_upgrade=settings.has_upgrade
     )
-    chosen = settings.upgrade_options(frame_gap_s=frame_gap, packet_gap_s=packet_gap)
+    chosen = settings.upgrade_options(frame_gap_s=frame_gap_s, packet_gap_s=packet_gap_s)
     beside = manifest_beside(image.image, loaded, target)
     lines = [*text.image_lines(loaded), *text.vector_lines(table), beside_line(beside)]
     output.results((*lines, *text.plan_lines(plan, chosen)))
