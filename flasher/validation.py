@@ -1,4 +1,5 @@
-"""Type annotations that validate: ranges of numbers, parsed texts, enumerations in lower case.
+"""Type annotations that validate: ranges of numbers, parsed texts, enumerations in lower case; and
+the JSON keys of a dataclass.
 
 `Annotated[int, NumberRange(ge=1, le=100)]`, `Annotated[str, Parsed("64 hex digits", read_sha256)]`.
 Only modules that read or write files need the validation library.
@@ -81,9 +82,9 @@ class LowerCaseInJson:
 
 
 def json_keys(keys: str) -> Callable[[_Type], _Type]:
-    """Declares what JSON has of a dataclass, in this order: names of fields and of properties,
-    separated by blanks; `key=name` gives one another key. What is read from JSON has to have all of
-    it; a `cached_property` then has the value that was read.
+    """Set the JSON keys of a dataclass, in this order: names of fields and properties, separated by
+    blanks; `key=name` sets another key than the name. JSON that is read must contain all of them; a
+    `cached_property` then has the value that was read.
     """
     names = {key: name or key for key, _, name in (each.partition("=") for each in keys.split())}
 

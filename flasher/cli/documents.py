@@ -1,8 +1,10 @@
 """What `--json` prints: types of documents, and how their values become JSON.
 
-A command's own documents are frozen dataclasses of its module, listed there as `DOCUMENTS` (and as
-`LINES` what it prints meanwhile). `flasher.cli.output` puts them into the `Envelope`,
-`flasher.cli.schema` makes a JSON Schema of all of it.
+A type that a command prints is printed as it is, or with the keys that it names
+(`flasher.validation.json_keys`). Only a view that differs from it is a document, a frozen dataclass
+of the command's module. Each module lists what it prints as `DOCUMENTS`, and as `LINES` what it
+prints meanwhile. `flasher.cli.output` puts them into the `Envelope`, `flasher.cli.schema` makes a
+JSON Schema of all of it.
 """
 
 from __future__ import annotations
