@@ -115,8 +115,8 @@ def test_a_serial_port_is_the_same_by_its_link(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="needs links and SIGKILL")
 def test_who_was_killed_holds_nothing() -> None:
     script = (
-        "import time; from flasher.bus.lock import hold;"
-        f"held = hold({CAN0!r}, 'flasher flash'); print('held', flush=True); time.sleep(60)"
+        "import time; from flasher.bus.lock import acquire;"
+        f"held = acquire({CAN0!r}, 'flasher flash'); print('held', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
