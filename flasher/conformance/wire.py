@@ -224,6 +224,7 @@ class Encoder:
         return self.frames(build(self.to_device, mode, command, data))
 
     def reset(self) -> list[RawFrame]:
+        """Command that restarts the device into its bootloader."""
         return self.message(WRITE, self.reset_command, self.reset_data)
 
     def update(self, size_bytes: int, text: bytes | None = None) -> list[RawFrame]:
@@ -242,6 +243,7 @@ class Encoder:
         return self.packet(number, packet_count(len(image)), packet_payload(image, number))
 
     def end(self) -> list[RawFrame]:
+        """End of transfer."""
         return self.message(WRITE, END, END_MARK)
 
     def damaged_packet_of(self, image: bytes, number: int) -> list[RawFrame]:
