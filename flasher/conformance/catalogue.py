@@ -71,7 +71,7 @@ QUICK: Final = (
 
 
 class Requirement(Enum):
-    """What a case needs or does; reports and options use the value."""
+    """A need or an effect of a case; reports and options use the value."""
 
     POWER = "power"
     """Switches the device off and on."""
@@ -246,7 +246,9 @@ MISSING_ON_BARE_BENCH: Final = {
     Requirement.TIMED_CUT: ("power cuts at the moment of a flash operation or a frame", _SIMULATED),
     Requirement.ERROR_FRAMES: ("an adapter that sends error frames", _SIMULATED),
 }
-"""What a bench of device, adapter and good image lacks: text, and the option that adds it."""
+"""Equipment missing on a bench of device, adapter and good image: text, and the option that adds
+it.
+"""
 _LACKS: Final = {
     **MISSING_ON_BARE_BENCH,
     Requirement.CHECKSUM: (

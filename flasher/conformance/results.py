@@ -487,32 +487,32 @@ class ExploreResult:
 
 @dataclass(frozen=True)
 class KeyAnswer:
-    """What is written for a key of the profile."""
+    """Value determined for a profile key."""
 
     key: str
     value: str | int | float | None
-    """None (null) where it stays open."""
+    """None (null) for an open key."""
     seen: str
-    """What was seen, or why it stays open."""
+    """Observation, or why the key stays open."""
 
 
 @json_keys("subject target answers toml file stopped")
 @dataclass(frozen=True)
 class InitResult:
-    """What a device answered."""
+    """Profile determined from a device."""
 
     subject: str
     target: str
     answers: tuple[KeyAnswer, ...]  # every key of the profile, in order
     stopped: str = ""
     """Why it ended early; empty when it did not."""
-    # In that case the answers must not be used.
+    # An interrupted run must not be used.
     was_brought_up: bool = True
     """False when the good image could not be flashed before the first question."""
     toml: str = ""
-    """The profile; empty when nothing is written."""
+    """The profile file's content; empty when none is written."""
     file: str = ""
-    """Its file; empty when none was written."""
+    """Path of the profile file; empty when none was written."""
 
     def profile(self, start: ConformanceProfile) -> ConformanceProfile:
         """Make a profile of the answers; open keys keep their values of `start`."""

@@ -19,7 +19,7 @@ _VERSION = b"\x55\xaa\x0c\x0b\xc1\x09BMSV1.0.0"
 """A boot version up to its CRC."""
 
 
-def _said(*frames: RawFrame) -> str:
+def _diagnosis(*frames: RawFrame) -> str:
     trace = [TraceEntry(0.001 * at, sent=False, frame=frame) for at, frame in enumerate(frames)]
     (text,) = diagnose(trace, _BMS)
     return text
@@ -30,24 +30,24 @@ def _message(raw: bytes, can_id: int = 0x725) -> list[RawFrame]:
 
 
 def test_nothing_at_all() -> None:
-    assert _said().startswith("no frame ")
+    assert _diagnosis().startswith("no frame ")
     own = TraceEntry(0.0, sent=True, frame=_BMS.reset()[0])
     assert diagnose([own], _BMS)[0].startswith("no frame ")
 
 
 def test_error_frames_alone_are_counted() -> None:
     error = RawFrame(0x725, bytes(8), is_error=True)
-    assert _said(error, error).startswith("2 error frames and no frame ")
+    assert _diagnosis(error, error).startswith("2 error frames and no frame ")
 
 
 def test_only_others_are_heard() -> None:
-    text = _said(RawFrame(0x123, b"\x00"), RawFrame(0x123, b"\x01"), RawFrame(0x1F0, b"\x00"))
+    text = _diagnosis(RawFrame(0x123, b"\x00"), RawFrame(0x123, b"\x01"), RawFrame(0x1F0, b"\x00"))
     assert "725" in text
     assert text.endswith("123 (2 times), 1F0")
 
 
 def test_another_target_speaks() -> None:
-    text = _said(*_message(bytes.fromhex("55AA0C02"), 0x735))
+    text = _diagnosis(*_message(bytes.fromhex("55AA0C02"), 0x735))
     assert text.startswith("735 ")
     assert "-t obc" in text
 
@@ -55,7 +55,7 @@ def test_another_target_speaks() -> None:
 @pytest.mark.parametrize("can_id", [0x725, 0x725 << 18])
 def test_the_id_comes_as_an_extended_one(can_id: int) -> None:
     frame = RawFrame(can_id, b"\x55\xaa", is_extended=True)
-    assert "extended 29-bit id" in _said(frame)
+    assert "extended 29-bit id" in _diagnosis(frame)
 
 
 @pytest.mark.parametrize(
@@ -90,13 +90,13 @@ def test_the_crc_that_fits_is_named(crc: str, way: _Crc) -> None:
     if crc == "mirrored":
         field = field[::-1]
     (difference,) = way.differences
-    text = _said(*_message(_VERSION + field + b"\xf0"))
+    text = _diagnosis(*_message(_VERSION + field + b"\xf0"))
     assert text.startswith("725 ")
     assert text.endswith(f"CRC fits {difference}")
 
 
 def test_a_crc_that_nothing_fits_is_shown_with_the_right_one() -> None:
-    text = _said(*_message(_VERSION + b"\x01\x02\x03\x04\xf0"))
+    text = _diagnosis(*_message(_VERSION + b"\x01\x02\x03\x04\xf0"))
     assert "has 01020304, and 0BD4B7F6 is right" in text
 
 
@@ -111,25 +111,25 @@ def test_a_crc_that_nothing_fits_is_shown_with_the_right_one() -> None:
     ],
 )
 def test_another_form_of_the_messages_is_named(raw: str, said: str) -> None:
-    assert said in _said(*_message(bytes.fromhex(raw)))
+    assert said in _diagnosis(*_message(bytes.fromhex(raw)))
 
 
 def test_the_name_of_another_device() -> None:
-    assert "announces itself as PBU" in _said(*_BMS.answer(0xC109, b"PBUV1.0.0"))
+    assert "announces itself as PBU" in _diagnosis(*_BMS.answer(0xC109, b"PBUV1.0.0"))
 
 
 def test_numbers_high_byte_first() -> None:
-    assert _said(*_BMS.answer(0xC202, b"\x00\x01")).endswith("high byte first: 256")
+    assert _diagnosis(*_BMS.answer(0xC202, b"\x00\x01")).endswith("high byte first: 256")
 
 
 def test_announcements_without_a_request() -> None:
     version = _BMS.answer(0xC109, b"BMSV1.0.0")
-    assert "answers no update command" in _said(*version)
+    assert "answers no update command" in _diagnosis(*version)
 
 
 def test_messages_that_are_right_are_counted() -> None:
     frames = [*_BMS.answer(0xC402, bytes(2)), *_BMS.answer(0xC202, b"\x01\x00")]
-    assert _said(*frames).endswith(" correct messages: request transfer, ACK 1")
+    assert _diagnosis(*frames).endswith(" correct messages: request transfer, ACK 1")
 
 
 class StartsAtZero(PythonBootloader):

@@ -152,7 +152,7 @@ class BootloaderProcess:
         self._stderr.close()
 
     def output(self) -> str:
-        """What the process printed, such as a sanitizer report without its memory dump."""
+        """Output of the process, such as a sanitizer report without its memory dump."""
         self._stderr.seek(0)
         lines = self._stderr.read(_OUTPUT_SIZE).decode(errors="replace").splitlines()
         report = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)

@@ -32,7 +32,7 @@ class Trial(NamedTuple):
 
 
 Findings = Iterator[KeyAnswer | Trial | str]
-"""What a question yields: answers, trials for its choice, or why all its keys stay open."""
+"""Results of a question: answers, trials for its choice, or why all its keys stay open."""
 
 
 def decide(key: str, trials: Sequence[Trial]) -> KeyAnswer:
