@@ -385,8 +385,8 @@ class Socket:
         if last is None or last.outcome is None:
             return text("Scan the label of the unit{card}.", card=card)
         return text(
-            "After {state} of {serial} it was silent, without power, or could not be heard. If this"
-            " is another unit, scan its label{card}.",
+            "It was off or not heard after {state} of {serial}: if this is another unit,"
+            " scan its label{card}.",
             state=_state_after(last.outcome).value,
             serial=printable(last.serial),
             card=card,
