@@ -161,7 +161,7 @@ def _version_answer(before_bytes: int, text_bytes: int, after_bytes: int) -> typ
         [
             ("before", bytes, wire_field(BytesField(before_bytes))),
             ("firmware_version", WireText, wire_field(TextField(text_bytes))),
-            ("after", bytes, wire_field(BytesField(after_bytes))),
+            ("behind", bytes, wire_field(BytesField(after_bytes))),
         ],
         bases=(VersionAnswer,),
         frozen=True,
