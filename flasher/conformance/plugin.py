@@ -51,7 +51,7 @@ from flasher.conformance.results import (
     TraceEntry,
     Unsupported,
 )
-from flasher.conformance.runner import RunObserver, RunOptions, SuiteRun
+from flasher.conformance.runner import RunObserver, SuiteOptions, SuiteRun
 from flasher.conformance.subject import Subject
 from flasher.conformance.trace_excerpt import excerpt, frame_lines
 from flasher.errors import FlasherError, printable, without_password
@@ -124,7 +124,7 @@ class PluginRun:
         self._config = config
         self._seed: str = config.getoption("btl_seed")
         self._is_strict: bool = config.getoption("btl_strict")
-        options = RunOptions(self._seed, strict=self._is_strict)
+        options = SuiteOptions(self._seed, strict=self._is_strict)
         self._started_at = datetime.now(UTC).isoformat(timespec="seconds")
         self._run = SuiteRun(subject, profile, options, RunObserver(), stopped=lambda: False)
         self._traces: dict[tuple[str, int], str] = {}

@@ -58,7 +58,7 @@ from flasher.errors import BusError
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class SuiteOptions:
     """Options of a run: `seed` determines all random values, each case runs `repeat` times,
     `limit_s` ends the run on the bench's clock, `strict` fails on resolved deviations, `upgrades`
     is the number of upgrades in a case that wears the device (None: `WEAR`).
@@ -72,7 +72,7 @@ class RunOptions:
 
 
 _EVERYTHING: Final = Selection()
-_PLAIN: Final = RunOptions()
+_PLAIN: Final = SuiteOptions()
 
 
 class RunObserver:
@@ -94,7 +94,7 @@ def run(
     profile: ConformanceProfile,
     *,
     selection: Selection = _EVERYTHING,
-    options: RunOptions = _PLAIN,
+    options: SuiteOptions = _PLAIN,
     observer: RunObserver | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RunReport:
@@ -149,7 +149,7 @@ class SuiteRun:
         self,
         subject: Subject,
         profile: ConformanceProfile,
-        options: RunOptions,
+        options: SuiteOptions,
         observer: RunObserver,
         stopped: Callable[[], bool],
     ) -> None:

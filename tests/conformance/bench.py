@@ -10,7 +10,7 @@ from flasher.conformance.catalogue import CASES, Case, Requirement, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseResult, CaseVerdict, RunReport
-from flasher.conformance.runner import RunObserver, RunOptions, run
+from flasher.conformance.runner import RunObserver, SuiteOptions, run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
@@ -134,7 +134,7 @@ def run_case(
             device or subject(),
             profile,
             selection=Selection(cases=("FR-00", "RS-04") if before_others else ("FR-00",)),
-            options=RunOptions(strict=strict),
+            options=SuiteOptions(strict=strict),
             observer=log,
         )
     finally:

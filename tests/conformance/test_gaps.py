@@ -23,7 +23,7 @@ from flasher.conformance.catalogue import (
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, Unsupported
-from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.runner import SuiteOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.mock.store import AREA_START
 from tests.loops import each
@@ -60,7 +60,7 @@ def check_bare_bench(target: str, address: int, cases: Sequence[str]) -> None:
     profile = ConformanceProfile({**given, "device.application_address": address})
     foreseen = bench_gaps(missing_requirements(subject, profile), cases)
     selection = Selection(cases=(*cases, "BU-07"))
-    report = run(subject, profile, selection=selection, options=RunOptions(upgrades=4))
+    report = run(subject, profile, selection=selection, options=SuiteOptions(upgrades=4))
     assert report.gaps == foreseen
     is_told = target == "bms" and address
     assert is_told != any(gap.requirement == Requirement.IMAGE_READBACK.value for gap in foreseen)
@@ -82,7 +82,7 @@ def check_full_bench(cases: Sequence[str]) -> None:
     )
     judged_by = profile_of_mock(subject.device.profile)
     selection = Selection(cases=tuple(cases))
-    report = run(subject, judged_by, selection=selection, options=RunOptions(upgrades=4))
+    report = run(subject, judged_by, selection=selection, options=SuiteOptions(upgrades=4))
     assert report.gaps == ()
     count = len(cases)
     assert report.in_full == f"{count} of {count} passes were judged in full"

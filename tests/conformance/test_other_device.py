@@ -18,7 +18,7 @@ from flasher.conformance.catalogue import CASES, Selection
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.real import RealPort, RealSubject
 from flasher.conformance.results import CaseVerdict
-from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.runner import SuiteOptions, run
 from flasher.protocol.spec import WELLING
 from tests.loops import each
 from tests.peers.scripted_device import ScriptedDevice
@@ -126,7 +126,7 @@ def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> 
     keys = {key.replace("__", "."): value for key, value in given.items()}
     device = kind("bms", capacity_bytes=_AREA_BYTES)
     profile = ConformanceProfile({**_PROFILE, **keys}, source="another product")
-    selection, options = Selection(cases=tuple(cases)), RunOptions(upgrades=4)
+    selection, options = Selection(cases=tuple(cases)), SuiteOptions(upgrades=4)
     report = run(bench(device), profile, selection=selection, options=options)
     assert report.final_image == "verified"
     return {

@@ -34,7 +34,7 @@ from flasher.conformance.results import (
     Measurement,
     RunReport,
 )
-from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.runner import SuiteOptions, run
 from flasher.conformance.summary_page import summary_page
 from flasher.mock.store import AREA_START
 from tests.loops import each
@@ -56,7 +56,7 @@ def wrong_run(*case_ids: str, seed: str = "1") -> RunReport:
         MockSubject("bms", make_device=variant_maker("announces-three-times")),
         PROFILE,
         selection=Selection(cases=case_ids or ("RS-01", "RS-04", "EN-04")),
-        options=RunOptions(seed=seed),
+        options=SuiteOptions(seed=seed),
     )
 
 

@@ -15,7 +15,7 @@ from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import completed, to_bytes
 from flasher.conformance.results import CaseVerdict, Unsupported
-from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.runner import SuiteOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
 from flasher.mock.store import AREA_START
@@ -387,7 +387,7 @@ def test_a_run_that_takes_too_long_reports_the_rest_as_not_run() -> None:
         subject(),
         PROFILE,
         selection=Selection(groups=("RS",)),
-        options=RunOptions(limit_s=5.0),
+        options=SuiteOptions(limit_s=5.0),
     )
     assert report.stopped
     statuses = [result.verdict for result in report.results]
@@ -419,7 +419,7 @@ def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repe
     assert drawn[0] == drawn[1]
 
     def twice(seed: str) -> object:
-        options = RunOptions(seed=seed, repeat=2)
+        options = SuiteOptions(seed=seed, repeat=2)
         return run(subject(), PROFILE, selection=Selection(cases=("UP-01",)), options=options)
 
     assert twice("7") == twice("7")
@@ -427,7 +427,7 @@ def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repe
 
 def test_a_case_is_repeated_with_a_seed_of_its_own() -> None:
     report = run(
-        subject(), PROFILE, selection=Selection(cases=("RS-04",)), options=RunOptions(repeat=3)
+        subject(), PROFILE, selection=Selection(cases=("RS-04",)), options=SuiteOptions(repeat=3)
     )
     assert [result.repeat for result in report.results] == [1, 2, 3]
     assert len({result.seed for result in report.results}) == 3

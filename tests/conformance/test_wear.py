@@ -13,7 +13,7 @@ from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, pr
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import completed
 from flasher.conformance.results import CaseVerdict, RunReport
-from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.runner import SuiteOptions, run
 from flasher.mock.model import MockDevice
 from tests.cli.conftest import Flasher
 from tests.conformance.bench import one
@@ -50,7 +50,7 @@ def worn(
         MockSubject(profile=device, make_device=device_maker(kind)),
         profile or profile_of_mock(device),
         selection=Selection((case_id,)),
-        options=RunOptions(upgrades=upgrades),
+        options=SuiteOptions(upgrades=upgrades),
     )
 
 

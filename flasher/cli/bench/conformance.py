@@ -255,7 +255,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     if chosen.is_list:
         return _list(chosen.selection, output)
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
-    from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
+    from flasher.conformance.runner import SuiteOptions, run  # noqa: PLC0415
 
     bench = described(bench, bus)
     _check_files(chosen)
@@ -275,7 +275,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
             subject,
             profile,
             selection=chosen.selection,
-            options=RunOptions(
+            options=SuiteOptions(
                 chosen.seed, chosen.repeat, chosen.timeout, chosen.strict, chosen.upgrades
             ),
             observer=observer,
