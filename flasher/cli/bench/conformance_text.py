@@ -18,6 +18,7 @@ from flasher.conformance.results import (
     CheckOutcome,
     Gap,
     RunReport,
+    Times,
     count_text,
 )
 from flasher.conformance.side_by_side import SideBySide
@@ -34,7 +35,6 @@ _TOLD: Final = (
 )
 """Verdicts whose cases have a line each; unsupported ones share one for each reason."""
 _MS: Final = 1000
-_BINS: Final = 20
 _SHADES: Final = " .:-=+*#%@"
 _DRAWN_LEAST: Final = 20
 _DRAWN_MS: Final = 0.1
@@ -130,7 +130,6 @@ def _not_judged(report: RunReport) -> Iterator[str]:
 def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
     if not report.times:
         return
-    measured = report.measured()
     yield ""
     unsure = f" +- {report.uncertainty_s * _MS:g} ms" if report.uncertainty_s else ""
     yield f"times in ms (time stamps: {printable(report.timestamp_source)}{unsure})"
@@ -140,25 +139,20 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
             continue
         values_s = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
         figures = (f"{value * _MS:.1f}" for value in values_s)
-        drawn = _drawn([one.value_s for one in measured[of.name]])
-        rows.append((printable(of.name), f"{of.count}", *figures, drawn))
+        rows.append((printable(of.name), f"{of.count}", *figures, _drawn(of)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
         yield (f"  {row[0]:<{widths[0]}}  " + "  ".join(cells)).rstrip()
 
 
-def _drawn(values_s: Sequence[float]) -> str:
+def _drawn(of: Times) -> str:
     """A histogram in a word, from the least value to the most: the darker, the more; empty where
     there is nothing to draw.
     """
-    low_s = min(values_s)
-    width_s = (max(values_s) - low_s) / _BINS
-    if len(values_s) < _DRAWN_LEAST or width_s * _MS < _DRAWN_MS / _BINS:
+    if of.count < _DRAWN_LEAST or (of.maximum_s - of.minimum_s) * _MS < _DRAWN_MS:
         return ""
-    counts = [0] * _BINS
-    for value_s in values_s:
-        counts[min(_BINS - 1, int((value_s - low_s) / width_s))] += 1
+    counts = of.histogram.counts
     darkest = len(_SHADES) - 1
     return f"|{''.join(_SHADES[ceil(count / max(counts) * darkest)] for count in counts)}|"
 
