@@ -5,6 +5,7 @@ was done is the story.
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections.abc import Generator, Iterator
 from dataclasses import replace
@@ -31,8 +32,8 @@ def setup_of(chance: random.Random) -> Story:
     bare = chance.choice((0.1, 0.1, 0.5))
     units = []
     for label in range(1, sockets + chance.choice((1, 2, 3)) + 1):
-        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 0.5))[0]
-        firmware = "new" if chance.random() < 0.5 else "old"
+        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 1.5))[0]
+        firmware = "new" if chance.random() < (0.2 if number == "other" else 0.5) else "old"
         units.append(
             stories.UnitSetup(
                 label=label,
@@ -60,20 +61,37 @@ class Teller:
 
     def acts(self) -> Iterator[stories.Act]:
         """Acts with their times, each drawn when the one before it is done."""
-        actors = [self._person(each.name) for each in self.world.setup.people]
-        actors.append(self._fate())
-        now = self.world.now
-        upcoming = [(now + gap, act, actor) for actor in actors for gap, act in (next(actor),)]
-        while True:
+        yield from self._in_turn([self._opening()])
+        people = [self._person(each.name) for each in self.world.setup.people]
+        yield from self._in_turn([*people, self._fate()])
+
+    def _in_turn(self, actors: list[Iterator[Step]]) -> Iterator[stories.Act]:
+        upcoming = [
+            (self.world.now + gap, act, actor)
+            for actor in actors
+            for gap, act in itertools.islice(actor, 1)
+        ]
+        while upcoming:
             index = min(range(len(upcoming)), key=lambda each: upcoming[each][0])
-            moment, act, actor = upcoming[index]
+            moment, act, actor = upcoming.pop(index)
             if act is not None:
                 yield replace(act, when=stories.at(moment))
             else:
                 # A story holds acts alone: who does nothing sees what the station shows by itself.
                 self.world.go_to(last_look(moment))
-            gap, following = next(actor)
-            upcoming[index] = (max(moment, self.world.now) + gap, following, actor)
+            for gap, following in itertools.islice(actor, 1):
+                now = max(moment, self.world.now)
+                upcoming.insert(index, (now + gap, following, actor))
+
+    def _opening(self) -> Iterator[Step]:
+        """What takes several things at once, while nobody else is at the line."""
+        people = [each.name for each in self.world.setup.people if each.source != "mounted"]
+        if people and self.chance.random() < 0.75:
+            scenes = [self._scan_at_once, self._be_interrupted, self._be_interrupted]
+            if any(each.number == "other" for each in self.world.setup.units):
+                scenes += 3 * [self._scan_another_number]
+            yield from self.chance.choice(scenes)(self.chance.choice(people))
+            yield 3.0, None
 
     # -- what is there ----------------------------------------------------------------------------
 
@@ -109,8 +127,10 @@ class Teller:
             : max(0, count - len(self._fresh()))
         ]:
             yield self._pause(), stories.Put(unit=unit, socket=bay.name)
-        yield 0.5, None
-        fresh = self._fresh()
+        fresh, give_up_at = self._fresh(), self.world.now + 3.0
+        while len(fresh) < count and self.world.now < give_up_at:
+            yield 0.5, None
+            fresh = self._fresh()
         return self.chance.sample(fresh, min(count, len(fresh)))
 
     def _number(self, bay: Bay) -> int:
@@ -295,6 +315,20 @@ class Teller:
         yield self.chance.choice((HAND_S, 0.3, 0.5)), stories.Put(unit=other, socket=bay.name)
         wait = self.chance.uniform(0.1, 3.0) if way is not None else self.chance.uniform(0.1, 0.9)
         yield wait, stories.Label(by=name, unit=unit)
+
+    def _scan_another_number(self, name: str) -> Iterator[Step]:
+        """Scan a unit that reports another number than its label."""
+        odd = [e.label for e in self.world.setup.units if e.number == "other"]
+        empty = self._bays(full=False)
+        units = [each for each in self._on_table() if each in odd]
+        if units and empty:
+            unit, bay = self.chance.choice(units), self.chance.choice(empty)
+            for act in (
+                stories.Card(by=name, unit=unit, socket=bay.name),
+                stories.Label(by=name, unit=unit),
+                stories.Put(unit=unit, socket=bay.name),
+            ):
+                yield self._pause(), act
 
     def _setup(self, number: int) -> stories.UnitSetup:
         return next(each for each in self.world.setup.units if each.label == number)
