@@ -59,16 +59,6 @@ def handle(
     patch.setitem(Line._TABLE, phase, {**Line._TABLE[phase], what: handler})
 
 
-def bind_to_the_first_arrival(patch: pytest.MonkeyPatch) -> None:
-    def arrived(self: Line, socket: Socket) -> None:
-        for waiting in self._waiting.values():
-            if waiting.label:
-                self._bind(socket, waiting.label, Binding.SAID, 0.0, waiting.source)
-                waiting.forget()
-
-    patch.setattr(Line, "_arrived_elsewhere", arrived)
-
-
 def forget_a_removal(patch: pytest.MonkeyPatch) -> None:
     def unit(self: Line, socket: Socket, what: PresenceChanged, now: float) -> None:
         if what.is_there:
@@ -147,7 +137,6 @@ def never_resume(patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "plant",
     [
-        bind_to_the_first_arrival,
         forget_a_removal,
         show_pass_before_it_is_saved,
         take_silence_for_an_empty_socket,

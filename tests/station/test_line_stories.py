@@ -11,23 +11,20 @@ from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 from subprocess import run
-from typing import cast
 
 import pytest
 
 from flasher.mock.table import BootloaderState
 from flasher.station import codes
 from flasher.station.continuity import Continuity
-from flasher.station.line import Line
 from flasher.station.presence import Presence
 from flasher.station.records.model import StepName
-from flasher.station.scans import Word
-from flasher.station.socket import UNNAMED, Socket, Source
-from flasher.station.station import Station
+from flasher.station.socket import Socket
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.unit_target import StepFailedError
 from tests.campaigns import line_world
+from tests.campaigns.line_bugs import read_bugs, swapped
 from tests.campaigns.line_world import undetectable
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.promises import Violation
@@ -52,23 +49,6 @@ PASSED_AND_EXCHANGED = (
     "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
     " @7.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @14.0 pull unit=1 ;"
     " @14.3 put unit=2 socket=A"
-)
-CANCELLED = (
-    "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 label by=jo unit=1 ;"
-    " @4.0 cancel by=jo ; @6.0 put unit=1 socket=A"
-)
-WITHOUT_CARD = (
-    "line sockets=1 ; unit label=1 application=none ; person name=jo ;"
-    " @3.0 put unit=1 socket=A ; @8.0 label by=jo unit=1"
-)
-INTERRUPTED = (
-    "line sockets=1 ; unit label=1 pace=slow ; person name=jo ; @3.0 put unit=1 socket=A ;"
-    " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @10.0 station ; @20.0 look"
-)
-EXCHANGED_AFTER_ITS_FLASH = (
-    "line sockets=1 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
-    " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @10.1 pull unit=1 ;"
-    " @10.5 put unit=2 socket=A"
 )
 NOT_OBSERVED_AFTER_ITS_FLASH = (
     "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
@@ -502,16 +482,7 @@ def test_what_somebody_could_detect_is_a_violation(monkeypatch: pytest.MonkeyPat
     assert told(story).kind == "NUMBER"
 
 
-# -- faults that the oracle has to find -----------------------------------------------------------
-
-
-def let_all_scan_at_one_place(patch: pytest.MonkeyPatch) -> None:
-    real = Station.submit
-
-    def submit(self: Station, text: str, _source: Source = UNNAMED) -> None:
-        real(self, text)
-
-    patch.setattr(Station, "submit", submit)
+# -- faults that the oracle has to find, beside those of `tests.campaigns.line_bugs` ---------------
 
 
 def report_nobody_after_a_run(patch: pytest.MonkeyPatch) -> None:
@@ -544,18 +515,6 @@ def never_begin(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Socket, "is_due", lambda *_: False)
 
 
-def cancel_nothing(patch: pytest.MonkeyPatch) -> None:
-    patch.setitem(cast("dict[Word, object]", Line._COMMANDS), Word.CANCEL, lambda *_: None)
-
-
-def need_no_card(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Socket, "is_unidentified", property(lambda _: False))
-
-
-def forget_the_interrupted(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Station, "_find_interrupted", lambda *_: None)
-
-
 def trust_every_run(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(codes, "OF_ANOTHER", frozenset())
 
@@ -563,15 +522,10 @@ def trust_every_run(patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("plant", "story", "kind"),
     [
-        (let_all_scan_at_one_place, CARD_HERE_LABEL_THERE, "NUMBER"),
         (report_nobody_after_a_run, PASSED_AND_EXCHANGED, "GREEN"),
         (accuse_everybody, PASSED_AND_EXCHANGED, "ACCUSED"),
         (write_and_fail, PASSED_AND_EXCHANGED, "STUCK"),
         (never_begin, PASSED_AND_EXCHANGED, "STUCK"),
-        (cancel_nothing, CANCELLED, "CANCELLED"),
-        (need_no_card, WITHOUT_CARD, "UNIDENTIFIED"),
-        (forget_the_interrupted, INTERRUPTED, "FORGOTTEN"),
-        (trust_every_run, EXCHANGED_AFTER_ITS_FLASH, "TRUSTED"),
         (trust_every_run, NOT_OBSERVED_AFTER_ITS_FLASH, "TRUSTED"),
     ],
 )
@@ -585,10 +539,11 @@ def test_a_fault_of_the_station_is_found(
     assert told(story).kind == kind
 
 
-def test_a_story_is_shrunk_to_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    let_all_scan_at_one_place(monkeypatch)
-    found = told(CARD_HERE_LABEL_THERE.replace("@4.0", "@2.5 free by=al socket=A ; @4.137"))
-    assert found.kind == "NUMBER"
-    story = shrink(found).story
+def test_a_story_is_shrunk_to_what_it_needs() -> None:
+    (bug,) = (each for each in read_bugs() if each.name == "one-card-for-all")
+    with swapped(bug.codes()):
+        found = told(CARD_HERE_LABEL_THERE.replace("@4.0", "@2.5 free by=al socket=A ; @4.137"))
+        assert found.kind == bug.kind
+        story = shrink(found).story
     assert [each.NAME for each in story.acts] == ["put", "card", "label"]
     assert all(each.when is not None and each.when.plus_s % 0.5 == 0 for each in story.acts)
