@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from flasher import events
 from flasher.web.translation import NAMES
-from flasher.web.virtual_bike import Fault
+from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.firmware import VECTORS
 from tests.web.barriers import barriers
@@ -70,7 +70,7 @@ class Held:
             self.go_on.wait(60)
 
 
-def _use(page: Page, fault: Fault) -> None:
+def _use(page: Page, fault: BikeFault) -> None:
     page.click(f"#adapter button:text-is('{fault.value}')")
     expect(page.locator("#target-bms")).to_be_enabled()
 
@@ -87,11 +87,11 @@ def before_an_upgrade(page: Page, album: Album) -> None:
     page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": odd})
     expect(page.locator("#image")).to_contain_text("odd.bin")
     album.take("dropped")
-    page.click(f"#adapter button:text-is('{Fault.OFF.value}')")
+    page.click(f"#adapter button:text-is('{BikeFault.OFF.value}')")
     expect(page.locator("#trouble .what")).to_be_visible()
     album.take("nobody")
     _again(page)
-    _use(page, Fault.HARDWARE)
+    _use(page, BikeFault.HARDWARE)
     page.click("#told-all")
     album.take("bike")
     page.click("#do-watch")
@@ -117,7 +117,7 @@ def before_an_upgrade(page: Page, album: Album) -> None:
 
 def from_an_upgrade_on(page: Page, place: BenchPlace, album: Album) -> None:
     """Lead the page through an upgrade that fails, its rescue, and what is left."""
-    _use(page, Fault.POWER)
+    _use(page, BikeFault.POWER)
     page.click("#target-bms")
     page.click(f"#image button:text-is('{IMAGE}')")
     held = Held(

@@ -20,7 +20,7 @@ from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
 from flasher.station.records.errors import UnprovenError
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     Measurement,
     RunDetails,
@@ -65,7 +65,7 @@ RUN_WORDS: Final = {
 class Proof:
     """What vouches for the last run of a unit."""
 
-    head: Head | None = None
+    head: ChainHead | None = None
     """The signed audit row; None while the run goes on."""
     record_sha256: str = ""
     """Over the run and all that belongs to it."""
@@ -188,14 +188,14 @@ def _seal(life: UnitLife, made_at: datetime, proof: Proof) -> str:
     )
 
 
-def _code(last: RunDetails, record_sha256: str, head: Head) -> Markup:
+def _code(last: RunDetails, record_sha256: str, head: ChainHead) -> Markup:
     """What a reader of the paper can compare with the records, as a QR code."""
     lines = code_lines(last, record_sha256, head)
     drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
     return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
 
 
-def code_lines(last: RunDetails, record_sha256: str, head: Head) -> tuple[str, ...]:
+def code_lines(last: RunDetails, record_sha256: str, head: ChainHead) -> tuple[str, ...]:
     """The text of the QR code."""
     run = last.run
     return (

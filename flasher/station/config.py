@@ -32,7 +32,7 @@ from flasher.errors import UsageError
 from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.recipe import ShortText
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
-from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 
 SOCKETS_MAX: Final = 64
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")

@@ -22,7 +22,7 @@ NAMES_SHOWN: Final = 3
 
 
 @dataclass(frozen=True)
-class Check:
+class HealthCheck:
     """One thing that was looked at."""
 
     name: str
@@ -31,7 +31,7 @@ class Check:
     """What was seen."""
 
 
-class Watch:
+class HealthWatch:
     """Looks at the disk and the clock every few seconds. `folder`: where the records' files are;
     `utc` and `monotonic_s`: the two clocks; `unkept`: the places that have not the last heads.
     """
@@ -49,42 +49,42 @@ class Watch:
         self._monotonic_s = monotonic_s
         self._offset_s = utc().timestamp() - monotonic_s()
         self._looked_at = float("-inf")
-        self._seen: tuple[Check, ...] = ()
+        self._seen: tuple[HealthCheck, ...] = ()
 
-    def look(self, board: Board) -> tuple[Check, ...]:
+    def look(self, board: Board) -> tuple[HealthCheck, ...]:
         """What is so now."""
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
         sentence = board.records_fault or text("every run is saved")
-        checks = [Check(text("records"), is_good=not board.records_fault, text=sentence)]
+        checks = [HealthCheck(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:
             sentence = text("not printed: {names}", names=_few(board.unprinted))
-            checks.append(Check(text("labels"), is_good=False, text=sentence))
+            checks.append(HealthCheck(text("labels"), is_good=False, text=sentence))
         if board.lost_scanners:
             sentence = text("cannot be read: {names}", names=_few(board.lost_scanners))
-            checks.append(Check(text("scanners"), is_good=False, text=sentence))
+            checks.append(HealthCheck(text("scanners"), is_good=False, text=sentence))
         if unkept := self._unkept():
             sentence = text("not kept yet in: {names}", names=_few(unkept))
-            checks.append(Check(text("heads"), is_good=False, text=sentence))
+            checks.append(HealthCheck(text("heads"), is_good=False, text=sentence))
         return (*checks, *self._seen)
 
-    def _disk(self) -> Check:
+    def _disk(self) -> HealthCheck:
         try:
             free = shutil.disk_usage(self._folder).free
         except OSError as error:
-            return Check(text("disk"), is_good=False, text=error.strerror or str(error))
+            return HealthCheck(text("disk"), is_good=False, text=error.strerror or str(error))
         size = f"{free / 1024**3:.1f} GiB"
-        return Check(
+        return HealthCheck(
             text("disk"), is_good=free >= LITTLE_BYTES, text=text("{size} free", size=size)
         )
 
-    def _clock(self) -> Check:
+    def _clock(self) -> HealthCheck:
         shift_s = self._utc().timestamp() - self._monotonic_s() - self._offset_s
         if abs(shift_s) <= CLOCK_SHIFT_MAX_S:
-            return Check(text("clock"), is_good=True, text=text("not set since the start"))
+            return HealthCheck(text("clock"), is_good=True, text=text("not set since the start"))
         sentence = text("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
-        return Check(text("clock"), is_good=False, text=sentence)
+        return HealthCheck(text("clock"), is_good=False, text=sentence)
 
 
 def _few(names: Collection[str]) -> str:

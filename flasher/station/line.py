@@ -35,7 +35,7 @@ from flasher.station.events import (
     UnitRemoved,
 )
 from flasher.station.messages import AdapterDown, PresenceChanged, Ready, RunResult
-from flasher.station.people import HIDDEN, Asked, Crew
+from flasher.station.operators import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, Order, RunState
@@ -63,8 +63,8 @@ from flasher.station.socket import (
     Binding,
     LastRun,
     Occupancy,
-    Phase,
     Socket,
+    SocketPhase,
     Source,
     source_words,
 )
@@ -286,7 +286,7 @@ class Line:
         if is_new:
             socket.arrived_at_s = now
             self._tell(UnitArrived(socket.name, what.how, what.label))
-        if socket.phase is not Phase.REST:
+        if socket.phase is not SocketPhase.REST:
             return
         if what.label and self._scans_labels and not socket.label:
             self._scan_borne(socket, what.label, now)
@@ -372,7 +372,7 @@ class Line:
             self._tell(OperatorPrompted(socket.name, sentence, source=named.source.name))
 
     def _claimed(self, socket: Socket, _what: RunStarted, _now: float) -> None:
-        socket.phase = Phase.RUN
+        socket.phase = SocketPhase.RUN
         socket.last, socket.is_last_there, socket.note = None, False, ""
         for each in self.sockets.values():
             if each is socket or each.interrupted == socket.serial:
@@ -380,18 +380,18 @@ class Line:
         self._reasons.pop(socket.serial, None)
 
     def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
-        serial, socket.phase, socket.serial = socket.serial, Phase.REST, ""
+        serial, socket.phase, socket.serial = socket.serial, SocketPhase.REST, ""
         self._refuse(serial, what.code, what.reason, what.remedy, socket, socket.source)
         socket.note = text("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
         if what.stops_line:
             self.stop(what.code, what.reason, what.remedy)
 
     def _claim_failed(self, socket: Socket, what: NotSaved, _now: float) -> None:
-        socket.phase, socket.serial = Phase.REST, ""
+        socket.phase, socket.serial = SocketPhase.REST, ""
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
     def _ended(self, socket: Socket, _what: RunResult, now: float) -> None:
-        socket.phase = Phase.SAVE
+        socket.phase = SocketPhase.SAVE
         socket.last, socket.is_last_there = LastRun(socket.serial), True
         # In the run it may have got its number: what is heard from now on counts.
         socket.own, socket.is_own_known = None, False
@@ -399,13 +399,13 @@ class Line:
             socket.occupancy = Occupancy.UNKNOWN
 
     def _saved(self, socket: Socket, what: RunEnded, _now: float) -> None:
-        socket.phase, socket.note, socket.serial = Phase.REST, "", ""
+        socket.phase, socket.note, socket.serial = SocketPhase.REST, "", ""
         if socket.last is not None:
             socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
 
     def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
         """A part of a run is not saved: it cannot pass, and no other run is started."""
-        if socket.phase is Phase.SAVE:
+        if socket.phase is SocketPhase.SAVE:
             socket.note = what.reason
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
@@ -461,7 +461,7 @@ class Line:
         """What a scan means, and for which socket. Raises Refused."""
         understood = understand(raw)
         if isinstance(understood, Label):
-            self._crew.check_somebody()
+            self._crew.check_assigned()
         was_in_doubt = waiting.is_in_doubt
         # A refused card is for the scan that follows; two of a kind, until it is said which counts.
         waiting.is_in_doubt = was_in_doubt and bool(waiting.text)
@@ -579,7 +579,7 @@ class Line:
 
     def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
         """A label of the scanner at a socket: as its card and the label. Raises Refused."""
-        self._crew.check_somebody()
+        self._crew.check_assigned()
         self._check_label(serial)
         self._check_takes(socket)
         self._check_for(socket, serial, source)
@@ -711,7 +711,7 @@ class Line:
 
     def _abort(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
-        if socket.phase is not Phase.RUN:
+        if socket.phase is not SocketPhase.RUN:
             reason = text("Nothing runs in socket {socket}.", socket=socket.name)
             raise Refused("NOT_RUNNING", reason, _NOTHING)
         self._audit(AuditEvent.ABORT, socket=socket.name, serial=socket.serial)
@@ -775,7 +775,7 @@ class Line:
         self._reason = argument
 
     def _reprint(self, argument: str, _now: float, _waiting: Waiting) -> None:
-        self._crew.check_somebody()
+        self._crew.check_assigned()
         self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
 
     def reprinted(self, serial: str, refused: Refused | None) -> None:
@@ -790,7 +790,7 @@ class Line:
         if self.stopped is None:
             raise Refused("NOT_STOPPED", text("The line is not stopped."), _NOTHING)
         self._audit(AuditEvent.RESUME, code=self.stopped.code)
-        unsaved = [each.name for each in self.sockets.values() if each.phase is Phase.SAVE]
+        unsaved = [each.name for each in self.sockets.values() if each.phase is SocketPhase.SAVE]
         self._effects.append(SaveAgain(tuple(unsaved)))
 
     def resumed(self, now: float, *, all_saved: bool) -> None:
@@ -836,7 +836,7 @@ class Line:
         for socket in self.sockets.values():
             if socket.out_of_service and now - socket.out_since_s >= SHORT_OUTAGE_S:
                 socket.is_last_there = False
-            waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
+            waits = socket.label and socket.begin_at_s is None and socket.phase is SocketPhase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
                 reason = text("Its unit did not come.")
                 self._drop_label(socket, _FORGOTTEN, reason, text("Scan it again with its unit."))
@@ -852,14 +852,14 @@ class Line:
                 self._drop_unidentified(socket)
             if self.stopped is None and not self.is_closing and socket.is_due(now):
                 serial, socket.label, socket.begin_at_s = socket.label, "", None
-                socket.phase, socket.serial = Phase.CLAIM, serial
+                socket.phase, socket.serial = SocketPhase.CLAIM, serial
                 reason = self._reasons.get(serial, "")
                 whose, lot = self.operator, self.lot
                 order = Order(serial, socket.name, whose, lot, reason, socket.is_virtual)
                 self._effects.append(order)
         for socket in self.sockets.values():
             shown = socket.view(self.stopped, is_only=len(self.sockets) == 1)
-            if socket.shown != shown and socket.phase is not Phase.CLAIM:
+            if socket.shown != shown and socket.phase is not SocketPhase.CLAIM:
                 socket.shown = shown
                 state, serial, text = shown
                 self._tell(SocketChanged(socket.name, state, serial, text))
@@ -995,17 +995,21 @@ class Line:
 
     # -- the tables -------------------------------------------------------------------------------
 
-    _TABLE: ClassVar[Mapping[Phase, Mapping[type, Callable[..., None]]]] = {
-        Phase.REST: {Ready: _ready, AdapterDown: _down, PresenceChanged: _unit},
-        Phase.CLAIM: {RunStarted: _claimed, NotClaimed: _not_claimed, NotSaved: _claim_failed},
-        Phase.RUN: {
+    _TABLE: ClassVar[Mapping[SocketPhase, Mapping[type, Callable[..., None]]]] = {
+        SocketPhase.REST: {Ready: _ready, AdapterDown: _down, PresenceChanged: _unit},
+        SocketPhase.CLAIM: {
+            RunStarted: _claimed,
+            NotClaimed: _not_claimed,
+            NotSaved: _claim_failed,
+        },
+        SocketPhase.RUN: {
             Ready: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
             RunResult: _ended,
         },
-        Phase.SAVE: {
+        SocketPhase.SAVE: {
             Ready: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,

@@ -37,7 +37,7 @@ from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import RunState
-from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket, Source
+from flasher.station.socket import Binding, LastRun, Occupancy, Socket, SocketPhase, Source
 
 _COMMAND_MAX: Final = 200
 
@@ -152,7 +152,11 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
     if len(sockets) == 1:
         (only,) = sockets.values()
         return only, _why_only(only, serial, source)
-    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST and not e.is_chosen]
+    idle = [
+        e
+        for e in sockets.values()
+        if e.can_work and e.phase is SocketPhase.REST and not e.is_chosen
+    ]
     said = [each for each in idle if each.is_there and each.own == serial]
     if len(said) == 1:
         return said[0], Binding.SAID
@@ -211,7 +215,7 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
 
 def check_free(socket: Socket) -> None:
     """Raises Refused while a run of the socket goes on, or is not saved."""
-    if socket.phase is not Phase.REST:
+    if socket.phase is not SocketPhase.REST:
         serial = printable(socket.serial)
         reason = text("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
         raise Refused(Refusal.SOCKET_BUSY.value, reason, WAIT)
@@ -231,7 +235,7 @@ def check_service(socket: Socket) -> None:
 def check_known(sockets: Sockets, serial: str) -> None:
     """Raises Refused for the label of a unit that runs, or has just passed."""
     for each in sockets.values():
-        if each.phase is not Phase.REST and each.serial == serial:
+        if each.phase is not SocketPhase.REST and each.serial == serial:
             reason = text("It runs in socket {socket}.", socket=each.name)
             raise Refused(Refusal.UNIT_RUNNING.value, reason, WAIT)
         last = each.verdict

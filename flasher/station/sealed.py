@@ -21,7 +21,7 @@ from flasher.errors import UsageError
 from flasher.i18n import text
 from flasher.station.records import chain
 from flasher.station.records.errors import UnprovenError
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import RunDetails, RunRecord, RunState, UnitLife, UnitState
 from flasher.station.records.queries import details_of_content
 from flasher.station.records.signatures import is_signed
@@ -64,9 +64,11 @@ class Sealed:
     earlier_left_out: int
 
     @property
-    def head(self) -> Head:
+    def head(self) -> ChainHead:
         row = self.row
-        return Head(self.station, row["number"], row["at"], row["hash"], self.signature, self.key)
+        return ChainHead(
+            self.station, row["number"], row["at"], row["hash"], self.signature, self.key
+        )
 
     @property
     def digests(self) -> Mapping[str, str]:

@@ -56,7 +56,7 @@ def source_words(name: str) -> str:
     return _SHOWN.get(name, printable(name))
 
 
-class Phase(Enum):
+class SocketPhase(Enum):
     """Where a socket's run is."""
 
     REST = "no run"
@@ -106,7 +106,7 @@ class Socket:
 
     name: str
     is_virtual: bool = False
-    phase: Phase = Phase.REST
+    phase: SocketPhase = SocketPhase.REST
     out_of_service: str | None = ""
     """Why it cannot work; empty while it starts, None when it can."""
     sees_units: bool = True
@@ -163,12 +163,12 @@ class Socket:
     @property
     def is_running(self) -> bool:
         """True from the claim until the process said the end of the run."""
-        return self.phase in (Phase.CLAIM, Phase.RUN)
+        return self.phase in (SocketPhase.CLAIM, SocketPhase.RUN)
 
     @property
     def is_busy(self) -> bool:
         """True while a run goes on, is not saved yet, or has its label."""
-        return self.phase is not Phase.REST or bool(self.label)
+        return self.phase is not SocketPhase.REST or bool(self.label)
 
     @property
     def state(self) -> SocketState:
@@ -191,13 +191,13 @@ class Socket:
     @property
     def awaits_label(self) -> bool:
         """True when a unit is in it that has no label yet."""
-        is_free = self.can_work and self.phase is Phase.REST and not self.label
+        is_free = self.can_work and self.phase is SocketPhase.REST and not self.label
         return is_free and self.is_there and self.verdict is None
 
     @property
     def is_starting(self) -> bool:
         """True while it is unknown whether a unit is in it."""
-        if self.phase is not Phase.REST or self.verdict is not None:
+        if self.phase is not SocketPhase.REST or self.verdict is not None:
             return False
         is_listening = self.sees_units and self.occupancy is Occupancy.UNKNOWN
         return self.out_of_service == "" or (self.can_work and is_listening)
@@ -249,7 +249,7 @@ class Socket:
 
     def _forget_note(self) -> None:
         """Clear the note: it was about the unit that was there before."""
-        if self.phase is Phase.REST and self.note_until_s is None:
+        if self.phase is SocketPhase.REST and self.note_until_s is None:
             self.note = ""
 
     def fall_silent(self, *, is_certain: bool) -> bool:
@@ -298,7 +298,7 @@ class Socket:
 
     def is_due(self, now: float) -> bool:
         """True when the unit of its label is there, as far as known."""
-        is_free = self.can_work and self.phase is Phase.REST and not self.is_chosen
+        is_free = self.can_work and self.phase is SocketPhase.REST and not self.is_chosen
         if not (self.label and is_free) or self.is_unidentified:
             return False
         # While it is not known whether a unit is there, nothing begins.
@@ -329,7 +329,7 @@ class Socket:
         """What it shows; `stopped` is why the line is stopped, `is_only`: there is no other one."""
         if self.is_running:
             return SocketState.RUNNING, self.serial, ""
-        if self.phase is Phase.SAVE:
+        if self.phase is SocketPhase.SAVE:
             return SocketState.ERROR if self.note else SocketState.SAVING, self.serial, self.note
         if self.is_chosen:
             words = text("Scan the label of the unit that is in this socket, or goes into it.")

@@ -57,7 +57,7 @@ from flasher.station.messages import (
     Write,
     WriteReply,
 )
-from flasher.station.people import Crew
+from flasher.station.operators import Crew
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
@@ -78,7 +78,7 @@ from flasher.station.records.model import (
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
 from flasher.station.scans import Refused
-from flasher.station.socket import UNNAMED, Phase, Socket, Source
+from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
@@ -169,7 +169,7 @@ class Station:
         """
         sockets = self.line.sockets
         are_mixed = _check_natures(
-            self.store.read.natures(),
+            self.store.read.unit_kinds(),
             frozenset(each.is_virtual for each in sockets.values()),
             self.options,
         )
@@ -376,7 +376,7 @@ class Station:
 
     def _abort_running(self) -> None:
         for socket in self.line.sockets.values():
-            if socket.phase is Phase.RUN:
+            if socket.phase is SocketPhase.RUN:
                 self.supervisor.send(socket.name, Abort())
 
     def _pin_checked(self, checked: Future[bool]) -> None:

@@ -25,7 +25,7 @@ _MESSAGES_AT_ONCE: Final = 1000
 """Taken from one process before the others have their turn."""
 
 
-class Port(Protocol):
+class WorkerPort(Protocol):
     """The station's end of one process."""
 
     @property
@@ -97,7 +97,7 @@ class WorkerLost:
     restart_in_s: float | None
 
 
-Launch = Callable[[WorkerSetup], Port]
+Launch = Callable[[WorkerSetup], WorkerPort]
 
 
 class _Slot:
@@ -105,7 +105,7 @@ class _Slot:
 
     def __init__(self, setup: WorkerSetup) -> None:
         self.setup = setup
-        self.port: Port | None = None
+        self.port: WorkerPort | None = None
         self.heard_at = 0.0
         self.is_new = True
         self.start_at: float | None = 0.0
@@ -129,7 +129,7 @@ class Supervisor:
         self._launch = launch
 
     @property
-    def ports(self) -> Mapping[str, Port]:
+    def ports(self) -> Mapping[str, WorkerPort]:
         """The processes that are there, by socket."""
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
 

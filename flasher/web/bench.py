@@ -1,7 +1,7 @@
-"""The bench: one person upgrades one bike, step by step. A machine that does one thing at a time.
+"""The bench: one person upgrades one bike step by step, and one thing happens at a time.
 
-Pages give it orders; its whole state goes into its feed, where every page gets it from. So a page
-may come and go, and a second one shows the same. What is done with a device is done by `Workplace`.
+Pages give it orders; its whole state goes into a feed that every page follows, so that a page may
+be closed and opened again. `BenchBackend` works with the devices.
 """
 
 from __future__ import annotations
@@ -36,7 +36,16 @@ from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
 from flasher.trace.watcher import Board, Pulse, Watcher
-from flasher.web.bench_state import Adapter, Doing, Done, Offer, Saved, SeenMessage, State, Watched
+from flasher.web.bench_state import (
+    Activity,
+    Adapter,
+    BenchState,
+    Done,
+    Offer,
+    Saved,
+    SeenMessage,
+    Watched,
+)
 from flasher.web.feed import Feed
 
 TURN_S: Final = 0.2
@@ -59,8 +68,8 @@ _LOG: Final = logging.getLogger("flasher.web")
 
 
 @dataclass
-class Carried:
-    """How an upgrade ended."""
+class UpgradeEnding:
+    """The end of an upgrade: its result or error."""
 
     result: Result | None
     error: FlasherError | None
@@ -69,7 +78,7 @@ class Carried:
     """Why the history has nothing of it; empty where it has."""
 
 
-class Workplace(Protocol):
+class BenchBackend(Protocol):
     """What the bench works with. Methods raise FlasherError."""
 
     dialect: Dialect
@@ -105,7 +114,7 @@ class Workplace(Protocol):
         *,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> Carried:
+    ) -> UpgradeEnding:
         """Carry out an upgrade, to its end, and keep what is to be kept of it."""
 
 
@@ -114,12 +123,12 @@ class Bench:
 
     def __init__(
         self,
-        workplace: Workplace,
+        workplace: BenchBackend,
         now: Callable[[], float],
         date: Callable[[], datetime] = lambda: datetime.now().astimezone(),
     ) -> None:
         self.feed = Feed(now, silence_limit_s=SILENCE_LIMIT_S)
-        self.state = State()
+        self.state = BenchState()
         self._place = workplace
         self._now = now
         self._date = date
@@ -157,7 +166,7 @@ class Bench:
         an upgrade that is to come to its own end.
         """
         self._is_closing = True
-        if ends_upgrade or self.state.doing is not Doing.UPGRADING:
+        if ends_upgrade or self.state.doing is not Activity.UPGRADING:
             self._ends_at_once = True
 
     # -- its own thread ----------------------------------------------------------------------------
@@ -192,7 +201,7 @@ class Bench:
         finally:
             with self._lock:
                 self._is_taken = False
-            self._set(doing=Doing.NOTHING, is_stopping=False)
+            self._set(doing=Activity.NOTHING, is_stopping=False)
 
     def _set(self, **changes: object) -> None:
         self.state = replace(self.state, now_s=self._now(), **changes)  # type: ignore[arg-type]
@@ -214,7 +223,7 @@ class Bench:
 
     def start_over(self, *, is_rescue: bool = False) -> None:
         """Begin with the next bike, or with the rescue of one."""
-        self.state = State(
+        self.state = BenchState(
             adapters=self.state.adapters,
             was_looked_for=True,
             is_rescue=is_rescue,
@@ -223,7 +232,7 @@ class Bench:
         self.find_adapters()
 
     def find_adapters(self) -> None:
-        self._set(doing=Doing.ADAPTERS)
+        self._set(doing=Activity.ADAPTERS)
         self._set(adapters=tuple(self._place.adapters(self._cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
@@ -241,7 +250,7 @@ class Bench:
 
     def look(self) -> None:
         """Ask the battery, and listen to the others: the documents give no question for them."""
-        self._set(doing=Doing.LOOKING, bike=None, done=None)
+        self._set(doing=Activity.LOOKING, bike=None, done=None)
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
         if not bike.survey.heard:
@@ -275,7 +284,7 @@ class Bench:
 
     def judge(self) -> None:
         """Look which images fit."""
-        self._set(doing=Doing.JUDGING, offers=(), offer=None)
+        self._set(doing=Activity.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
         for path in self._place.images():
@@ -332,7 +341,7 @@ class Bench:
                 )
                 self._set(watched=Watched(self._now() - since_s, messages, troubles, rows))
 
-        self._set(doing=Doing.WATCHING, watched=Watched(0.0, 0, 0, ()))
+        self._set(doing=Activity.WATCHING, watched=Watched(0.0, 0, 0, ()))
         watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._place.dialect)
         with self._place.connect(self._adapter(), asks=False) as connection:
             drive(
@@ -345,7 +354,7 @@ class Bench:
         exist may crash a device. Images that cannot be for it do not count.
         """
         self._adapter()
-        self._set(doing=Doing.JUDGING, areas=None)
+        self._set(doing=Activity.JUDGING, areas=None)
         found = [area_of_profile(self._place.profile(BMS)) or self._place.model_area()]
         for path in self._place.images():
             if self._cancelled():
@@ -367,7 +376,7 @@ class Bench:
                 case events.QueryAnswered(content=Memory() as piece):
                     self._set(saved_bytes=self.state.saved_bytes + len(memory_bytes(piece)))
 
-        self._set(doing=Doing.SAVING, saved=None, saved_bytes=0)
+        self._set(doing=Activity.SAVING, saved=None, saved_bytes=0)
         self._set(
             saved=self._place.back_up(
                 self._adapter(), area, on_event=happened, cancelled=self._cancelled
@@ -441,7 +450,7 @@ class Bench:
             )
         adapter = self._adapter()
         self._set(
-            doing=Doing.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
+            doing=Activity.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
             repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
             adapter_left_s=None, watched=None,
         )  # fmt: skip
@@ -465,7 +474,7 @@ class Bench:
         self._set(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
         is_new = carried.result is not None and carried.result.outcome.ok
         if is_new and done.target.has_version_query:
-            self._set(doing=Doing.LOOKING_AGAIN)
+            self._set(doing=Activity.LOOKING_AGAIN)
             self._set(done=replace(done, after=self._seen(adapter, done.target)))
 
     def _happened(self, event: object) -> None:

@@ -24,7 +24,7 @@ from flasher.protocol.text import printable
 from flasher.report.base import visible
 from flasher.trace.decoder import Field, content_fields
 from flasher.web.bench import Bench
-from flasher.web.bench_state import Done, State
+from flasher.web.bench_state import BenchState, Done
 from flasher.web.pages import Pages, streamed
 from flasher.web.translation import Translator
 
@@ -173,11 +173,11 @@ class BenchPage:
             yield message
         yield {"ended": True}
 
-    def _parts(self, translate: Translator, state: State) -> dict[str, str]:
+    def _parts(self, translate: Translator, state: BenchState) -> dict[str, str]:
         return self._pages.parts(
             translate, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
-            left_s=left_s(state), told=told(state), waivers=WAIVERS,
+            left_s=left_s(state), failure_details=failure_details(state), waivers=WAIVERS,
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:
@@ -239,7 +239,7 @@ def _listed(shown: Field) -> str:
     return Text(", ".join(f"{{{name}}}" for name in values), values)
 
 
-def facts(state: State) -> list[tuple[str, str]]:
+def facts(state: BenchState) -> list[tuple[str, str]]:
     """What the battery says of itself, in short; its faults last."""
     if state.bike is None:
         return []
@@ -263,7 +263,7 @@ def identity(done: Done) -> list[tuple[str, str]]:
     return [rows[name] for name in ("model", "serial_number", "hardware_version") if name in rows]
 
 
-def told(state: State) -> list[tuple[str, list[tuple[str, str]]]]:
+def failure_details(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]]:
     """Everything that the battery told, in the words of `flasher info`: a title with its rows."""
     bike = state.bike
     if bike is None:
@@ -295,7 +295,7 @@ def compared(done: Done) -> list[tuple[str, str, str]]:
     return found
 
 
-def left_s(state: State) -> float | None:
+def left_s(state: BenchState) -> float | None:
     """Seconds that the transfer still takes, at the pace so far; None before there is one."""
     if state.transfer_began_s is None or state.offer is None or state.packet < 2:
         return None

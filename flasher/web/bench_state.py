@@ -17,7 +17,7 @@ from flasher.settings.area import Area
 from flasher.trace.decoder import BusEvent
 
 
-class Doing(Enum):
+class Activity(Enum):
     """What the bench does now."""
 
     NOTHING = "nothing"
@@ -150,10 +150,10 @@ class Saved:
 
 
 @dataclass(frozen=True)
-class State:
+class BenchState:
     """Everything that a page shows."""
 
-    doing: Doing = Doing.NOTHING
+    doing: Activity = Activity.NOTHING
     is_rescue: bool = False
     adapters: tuple[Adapter, ...] = ()
     was_looked_for: bool = False
@@ -198,7 +198,7 @@ class State:
 
     @property
     def is_idle(self) -> bool:
-        return self.doing is Doing.NOTHING
+        return self.doing is Activity.NOTHING
 
     def power_cycle_left_s(self, now_s: float) -> int:
         """Whole seconds that the device is still waited for."""

@@ -26,10 +26,10 @@ from starlette.types import Scope
 from flasher.i18n import text
 from flasher.station import pins
 from flasher.station.attempts import Attempts
-from flasher.station.people import Person, Role
+from flasher.station.operators import Person, Role
 from flasher.station.records.model import AuditEvent, Clock
-from flasher.web.answers import question_of
 from flasher.web.pages import Pages
+from flasher.web.query_processes import question_of
 from flasher.web.server import client_at
 from flasher.web.sign_ins import IDLE_S, SHIFT_S, Note, SignIn, SignIns
 from flasher.web.supervisor import frame

@@ -22,9 +22,9 @@ from starlette.routing import BaseRoute, Route
 from flasher.i18n import text
 from flasher.station.board import Board, Row, Spoken
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
-from flasher.station.health import Check, Watch
+from flasher.station.health import HealthCheck, HealthWatch
+from flasher.station.shift_counts import EndedRun, Output, ShiftCounts
 from flasher.station.socket import PAGE, Source
-from flasher.station.tally import EndedRun, Output, Tally
 from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
 from flasher.web.translation import Translator
@@ -68,7 +68,7 @@ class Lot:
 
 
 @dataclass(frozen=True)
-class Head:
+class ScreenHeader:
     """All that the page shows beside the sockets."""
 
     station: str
@@ -78,13 +78,13 @@ class Head:
     lot: Lot
     virtual: str
     output: Output
-    health: tuple[Check, ...]
+    health: tuple[HealthCheck, ...]
     stopped: LineStopped | None
     spoken: Spoken
     is_secret: bool
     """What is typed now must not be shown."""
 
-    def said(self, translate: Translator, source: Source) -> dict[str, Any]:
+    def to_json(self, translate: Translator, source: Source) -> dict[str, Any]:
         """The head in a language, for the page's script in the session that is this source."""
         stopped, lot, spoken = self.stopped, self.lot, self.spoken.to(source.name)
         name = lot.name or translate(text("no lot"))
@@ -159,7 +159,7 @@ class Screen:
     thread.
     """
 
-    def __init__(self, tally: Tally, watch: Watch) -> None:
+    def __init__(self, tally: ShiftCounts, watch: HealthWatch) -> None:
         self.feed = Feed(time.perf_counter, silence_limit_s=SILENCE_LIMIT_S)
         self._tally = tally
         self._watch = watch
@@ -192,7 +192,7 @@ class Screen:
         if now - self._turned_at < HEAD_EVERY_S:
             return
         self._turned_at = now
-        head = Head(
+        head = ScreenHeader(
             board.station,
             board.recipe,
             board.part,
@@ -248,8 +248,8 @@ class OperatorPage:
 
     async def _scan(self, request: Request) -> Response:
         try:
-            said = json.loads(await request.body())
-            text = said["text"]
+            to_json = json.loads(await request.body())
+            text = to_json["text"]
         except (ValueError, TypeError, KeyError):
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
@@ -273,9 +273,9 @@ async def _messages(
         if batch.is_all:
             message["all"] = True
         tiles = [_tile(state, translate) for _, state in batch.changes if isinstance(state, Row)]
-        heads = [state for _, state in batch.changes if isinstance(state, Head)]
+        heads = [state for _, state in batch.changes if isinstance(state, ScreenHeader)]
         if tiles:
             message["tiles"] = tiles
         if heads:
-            message["head"] = heads[-1].said(translate, source)
+            message["head"] = heads[-1].to_json(translate, source)
         yield message

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final
 
-from flasher.station.people import Person, Role
+from flasher.station.operators import Person, Role
 from flasher.station.records.model import AuditEvent, Clock
 
 SHIFT_S: Final = 8 * 3600.0

@@ -36,7 +36,7 @@ from flasher.station.certificate import (
 from flasher.station.certificate_check import check_certificate
 from flasher.station.records import chain
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
@@ -48,19 +48,19 @@ from flasher.station.records.model import (
     StepName,
     UnitState,
 )
-from flasher.station.records.newest import Cut
+from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page, Span
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, csv_text
 from flasher.station.sealed import CERTIFICATE_MAX_SIZE
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.station.stories import explained
-from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.trace.figures import Distribution
 from flasher.trace.story import Story
-from flasher.web.answers import Answer, Question
 from flasher.web.charts import SERIES_MAX, lines, stacked_bars
 from flasher.web.pages import Pages
+from flasher.web.query_processes import Answer, Question
 from flasher.web.translation import Translator, translator
 
 USUAL_DAYS: Final = 30
@@ -207,7 +207,7 @@ class Supervisor:
         page = self.overview.life(serial, part, _cut(question))
         if not page.rows:
             raise NotFoundError(f"There is no such run of {serial}.")
-        newest = self.overview.life(serial, part, Cut(), 1).rows[0]
+        newest = self.overview.life(serial, part, PageCursor(), 1).rows[0]
         shown = page.rows[0]
         story = self._story(shown)
         state_status, state, _ = UNIT_WORDS[UnitState.after(newest.run.state)]
@@ -426,7 +426,7 @@ def upload_limit(usual: int) -> Callable[[str], int]:
     return lambda path: CERTIFICATE_MAX_SIZE if path == CHECK else usual
 
 
-Place = tuple[str, Path, Keeping]
+Place = tuple[str, Path, KeyLocations]
 
 
 def place_of(store: Store) -> Place:
@@ -435,14 +435,16 @@ def place_of(store: Store) -> Place:
     return url, store.files.folder, store.signer.keeping
 
 
-def open_supervisor(url: str, folder: Path, keeping: Keeping, shifts: Sequence[time]) -> Supervisor:
+def open_supervisor(
+    url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
+) -> Supervisor:
     """Answers of the records of a place, which are only read. Raises what `Store.open` does."""
     store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
     return Supervisor(store, shifts)
 
 
 def serve_supervisor(
-    url: str, folder: Path, keeping: Keeping, shifts: Sequence[time]
+    url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
 ) -> Supervisor:
     """The same, and adds up the days for figures as long as this process lives."""
     supervisor = open_supervisor(url, folder, keeping, shifts)
@@ -506,9 +508,9 @@ def _moment(question: Question, name: str) -> datetime | None:
         ) from error
 
 
-def _oldest(question: Question) -> Cut:
+def _oldest(question: Question) -> PageCursor:
     """Where a part of a file begins; the first one with the oldest row."""
-    return Cut(after=_cut(question).after or 0)
+    return PageCursor(after=_cut(question).after or 0)
 
 
 def _part(
@@ -522,12 +524,12 @@ def _part(
     return Answer(text.encode("utf-8"), _CSV, file_name=name, after=after)
 
 
-def _cut(question: Question) -> Cut:
+def _cut(question: Question) -> PageCursor:
     def at(name: str) -> int | None:
         text = question.fields.get(name, "")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
-    return Cut(at("before"), at("after"))
+    return PageCursor(at("before"), at("after"))
 
 
 class _Addresses:
@@ -540,7 +542,7 @@ class _Addresses:
             if name not in ("before", "after")
         }
 
-    def with_cut(self, path: str, cut: Cut | None = None, **more: str) -> str:
+    def with_cut(self, path: str, cut: PageCursor | None = None, **more: str) -> str:
         """The same list from a cut on."""
         fields = self._fields | more
         if cut is not None and cut.before is not None:

@@ -29,7 +29,7 @@ _FOREIGN: Final = bytes.fromhex("55AA168700000000")
 """The beginning of a message that only a tool sends."""
 
 
-class Fault(Enum):
+class BikeFault(Enum):
     """What is wrong with a virtual bike; the value is its name."""
 
     NONE = "virtual bike"
@@ -43,14 +43,14 @@ class Fault(Enum):
 
 
 NOTES: Final = {
-    Fault.NONE: text("nothing is wrong with it"),
-    Fault.POWER: text("loses its power in the middle of the upgrade"),
-    Fault.PULLED: text("the adapter is pulled out in the middle of the upgrade"),
-    Fault.SECOND_TOOL: text("a second tool speaks in the middle of the upgrade"),
-    Fault.REFUSES: text("its devices refuse the image at the end"),
-    Fault.HARDWARE: text("has other hardware, and reports a fault"),
-    Fault.NO_APPLICATION: text("its upgrade was interrupted: its devices do not start"),
-    Fault.OFF: text("is switched off"),
+    BikeFault.NONE: text("nothing is wrong with it"),
+    BikeFault.POWER: text("loses its power in the middle of the upgrade"),
+    BikeFault.PULLED: text("the adapter is pulled out in the middle of the upgrade"),
+    BikeFault.SECOND_TOOL: text("a second tool speaks in the middle of the upgrade"),
+    BikeFault.REFUSES: text("its devices refuse the image at the end"),
+    BikeFault.HARDWARE: text("has other hardware, and reports a fault"),
+    BikeFault.NO_APPLICATION: text("its upgrade was interrupted: its devices do not start"),
+    BikeFault.OFF: text("is switched off"),
 }
 
 
@@ -79,14 +79,14 @@ class _BikeClock:
 class VirtualBike:
     """Three devices that can be upgraded, on a bus of their own. `speed` 0 takes no time."""
 
-    def __init__(self, fault: Fault, dialect: Dialect, *, speed: float = 1.0) -> None:
+    def __init__(self, fault: BikeFault, dialect: Dialect, *, speed: float = 1.0) -> None:
         self._fault = fault
         self._dialect = dialect
         self._clock: Clock = _BikeClock(speed) if speed else VirtualClock()
         self._bus = SimulatedBus(dialect.bitrate_bps, self._clock)
         self._link = self._bus.link()
         self._devices: dict[Target, FaultInjector] = {}
-        for target in TARGETS.values() if fault is not Fault.OFF else ():
+        for target in TARGETS.values() if fault is not BikeFault.OFF else ():
             self._devices[target] = FaultInjector(self._device(target))
             self._bus.attach(self._devices[target])
         self._job: Job | None = None
@@ -94,18 +94,18 @@ class VirtualBike:
     def _device(self, target: Target) -> MockDevice:
         fault = self._fault
         profile = DeviceProfile().speaking(self._dialect)
-        if fault is Fault.REFUSES:
+        if fault is BikeFault.REFUSES:
             profile = replace(profile, image_checksum="crc32")
-        if fault is Fault.HARDWARE:
+        if fault is BikeFault.HARDWARE:
             profile = replace(profile, hardware_version=_OTHER_HARDWARE, faults=_ONE_FAULT)
-        if fault is Fault.NO_APPLICATION:
+        if fault is BikeFault.NO_APPLICATION:
             profile = replace(profile, without_application="listens")
         is_battery = target is BMS
         return MockDevice(
             target,
             bitrate_bps=self._dialect.bitrate_bps,
             profile=profile,
-            has_application=fault is not Fault.NO_APPLICATION,
+            has_application=fault is not BikeFault.NO_APPLICATION,
             application=None if is_battery else ClientApplication(target.node, self._dialect),
         )
 
@@ -127,7 +127,7 @@ class VirtualBike:
         """An upgrade begins; its fault is going to happen."""
         self._job = job
         device = self._devices.get(job.plan.target)
-        if device is not None and self._fault is Fault.POWER and not job.options.at_power_up:
+        if device is not None and self._fault is BikeFault.POWER and not job.options.at_power_up:
             device.set(PowerCut(None), InOperation(job.plan.total_packets // 2))
 
     def happened(self, event: object) -> None:
@@ -138,7 +138,7 @@ class VirtualBike:
                 if device is not None:
                     device.set(PowerCut(_HAND_S), AtTime(self._clock.now() + _HAND_S))
             case events.PacketAcknowledged(number, total, _) if number == total // 2:
-                if self._fault is Fault.PULLED:
+                if self._fault is BikeFault.PULLED:
                     self._bus.unplug()
-                elif self._fault is Fault.SECOND_TOOL and job is not None:
+                elif self._fault is BikeFault.SECOND_TOOL and job is not None:
                     self._bus.link().send(Frame(job.plan.target.request_id, _FOREIGN))

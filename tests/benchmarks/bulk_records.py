@@ -20,7 +20,7 @@ from sqlalchemy import Connection, Table, select
 from flasher.protocol.spec import BMS
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import CLAIM, CLAIM_PARTS, canonical, digest
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import RunState, utc_text
 from flasher.station.records.signatures import SigningKey
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
@@ -126,7 +126,7 @@ class _Plant:
         self._runs, self._traces = runs, traces
         self._chance = random.Random(7)
         self._rows: dict[str, list[_Row]] = {}
-        self._heads: list[Head] = []
+        self._heads: list[ChainHead] = []
         self._digests: dict[tuple[str, int], str] = {}
         signer = bench.store.signer
         key = SigningKey.load(signer.key_file)
@@ -305,7 +305,7 @@ class _Plant:
             schema.audit, **row, id=self._audit_id, station_id=1, hash=self._before,
             signature=signature,
         )  # fmt: skip
-        head = Head("line-2", self._number, at, self._before, signature, self._key.public)
+        head = ChainHead("line-2", self._number, at, self._before, signature, self._key.public)
         self._heads.append(head)
 
     def write(self) -> None:

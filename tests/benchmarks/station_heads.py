@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from flasher.station.records.heads import Head, HeadsFile
+from flasher.station.records.heads import ChainHead, HeadsFile
 from flasher.station.records.signatures import SigningKey
 
 BATCH = 10_000
@@ -27,9 +27,9 @@ def fill(file: HeadsFile, key: SigningKey, rows: int) -> None:
         file.append((head(number, key) for number in numbers), key)
 
 
-def head(number: int, key: SigningKey) -> Head:
+def head(number: int, key: SigningKey) -> ChainHead:
     at = f"2026-05-17T09:00:00.{number % 1_000_000:06}"
-    return Head("line-2", number, at, f"{number:064x}", "s" * 88, key.public)
+    return ChainHead("line-2", number, at, f"{number:064x}", "s" * 88, key.public)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from flasher.cli.documents import as_json
 from flasher.cli.station.records import certificate
 from flasher.protocol.spec import BMS
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     Ending,
     Measurement,
@@ -99,7 +99,7 @@ def measure(folder: Path, runs: int) -> None:
     bench.recipe = make_recipe(folder, HEAD + SERIAL_NUMBER + target_table(BMS))
     fast = bench.store
     fast.close()
-    keeping = Keeping(bench.keys)
+    keeping = KeyLocations(bench.keys)
     with Store.open(
         str(bench.path), station="line-2", clock=bench.clock, keeping=keeping
     ) as bench.store:

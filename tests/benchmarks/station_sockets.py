@@ -21,7 +21,7 @@ from flasher.station.config import MockUnits
 from flasher.station.events import RunEnded, RunStarted, StationEvent, StepEnded
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import RunState, StepName
 from flasher.station.records.store import Store
 from flasher.station.station import Station, StationOptions
@@ -91,7 +91,7 @@ class Measured:
             for at in range(sockets)
         ]
         cpu_before, own_before = _children_cpu_s(), time.process_time()
-        keeping = Keeping(folder / "keys")
+        keeping = KeyLocations(folder / "keys")
         records = str(folder / "records.sqlite")
         with Store.open(records, station="benchmark", keeping=keeping) as store:
             options = StationOptions(scans_labels=True)

@@ -31,7 +31,7 @@ from sqlalchemy import create_engine
 from flasher.protocol.spec import BMS
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import ClaimRefusedError
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     AuditEvent,
     Ending,
@@ -46,8 +46,8 @@ from flasher.station.records.overview import Overview
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import Report
-from flasher.station.tally import DEFAULT_SHIFTS
-from flasher.web.answers import AnswerProcesses, Question
+from flasher.station.shift_counts import DEFAULT_SHIFTS
+from flasher.web.query_processes import QueryProcesses, Question
 from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_supervisor
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
@@ -89,7 +89,7 @@ class Plant:
     def open(self, *, read_only: bool = True, clock: FakeClock | None = None) -> Store:
         return Store.open(
             self.url, station="line-2", folder=self.files, read_only=read_only, clock=clock,
-            keeping=Keeping(self.folder / "keys"),
+            keeping=KeyLocations(self.folder / "keys"),
         )  # fmt: skip
 
     @property
@@ -179,7 +179,7 @@ def _serial(plant: Plant) -> str:
 
 
 def measure_pages(plant: Plant, wanted: str) -> None:
-    place = (plant.url, plant.files, Keeping(plant.folder / "keys"), DEFAULT_SHIFTS)
+    place = (plant.url, plant.files, KeyLocations(plant.folder / "keys"), DEFAULT_SHIFTS)
     questions = questions_of(plant)
     open_supervisor(*place).answer(questions[0][1])  # templates and statements are there
     for shown, question in questions:
@@ -205,7 +205,7 @@ def measure_pages(plant: Plant, wanted: str) -> None:
 
 def measure_files(plant: Plant) -> None:
     """Files of everything, which are sent in parts."""
-    place = (plant.url, plant.files, Keeping(plant.folder / "keys"), DEFAULT_SHIFTS)
+    place = (plant.url, plant.files, KeyLocations(plant.folder / "keys"), DEFAULT_SHIFTS)
     supervisor = open_supervisor(*place)
     for path, fields in (("/images.csv", {"sha256": "2" * 64}), ("/runs.csv", {})):
         parts_s: list[float] = []
@@ -268,7 +268,7 @@ def measure_station(plant: Plant) -> None:
     store = plant.open(read_only=False, clock=clock)
     store.recover()
     print(f"  a station starts, cold {(time.perf_counter() - began) * 1000:7.0f} ms")
-    answering = AnswerProcesses(partial(serve_supervisor, *place_of(store), DEFAULT_SHIFTS))
+    answering = QueryProcesses(partial(serve_supervisor, *place_of(store), DEFAULT_SHIFTS))
     with closing(store), closing(answering):
         _runs(store, clock, recipe, plant.folder)
         _commits(store, "alone")
@@ -327,7 +327,7 @@ def _commits(store: Store, when: str) -> None:
         )
 
 
-async def _ask(answering: AnswerProcesses, ended: threading.Event) -> None:
+async def _ask(answering: QueryProcesses, ended: threading.Event) -> None:
     asked = 0
 
     async def ask_on(paths: tuple[str, ...]) -> None:

@@ -19,7 +19,7 @@ from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.errors import ErrorCode, ExitCode, ImageError
 from flasher.host.waivers import WAIVERS
 from flasher.web.bench import Bench
-from flasher.web.virtual_bike import Fault
+from flasher.web.virtual_bike import BikeFault
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.web.bench_place import BenchPlace, order
@@ -130,7 +130,7 @@ def test_the_bench_page_neither_offers_nor_sends_one(
 ) -> None:
     place = BenchPlace(tmp_path)
     (tmp_path / "sample.hex").write_bytes(BMS.read_bytes())
-    looked = (order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
+    looked = (order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms"))
     state = place.do(*looked)
     offer = next(each for each in state.offers if each.name == "sample.hex")
     assert offer.refusal is None, "a virtual bike takes it"

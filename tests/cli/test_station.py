@@ -24,7 +24,7 @@ from flasher.settings.toml_reader import TomlTable
 from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
 from flasher.station.messages import CannotWork
-from flasher.station.people import BadgeTable
+from flasher.station.operators import BadgeTable
 from flasher.station.pins import Pin, is_right
 from flasher.station.recipe import Recipe
 from flasher.station.records.errors import DiskFullError

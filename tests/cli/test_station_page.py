@@ -23,7 +23,7 @@ import pytest
 from flasher.cli.station import pages
 from flasher.errors import ExitCode, UsageError
 from flasher.station.records.errors import DiskFullError
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import Store
 from flasher.web.guard import TOKEN_HEADER
 from flasher.web.server import Server
@@ -257,7 +257,7 @@ def test_who_signs_in_at_a_page_is_in_the_audit_trail(
 
 
 def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:
-    keeping = Keeping(tmp_path / "keys")
+    keeping = KeyLocations(tmp_path / "keys")
     first = pages.kept_secret(keeping)
     assert len(first) > 30
     assert pages.kept_secret(keeping) == first
@@ -269,7 +269,7 @@ def test_a_full_disk_leaves_no_half_secret(tmp_path: Path, monkeypatch: pytest.M
     def full(*_words: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    keeping = Keeping(tmp_path / "keys")
+    keeping = KeyLocations(tmp_path / "keys")
     with monkeypatch.context() as patched:
         patched.setattr("secrets.token_urlsafe", full)
         with pytest.raises(UsageError, match="No space left"):

@@ -17,7 +17,7 @@ from urllib.request import HTTPCookieProcessor, Request, build_opener
 import pytest
 
 from flasher.errors import ExitCode
-from flasher.web.virtual_bike import Fault
+from flasher.web.virtual_bike import BikeFault
 from tests.cli.conftest import Flasher
 from tests.end_to_end.stage import image_of
 from tests.web.bench_place import IMAGE, folder_of_images
@@ -60,7 +60,7 @@ class _Browser:
 
     def begin(self) -> None:
         self.until("adapter", "adapter-1")
-        self.order("adapter", name=Fault.NONE.value)
+        self.order("adapter", name=BikeFault.NONE.value)
         self.until("bike", "target-bms")
         self.order("target", name="bms")
         self.until("image", "image-1")

@@ -25,7 +25,7 @@ from flasher.cli.main import PURPOSES, flasher
 from flasher.conformance.profile import profile_keys
 from flasher.settings import bus, device_model, manifest, profile
 from flasher.settings.toml_reader import Key, Reader
-from flasher.station import codes, config, people, recipe
+from flasher.station import codes, config, operators, recipe
 
 _MADE: Final = re.compile(r"^<!-- made: (\S+) ?(.*) -->$", re.MULTILINE)
 _Lines = Iterator[str]
@@ -188,7 +188,7 @@ _FILES: Final[Mapping[str, Callable[[], _Lines]]] = {
     "manifest": lambda: _keys(manifest.reader().keys),
     "recipe": lambda: _file(recipe.Recipe),
     "station": lambda: _file(config.StationConfig),
-    "badges": lambda: _file(people.BadgeTable),
+    "badges": lambda: _file(operators.BadgeTable),
     "conformance": lambda: _keys(profile_keys()),
     "mock": lambda: _keys(device_model.reader().keys),
 }

@@ -19,7 +19,7 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Claim, Ending, Order, RunId, RunState, StepState, Verified
 from flasher.station.records.store import Store
 from tests.station.traces import run_messages, write_trace
@@ -98,7 +98,7 @@ def _begun_records() -> dict[str, bytes]:
         folder = Path(made)
         path, keys = folder / "records.sqlite", folder / "keys"
         with Store.open(
-            str(path), station="line-2", clock=FakeClock(), keeping=Keeping(keys)
+            str(path), station="line-2", clock=FakeClock(), keeping=KeyLocations(keys)
         ) as store:
             store.recover()
         return {
@@ -154,8 +154,8 @@ class Bench:
         return store
 
     @property
-    def keeping(self) -> Keeping:
-        return Keeping(self.keys, tuple(map(str, self.heads)))
+    def keeping(self) -> KeyLocations:
+        return KeyLocations(self.keys, tuple(map(str, self.heads)))
 
     @contextmanager
     def outsider(self) -> Iterator[Any]:

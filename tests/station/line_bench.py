@@ -23,7 +23,7 @@ from flasher.station.messages import (
     WriteReply,
     packed,
 )
-from flasher.station.people import Crew
+from flasher.station.operators import Crew
 from flasher.station.records.model import (
     Claim,
     Measurement,

@@ -27,10 +27,10 @@ from flasher.station.events import (
     ScanRefused,
     SocketState,
 )
-from flasher.station.health import Watch
+from flasher.station.health import HealthWatch
 from flasher.station.label_printer import LabelJob, LabelPrinter, NotPrinted, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of, values_of
-from flasher.station.people import Crew, Person, Role
+from flasher.station.operators import Crew, Person, Role
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.model import RunState
 from flasher.station.records.store import Store
@@ -200,7 +200,7 @@ def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> No
 
 
 def test_what_is_not_printed_stays_on_the_page(tmp_path: Path, bench: Bench) -> None:
-    watch = Watch(tmp_path, bench.clock.utc, bench.clock.monotonic_s)
+    watch = HealthWatch(tmp_path, bench.clock.utc, bench.clock.monotonic_s)
     names = [check.name for check in watch.look(Board())]
     assert names == ["records", "disk", "clock"]
     failed = LabelFailed("A", "W1", "No paper.", "Put some in.")

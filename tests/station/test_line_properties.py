@@ -15,7 +15,7 @@ from flasher.station.events import SocketChanged
 from flasher.station.line import Line
 from flasher.station.messages import PresenceChanged, Ready, RunResult
 from flasher.station.records.model import RunState
-from flasher.station.socket import Binding, Occupancy, Phase, Socket, Source
+from flasher.station.socket import Binding, Occupancy, Socket, SocketPhase, Source
 from tests.loops import each
 from tests.station.line_inputs import saved
 from tests.station.line_world import Walk, World
@@ -53,7 +53,7 @@ def test_no_label_runs_on_another_unit_and_nobody_is_stuck(sockets: tuple[str, .
 
 
 def handle(
-    patch: pytest.MonkeyPatch, phase: Phase, what: type, handler: Callable[..., None]
+    patch: pytest.MonkeyPatch, phase: SocketPhase, what: type, handler: Callable[..., None]
 ) -> None:
     """Put another handler into the line's table."""
     patch.setitem(Line._TABLE, phase, {**Line._TABLE[phase], what: handler})
@@ -64,7 +64,7 @@ def forget_a_removal(patch: pytest.MonkeyPatch) -> None:
         if what.is_there:
             Line._unit(self, socket, what, now)
 
-    handle(patch, Phase.REST, PresenceChanged, unit)
+    handle(patch, SocketPhase.REST, PresenceChanged, unit)
 
 
 def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
@@ -73,9 +73,9 @@ def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
         Line._saved(self, socket, saved(socket.name, RunState.PASS, ""), now)
         socket.shown = socket.view(None, is_only=False)
         self._tell(SocketChanged(socket.name, *socket.shown))
-        socket.phase = Phase.SAVE
+        socket.phase = SocketPhase.SAVE
 
-    handle(patch, Phase.RUN, RunResult, ended)
+    handle(patch, SocketPhase.RUN, RunResult, ended)
 
 
 def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
@@ -92,7 +92,7 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
         socket.is_last_there = was_last_there
 
     patch.setattr(Socket, "fall_silent", fall_silent)
-    handle(patch, Phase.REST, Ready, ready)
+    handle(patch, SocketPhase.REST, Ready, ready)
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
@@ -101,7 +101,7 @@ def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
             found = scans.place(sockets, serial, source)
         except scans.Refused:
             found = None
-        free = (e for e in sockets.values() if e.can_work and e.phase is Phase.REST)
+        free = (e for e in sockets.values() if e.can_work and e.phase is SocketPhase.REST)
         unknown = next(
             (e for e in free if e.occupancy is not Occupancy.THERE and not e.label), None
         )

@@ -23,14 +23,14 @@ from flasher.station.events import (
     StationEvent,
 )
 from flasher.station.keys import LENGTH_MAX, PAUSE_S, KeyDecoder, ScanBuilder
-from flasher.station.people import Crew, Person, Role
+from flasher.station.operators import Crew, Person, Role
 from flasher.station.scanners import InputScanner, NoScanner, Reads, Scanner, input_device
 from flasher.station.socket import Source
 from tests.loops import each
 from tests.station.factory import SERIAL, Bench
 from tests.station.line_bench import LineBench
 from tests.station.scanner_keys import KEYS
-from tests.station.test_people import PIN, REWORK, crew
+from tests.station.test_operators import PIN, REWORK, crew
 
 ENTER, TAB, SHIFT, CAPS, CTRL = 28, 15, 42, 58, 29
 SYN_REPORT, SYN_DROPPED = 0, 3

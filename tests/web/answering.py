@@ -9,12 +9,12 @@ from starlette.routing import BaseRoute
 from starlette.testclient import TestClient
 from starlette.types import ASGIApp
 
-from flasher.station.records.keys import Keeping
-from flasher.station.tally import DEFAULT_SHIFTS
-from flasher.web.answers import Answer, Question, answer_routes
+from flasher.station.records.keys import KeyLocations
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Login
 from flasher.web.pages import Pages
+from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.supervisor import (
     CHECK,
     PAGES,
@@ -29,7 +29,7 @@ _KEY = "of the test"
 def app_of(database: Path, keys: Path) -> ASGIApp:
     """The pages of the records in a file."""
     folder = database.with_name(f"{database.name}.files")
-    return app_with(open_supervisor(str(database), folder, Keeping(keys), DEFAULT_SHIFTS))
+    return app_with(open_supervisor(str(database), folder, KeyLocations(keys), DEFAULT_SHIFTS))
 
 
 def app_with(supervisor: Supervisor, login: Login | None = None, *more: BaseRoute) -> ASGIApp:

@@ -17,14 +17,14 @@ from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import Memory, VirtualBikes, backup_folder
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
-from flasher.web.answers import Answer, Question, answer_routes
+from flasher.web.archive import PAGES as KEPT
+from flasher.web.archive import Archive
 from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
-from flasher.web.bench_state import Adapter, State
+from flasher.web.bench_state import Adapter, BenchState
 from flasher.web.guard import BODY_MAX, Entry, application
-from flasher.web.kept import PAGES as KEPT
-from flasher.web.kept import Kept
 from flasher.web.pages import Pages
+from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.server import Server
 from tests.end_to_end.stage import NEW, image_of
 
@@ -53,7 +53,7 @@ class HeldBikes(VirtualBikes):
         *,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.Carried:
+    ) -> bench.UpgradeEnding:
         def held(event: object) -> None:
             on_event(event)
             self.hold(event)
@@ -79,7 +79,7 @@ class BenchPlace:
         self.bench = Bench(self.bikes, now)
         self.do(Bench.find_adapters)
 
-    def do(self, *orders: Order) -> State:
+    def do(self, *orders: Order) -> BenchState:
         """Carry out orders; the state then."""
         for order in orders:
             self.bench.write_planned(order)
@@ -89,7 +89,7 @@ class BenchPlace:
     def served(self) -> Iterator[str]:
         """Its page, with its thread; gives the address that lets a browser in."""
         pages = Pages(remembers_language=True)
-        kept = Kept(bundle_folder(), backup_folder(), self.shelf.traces)
+        kept = Archive(bundle_folder(), backup_folder(), self.shelf.traces)
 
         async def ask(question: Question) -> Answer:
             return await asyncio.to_thread(kept.answer, question)

@@ -18,10 +18,10 @@ from flasher.station.events import (
     StationEvent,
     StationStarted,
 )
-from flasher.station.health import Watch
+from flasher.station.health import HealthWatch
 from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.shift_counts import ShiftCounts
 from flasher.station.socket import Source
-from flasher.station.tally import Tally
 from flasher.web.guard import application
 from flasher.web.operator import Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
@@ -39,7 +39,9 @@ class LineScreen:
         self.scans: list[str] = []
         self.sources: list[Source] = []
         """Where each was scanned."""
-        self.screen = Screen(Tally(), Watch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0))
+        self.screen = Screen(
+            ShiftCounts(), HealthWatch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0)
+        )
         self.operator = "Jo"
         self.lot = Lot("L17", 500, 12)
         self._lock = threading.Lock()

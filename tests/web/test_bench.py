@@ -31,10 +31,10 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.bench import Bench, Order
-from flasher.web.bench_page import told
-from flasher.web.bench_state import Doing, Done, State
+from flasher.web.bench_page import failure_details
+from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.translation import translator
-from flasher.web.virtual_bike import Fault
+from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
 
@@ -44,13 +44,15 @@ def place(tmp_path: Path) -> BenchPlace:
     return BenchPlace(tmp_path)
 
 
-def _upgrade(state: State) -> Order:
+def _upgrade(state: BenchState) -> Order:
     assert state.target is not None
     assert state.offer is not None
     return order(Bench.upgrade, state.target.name, state.offer.sha256)
 
 
-def _chosen(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> State:
+def _chosen(
+    place: BenchPlace, fault: BikeFault = BikeFault.NONE, target: str = "bms"
+) -> BenchState:
     return place.do(
         order(Bench.use_adapter, fault.value),
         order(Bench.choose_target, target),
@@ -58,7 +60,7 @@ def _chosen(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -
     )
 
 
-def _done(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> Done:
+def _done(place: BenchPlace, fault: BikeFault = BikeFault.NONE, target: str = "bms") -> Done:
     state = place.do(_upgrade(_chosen(place, fault, target)))
     assert state.trouble is None
     assert state.done is not None
@@ -114,14 +116,16 @@ def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> Non
     _done(place)
     state = place.do(Bench.start_over)
     assert (state.done, state.bike, state.offer, state.adapter) == (None,) * 4
-    assert len(state.adapters) == len(Fault)
+    assert len(state.adapters) == len(BikeFault)
 
 
 # -- images ----------------------------------------------------------------------------------------
 
 
 def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPlace) -> None:
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
+    state = place.do(
+        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+    )
     assert [(each.name, type(each.refusal)) for each in state.offers] == [
         (IMAGE, type(None)),
         ("broken.hex", ImageError),
@@ -146,7 +150,7 @@ def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
     _for_other_hardware(tmp_path)
     assert _chosen(place).offer is not None
     state = place.do(
-        order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms")
+        order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms")
     )
     refusals = {each.name: each.refusal for each in state.offers}
     assert isinstance(refusals[IMAGE], WrongDeviceError)
@@ -156,7 +160,9 @@ def test_a_dropped_image_is_offered_and_what_is_none_is_not_taken(place: BenchPl
     assert place.shelf.take("../../dropped.bin", image_of(3, NEW).data)
     for name in ("run.sh", ".bin", "", "a\nb.bin", "x" * 300 + ".bin"):
         assert place.shelf.take(name, b"x") is None, name
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
+    state = place.do(
+        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+    )
     assert [each.name for each in state.offers if not each.refusal] == ["dropped.bin", IMAGE]
 
 
@@ -165,7 +171,9 @@ def test_a_name_is_shown_as_people_write_it_and_what_hides_is_not(
 ) -> None:
     for name in ("固件 ü.bin", "a\u202eb.bin"):
         (tmp_path / name).write_bytes(image_of(3, NEW).data)
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
+    state = place.do(
+        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+    )
     fitting = {each.name for each in state.offers if not each.refusal}
     assert fitting == {IMAGE, "固件 ü.bin", "a\\u202eb.bin"}
     for name in fitting:
@@ -199,7 +207,7 @@ def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_pa
     other.mkdir()
     (other / "other.bin").write_bytes(image_of(3, NEW).data)
     state = place.do(
-        order(Bench.use_adapter, Fault.NONE.value),
+        order(Bench.use_adapter, BikeFault.NONE.value),
         order(Bench.choose_target, "bms"),
         order(Bench.use_folder, str(other)),
     )
@@ -218,7 +226,7 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     place: BenchPlace, tmp_path: Path
 ) -> None:
     _for_other_hardware(tmp_path)
-    place.do(order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms"))
+    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms"))
     state = place.do(order(Bench.waive, IMAGE, "hardware"))
     assert state.offer is not None
     assert state.offer.waived == ("hardware",)
@@ -229,7 +237,7 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     assert FlashHistory().flashes()[0][-1].began.waived == "hardware"
     state = place.do(
         Bench.start_over,
-        order(Bench.use_adapter, Fault.HARDWARE.value),
+        order(Bench.use_adapter, BikeFault.HARDWARE.value),
         order(Bench.choose_target, "bms"),
     )
     assert IMAGE not in {each.name for each in state.offers if not each.refusal}
@@ -237,7 +245,7 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
 
 def test_only_the_check_that_refused_can_be_waived(place: BenchPlace, tmp_path: Path) -> None:
     _for_other_hardware(tmp_path)
-    place.do(order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms"))
+    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms"))
     for ordered in (
         order(Bench.waive, IMAGE, "downgrade"),
         order(Bench.waive, "broken.hex", ""),
@@ -267,14 +275,14 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
 @pytest.mark.parametrize(
     ("fault", "error", "claims"),
     [
-        (Fault.POWER, TransferError, (False, False, None)),
-        (Fault.PULLED, BusError, (None, None, None)),
-        (Fault.SECOND_TOOL, BusError, (False, False, None)),
-        (Fault.REFUSES, RefusedError, (True, False, None)),
+        (BikeFault.POWER, TransferError, (False, False, None)),
+        (BikeFault.PULLED, BusError, (None, None, None)),
+        (BikeFault.SECOND_TOOL, BusError, (False, False, None)),
+        (BikeFault.REFUSES, RefusedError, (True, False, None)),
     ],
 )
 def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
-    place: BenchPlace, fault: Fault, error: type[Exception], claims: tuple[bool | None, ...]
+    place: BenchPlace, fault: BikeFault, error: type[Exception], claims: tuple[bool | None, ...]
 ) -> None:
     done = _done(place, fault)
     assert type(done.error) is error
@@ -287,7 +295,7 @@ def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
 
 
 def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> None:
-    error = _done(place, Fault.POWER).error
+    error = _done(place, BikeFault.POWER).error
     assert error is not None
     assert "Then rescue this device." in error.remedy
     german = translator("de")
@@ -298,7 +306,7 @@ def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> Non
 
 
 def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
-    _done(place, Fault.POWER)
+    _done(place, BikeFault.POWER)
     state = place.do(Bench.rescue_it)
     assert state.is_rescue
     assert state.offer is not None
@@ -317,13 +325,13 @@ def test_the_wait_for_a_lost_adapter_is_counted_down(place: BenchPlace) -> None:
     seen: list[int | None] = []
     put = place.bench.feed.put
 
-    def watched(subject: str, state: State, *, word: object) -> None:
+    def watched(subject: str, state: BenchState, *, word: object) -> None:
         put(subject, state, word=word)
         if seen[-1:] != [state.adapter_left_s]:
             seen.append(state.adapter_left_s)
 
     place.bench.feed.put = watched  # type: ignore[method-assign]
-    assert isinstance(_done(place, Fault.PULLED).error, BusError)
+    assert isinstance(_done(place, BikeFault.PULLED).error, BusError)
     assert seen == [None, 5, 4, 3, 2, 1, None]
 
 
@@ -333,12 +341,12 @@ def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
     seen: list[int] = []
     put = place.bench.feed.put
 
-    def watched(subject: str, state: State, *, word: object) -> None:
+    def watched(subject: str, state: BenchState, *, word: object) -> None:
         put(subject, state, word=word)
         seen.extend([state.power_cycle_left_s(state.now_s)] * (state.power_cycle_s is not None))
 
     place.bench.feed.put = watched  # type: ignore[method-assign]
-    _done(place, Fault.POWER)
+    _done(place, BikeFault.POWER)
     place.do(_upgrade(place.do(Bench.rescue_it)))
     assert seen[0] in (59, 60)
     assert len(set(seen)) > 5
@@ -348,7 +356,7 @@ def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
 def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
     place: BenchPlace,
 ) -> None:
-    _done(place, Fault.REFUSES)
+    _done(place, BikeFault.REFUSES)
     state = place.do(Bench.rescue_it)
     assert state.offers
     assert state.offer is None
@@ -357,7 +365,7 @@ def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
 def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: BenchPlace) -> None:
     state = place.do(
         order(Bench.start_over, is_rescue=True),
-        order(Bench.use_adapter, Fault.NO_APPLICATION.value),
+        order(Bench.use_adapter, BikeFault.NO_APPLICATION.value),
         order(Bench.choose_target, "obc"),
         order(Bench.choose_image, IMAGE),
     )
@@ -367,7 +375,9 @@ def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: Ben
 
 
 def test_a_bike_that_is_off_says_so(place: BenchPlace) -> None:
-    assert isinstance(place.do(order(Bench.use_adapter, Fault.OFF.value)).trouble, NoAnswerError)
+    assert isinstance(
+        place.do(order(Bench.use_adapter, BikeFault.OFF.value)).trouble, NoAnswerError
+    )
 
 
 # -- one thing at a time ---------------------------------------------------------------------------
@@ -422,7 +432,7 @@ def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Or
     state = place.do(ordered)
     assert isinstance(state.trouble, UsageError)
     assert state.trouble.remedy
-    assert state.doing is Doing.NOTHING
+    assert state.doing is Activity.NOTHING
 
 
 # -- looking closer --------------------------------------------------------------------------------
@@ -431,10 +441,10 @@ def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Or
 def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(order(Bench.use_adapter, Fault.HARDWARE.value))
-    looks: list[State] = []
+    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value))
+    looks: list[BenchState] = []
 
-    def put(_subject: str, state: State, **_: object) -> None:
+    def put(_subject: str, state: BenchState, **_: object) -> None:
         looks.append(state)
         if state.watched is not None and state.watched.messages > 10:
             place.bench.stop()
@@ -443,23 +453,23 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     state = place.do(Bench.watch)
     assert state.trouble is None
     assert state.watched is not None
-    assert {each.doing for each in looks} == {Doing.WATCHING, Doing.NOTHING}
+    assert {each.doing for each in looks} == {Activity.WATCHING, Activity.NOTHING}
     rows = {each.seen.marked_title: each.seen for each in state.watched.board}
     running = rows["running information"]
     assert running.route == "BMS > all"
     assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
     assert any(each.seen.is_trouble for each in state.watched.board)  # the fault of this bike
-    assert place.do(order(Bench.use_adapter, Fault.NONE.value)).watched is None
+    assert place.do(order(Bench.use_adapter, BikeFault.NONE.value)).watched is None
 
 
 def test_a_bus_that_fails_while_it_is_watched_says_so(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(order(Bench.use_adapter, Fault.NONE.value))
+    place.do(order(Bench.use_adapter, BikeFault.NONE.value))
     monkeypatch.setattr("flasher.web.bench.drive", _lost)
     state = place.do(Bench.watch)
     assert isinstance(state.trouble, BusError)
-    assert state.doing is Doing.NOTHING
+    assert state.doing is Activity.NOTHING
 
 
 def _lost(*_: object, **__: object) -> None:
@@ -467,7 +477,7 @@ def _lost(*_: object, **__: object) -> None:
 
 
 def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), Bench.find_areas)
+    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), Bench.find_areas)
     assert state.areas is not None
     (area,) = state.areas  # new.bin has no addresses, and broken.hex is no image
     saved = place.do(order(Bench.back_up, area.source)).saved
@@ -487,7 +497,7 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
     image = IntelHex()
     image.frombytes(image_of(3, NEW).data, offset=0x0800_4000)
     image.write_hex_file(str(tmp_path / "running.hex"))
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), Bench.find_areas)
+    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), Bench.find_areas)
     assert [each.start for each in state.areas or ()] == [AREA_START, 0x0800_4000]
     state = place.do(order(Bench.back_up, (state.areas or ())[1].source))
     assert state.saved is not None
@@ -496,7 +506,7 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
 
 
 def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
-    saved = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.back_up, "")).saved
+    saved = place.do(order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.back_up, "")).saved
     assert saved is not None
     assert (saved.area, saved.names_running_version) == (None, None)
     assert "memory" in saved.missing
@@ -505,23 +515,25 @@ def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> No
 def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_written(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    state = place.do(order(Bench.use_adapter, Fault.OFF.value), order(Bench.back_up, ""))
+    state = place.do(order(Bench.use_adapter, BikeFault.OFF.value), order(Bench.back_up, ""))
     assert isinstance(state.trouble, NoAnswerError)
     assert state.saved is None
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.back_up, ""))
+    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.back_up, ""))
     assert isinstance(state.trouble, UsageError)
     assert state.saved is None
 
 
 def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
-    state = place.do(order(Bench.use_adapter, Fault.NONE.value))
-    found = dict(told(state))
+    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value))
+    found = dict(failure_details(state))
     assert found["faults"] == [("faults", "none received")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
-    ((_, faults),) = dict(told(place.do(order(Bench.use_adapter, Fault.HARDWARE.value))))["faults"]
+    ((_, faults),) = dict(
+        failure_details(place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value)))
+    )["faults"]
     assert faults == "over discharge protection"
     assert translator("de")(faults) == "Schutz: Tiefentladung"
 

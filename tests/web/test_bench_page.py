@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from flasher import events
-from flasher.web.virtual_bike import Fault
+from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.firmware import VECTORS
 from tests.web.barriers import barriers
@@ -42,7 +42,7 @@ def page(tab: Tab, place: BenchPlace) -> Iterator[Page]:
         tab.page.goto("about:blank")
 
 
-def _choose(page: Page, fault: Fault = Fault.NONE, target: str = "bms") -> None:
+def _choose(page: Page, fault: BikeFault = BikeFault.NONE, target: str = "bms") -> None:
     page.click(f"#adapter button:text-is('{fault.value}')")
     page.click(f"#target-{target}:enabled")
     page.click("#image-1")
@@ -99,7 +99,7 @@ def test_keyboard_alone_upgrades_a_bike_and_leads_to_its_sheet(page: Page) -> No
 
 
 def test_an_interrupted_upgrade_is_rescued(page: Page) -> None:
-    _choose(page, Fault.POWER)
+    _choose(page, BikeFault.POWER)
     page.click("#go")
     assert _claims(page) == ["NO", "NO", "NOT KNOWN"]
     expect(page.locator("#result")).to_contain_text("erased or half written")
@@ -143,7 +143,7 @@ def test_files_are_taken_before_anything_is_chosen_and_a_trace_tells_its_story(
 
 
 def test_a_failure_is_explained_and_its_bundle_downloaded_in_one_click(page: Page) -> None:
-    _choose(page, Fault.POWER)
+    _choose(page, BikeFault.POWER)
     page.click("#go")
     page.click("#story")
     expect(page.locator("h1")).to_contain_text("What flasher-bms-")
@@ -163,7 +163,7 @@ def test_a_failure_is_explained_and_its_bundle_downloaded_in_one_click(page: Pag
 
 
 def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
-    page.click(f"#adapter button:text-is('{Fault.HARDWARE.value}')")
+    page.click(f"#adapter button:text-is('{BikeFault.HARDWARE.value}')")
     page.click("#told-all")
     expect(page.locator("#told")).to_contain_text("over discharge protection")
     expect(page.locator("#told")).to_contain_text("most recent charge interval")
@@ -183,7 +183,7 @@ def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
 
 
 def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> None:
-    page.click(f"#adapter button:text-is('{Fault.NONE.value}')")
+    page.click(f"#adapter button:text-is('{BikeFault.NONE.value}')")
     page.click("#target-bms:enabled")
     wrong = image_of(3, NEW).data[len(VECTORS) :]
     page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": wrong})
@@ -200,7 +200,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
 
 
 def test_the_page_says_when_its_program_has_ended(page: Page, place: BenchPlace) -> None:
-    page.click(f"#adapter button:text-is('{Fault.NONE.value}')")
+    page.click(f"#adapter button:text-is('{BikeFault.NONE.value}')")
     expect(page.locator("#target-bms")).to_be_visible()
     place.bench.feed.close()
     expect(page.locator("#ended")).to_be_visible()
@@ -211,7 +211,7 @@ def test_the_page_says_when_its_program_has_ended(page: Page, place: BenchPlace)
 
 
 def test_an_image_that_the_device_refuses_is_not_said_to_be_completed(page: Page) -> None:
-    _choose(page, Fault.REFUSES)
+    _choose(page, BikeFault.REFUSES)
     page.click("#go")
     assert _claims(page) == ["YES", "NO", "NOT KNOWN"]
     expect(page.locator("#result")).to_contain_text("the device refused the image at the end")

@@ -16,7 +16,7 @@ from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from flasher.station.attempts import ALL_MAX, PAUSE_S, PER_ADDRESS_MAX, TRIES_MAX
-from flasher.station.people import Person, Role
+from flasher.station.operators import Person, Role
 from flasher.station.records.model import AuditEvent
 from flasher.web.guard import TOKEN_HEADER, application
 from flasher.web.login import Badges, Login

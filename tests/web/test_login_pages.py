@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from flasher.station.people import Person, Role
+from flasher.station.operators import Person, Role
 from flasher.station.pins import checker
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import SystemClock
-from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.login import Badges, Login
 from flasher.web.operator import LINE, OperatorPage
 from flasher.web.pages import Pages
@@ -64,7 +64,7 @@ def _served(*, are_for_all: bool) -> Iterator[tuple[str, Login]]:
         bench = Bench(Path(folder))
         bench.make()
         supervisor = open_supervisor(
-            str(bench.path), bench.store.files.folder, Keeping(bench.keys), DEFAULT_SHIFTS
+            str(bench.path), bench.store.files.folder, KeyLocations(bench.keys), DEFAULT_SHIFTS
         )
         app = app_with(supervisor, login, *operator.routes)
         with Server(app, "127.0.0.1", 0) as server:

@@ -21,7 +21,7 @@ from starlette.testclient import TestClient
 
 from flasher.protocol.spec import BMS as TARGET
 from flasher.station.records import chain
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -29,11 +29,11 @@ from flasher.station.records.model import (
     RunState,
     StepState,
 )
-from flasher.station.records.newest import Cut
+from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import By, Overview, Span
-from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web import supervisor
-from flasher.web.answers import Answer, Question
+from flasher.web.query_processes import Answer, Question
 from flasher.web.supervisor import Supervisor, open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.station.postgres import Server
@@ -149,7 +149,7 @@ def test_a_file_breaks_off_where_a_part_cannot_be_read(
 ) -> None:
     monkeypatch.setattr(supervisor, "PART_SIZE", 2)
     pages = open_supervisor(
-        str(plant.path), plant.store.files.folder, Keeping(plant.keys), DEFAULT_SHIFTS
+        str(plant.path), plant.store.files.folder, KeyLocations(plant.keys), DEFAULT_SHIFTS
     )
     asked: list[Question] = []
     usual = supervisor.Supervisor.answer
@@ -170,7 +170,9 @@ def server_client(postgres: Server) -> Iterator[TestClient]:
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), url=url)
         _units(bench)
-        pages = open_supervisor(url, bench.store.files.folder, Keeping(bench.keys), DEFAULT_SHIFTS)
+        pages = open_supervisor(
+            url, bench.store.files.folder, KeyLocations(bench.keys), DEFAULT_SHIFTS
+        )
         with closing(bench.store), closing(pages.store):
             yield client_of(app_with(pages))
 
@@ -203,14 +205,14 @@ def _without_times(text: str) -> str:
     ],
 )
 def test_a_filter_finds_its_runs(overview: Overview, chosen: RunFilter, count: int) -> None:
-    assert len(overview.runs(chosen, Cut()).rows) == count
+    assert len(overview.runs(chosen, PageCursor()).rows) == count
 
 
 @pytest.mark.parametrize("size", [1, 5, 16, 20])
 def test_pages_hold_every_run_once_in_both_directions(overview: Overview, size: int) -> None:
-    every = [run.run_id for run in overview.runs(RunFilter(), Cut(), 100).rows]
+    every = [run.run_id for run in overview.runs(RunFilter(), PageCursor(), 100).rows]
     assert every == sorted(every, reverse=True)
-    page = overview.runs(RunFilter(), Cut(), size)
+    page = overview.runs(RunFilter(), PageCursor(), size)
     down = [[run.run_id for run in page.rows]]
     assert page.newer is None
     while page.older is not None:
@@ -332,7 +334,7 @@ def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench
     bench.store.finish(
         untouched, bench.ending(RunState.FAIL, "NO_ANSWER", bench.traced("W2605004"))
     )
-    first = {each.serial: each.is_confirmed for each in overview.holders(IMAGE, Cut()).rows}
+    first = {each.serial: each.is_confirmed for each in overview.holders(IMAGE, PageCursor()).rows}
     assert first == {"W2605001": True, "W2605002": False, "W2605003": True}
     assert overview.holder_count(IMAGE) == 3
 
@@ -340,8 +342,11 @@ def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench
     _other_image(bench, data)
     newer = bench.recipe.targets[0].image.sha256
     _flash(bench, "W2605002", RunState.PASS)
-    assert {each.serial for each in overview.holders(newer, Cut()).rows} == {"W2605002"}
-    assert {each.serial for each in overview.holders(IMAGE, Cut()).rows} == {"W2605001", "W2605003"}
+    assert {each.serial for each in overview.holders(newer, PageCursor()).rows} == {"W2605002"}
+    assert {each.serial for each in overview.holders(IMAGE, PageCursor()).rows} == {
+        "W2605001",
+        "W2605003",
+    }
 
     client = client_of(app_of(bench.path, bench.keys))
     html = client.get(f"/images?image={newer[:12].upper()}").text
@@ -365,7 +370,7 @@ def _other_image(bench: Bench, data: bytes) -> None:
 
 
 def test_holders_come_in_pages(overview: Overview) -> None:
-    found, cut = [], Cut()
+    found, cut = [], PageCursor()
     while True:
         page = overview.holders(IMAGE, cut, 5)
         found += [each.serial for each in page.rows]
@@ -467,7 +472,7 @@ def test_charts_need_nothing_that_the_policy_forbids(client: TestClient, by: str
 def test_the_audit_trail_in_pages(client: TestClient, overview: Overview) -> None:
     html = client.get("/audit?event=finished").text
     assert html.count('<td class="keep first">finished') == 16
-    first = overview.audit(Cut(), size=10)
+    first = overview.audit(PageCursor(), size=10)
     assert first.older is not None
     second = overview.audit(first.older, size=10)
     assert first.rows[-1].number == second.rows[0].number + 1
@@ -475,7 +480,7 @@ def test_the_audit_trail_in_pages(client: TestClient, overview: Overview) -> Non
 
 
 def test_every_event_of_the_trail_can_be_chosen(overview: Overview) -> None:
-    assert {row.event for row in overview.audit(Cut(), size=500).rows} <= set(chain.EVENTS)
+    assert {row.event for row in overview.audit(PageCursor(), size=500).rows} <= set(chain.EVENTS)
 
 
 # -- what must not do harm -------------------------------------------------------------------------

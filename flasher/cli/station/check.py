@@ -19,7 +19,7 @@ from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import check_samples, detect, resolve
 from flasher.station.config import load_config
-from flasher.station.people import load_badges
+from flasher.station.operators import load_badges
 from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 

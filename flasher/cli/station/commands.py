@@ -371,7 +371,7 @@ def unit(
 @_records_options
 def backup(output: Output, file: Path, records: RecordsOptions) -> int:
     """Copy the records while the station runs."""
-    return _call("care.backup", output, records, file)
+    return _call("maintenance.backup", output, records, file)
 
 
 @station.action("roles")
@@ -383,7 +383,7 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
     stations, which adds records, and one which reads them. Neither can delete records, or change
     tables and triggers. Users and records that are not there yet are made.
     """
-    return _call("care.roles", output, records, station_role, reader_role)
+    return _call("maintenance.roles", output, records, station_role, reader_role)
 
 
 @station.action("verify")
@@ -402,8 +402,8 @@ def verify(
 ) -> int:
     """Tell whether the records, or a certificate of them, were changed."""
     if certificate is not None:
-        return _call("care.verify_certificate", output, records, certificate)
-    return _call("care.verify", output, records, is_all=is_all)
+        return _call("maintenance.verify_certificate", output, records, certificate)
+    return _call("maintenance.verify", output, records, is_all=is_all)
 
 
 @station.action("key")
@@ -424,7 +424,7 @@ def key(
     """Show, or change, the key that signs the records."""
     if rotate and lost:
         raise UsageError("--rotate and --lost do not go together.", remedy="Leave one out.")
-    return _call("care.key", output, records, operator, reason, rotate=rotate, lost=lost)
+    return _call("maintenance.key", output, records, operator, reason, rotate=rotate, lost=lost)
 
 
 @station.action("accept")
@@ -441,7 +441,7 @@ def accept(
     output: Output, what: str, operator: str | None, reason: str, records: RecordsOptions
 ) -> int:
     """Let the station go on, and note who said so."""
-    return _call("care.accept", output, records, what, operator, reason)
+    return _call("maintenance.accept", output, records, what, operator, reason)
 
 
 @station.action("upgrade")
@@ -450,4 +450,4 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
     """Bring records of an older flasher up to date. Of a file, a backup is made first; a server
     has to be backed up before (pg_dump), and its owner does it.
     """
-    return _call("care.upgrade", output, records)
+    return _call("maintenance.upgrade", output, records)

@@ -32,19 +32,19 @@ from flasher.protocol.text import printable
 from flasher.station.board import Board
 from flasher.station.config import StationConfig, load_config
 from flasher.station.events import RunEnded, StationEvent
-from flasher.station.health import Watch
-from flasher.station.people import BADGES, Person
+from flasher.station.health import HealthWatch
+from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Clock, RunFilter, RunState, utc_moment
 from flasher.station.records.store import SystemClock
+from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
 from flasher.station.station import Station
-from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
-from flasher.web.answers import AnswerProcesses, answer_routes
 from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Badges, Login
 from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
+from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server, Tls
 from flasher.web.sign_ins import Note
 from flasher.web.supervisor import CHECK, PAGES, place_of, serve_supervisor, upload_limit
@@ -101,7 +101,7 @@ def operator_page(
     board: Board,
     config: StationConfig,
     *,
-    keeping: Keeping | None,
+    keeping: KeyLocations | None,
     people: Sequence[Person],
 ) -> Iterator[tuple[OperatorView, str]]:
     """Serve the page, and those of the supervisor beside it, while the block runs; gives its view
@@ -109,20 +109,20 @@ def operator_page(
 
     Raises UsageError.
     """
-    tally = Tally(config.shifts)
+    tally = ShiftCounts(config.shifts)
     began = tally.began(datetime.now().astimezone())
     store = station.store
     for run in store.read.table(RunFilter(since=began)):
         if run.station == store.station and run.state is not RunState.RUNNING:
             tally.add(EndedRun(utc_moment(run.begun_at), run.serial, run.state, run.code))
     clock = station.clock
-    watch = Watch(store.files.folder, clock.utc, clock.monotonic_s, store.signer.unkept)
+    watch = HealthWatch(store.files.folder, clock.utc, clock.monotonic_s, store.signer.unkept)
     screen = Screen(tally, watch)
     pages = Pages(options.language)
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
-    answering = AnswerProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
+    answering = QueryProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
     routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     server = served(
         options,
@@ -154,7 +154,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
     with closing(open_to_read(records)) as store:  # what is wrong with them is said before
         place = place_of(store)
     pages = Pages(options.language)
-    answering = AnswerProcesses(partial(serve_supervisor, *place, shifts))
+    answering = QueryProcesses(partial(serve_supervisor, *place, shifts))
     routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     with (
         closing(answering),
@@ -194,7 +194,7 @@ def served(
     routes: Collection[BaseRoute],
     *,
     pages: Pages,
-    keeping: Keeping | None,
+    keeping: KeyLocations | None,
     people: Sequence[Person] = (),
     is_supervised: Callable[[str], bool],
     clock: Clock,
@@ -291,7 +291,7 @@ def _password(options: PagesOptions) -> str:
     return text
 
 
-def kept_secret(keeping: Keeping) -> str:
+def kept_secret(keeping: KeyLocations) -> str:
     """What signs the cookies of the pages, for this user alone; made where there is none."""
     path: Path = keeping.keys_folder / "pages.secret"
     try:

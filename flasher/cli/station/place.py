@@ -12,7 +12,7 @@ from flasher.cli.station.commands import DEFAULT_RECORDS, RecordsOptions
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
 
@@ -28,7 +28,7 @@ class RecordsPlace:
     """A file, or an SQLAlchemy URL."""
     files: Path | None
     lock_timeout_s: float
-    keeping: Keeping
+    keeping: KeyLocations
     station: str | None
     """The station's name, where the options name its file."""
 
@@ -59,11 +59,15 @@ def records_of(options: RecordsOptions) -> RecordsPlace:
     database, files, keys, heads = options.database, options.files, options.keys, options.heads
     if config is None:
         return RecordsPlace(
-            database or DEFAULT_RECORDS, files, DEFAULT_LOCK_TIMEOUT_S, Keeping(keys, heads), None
+            database or DEFAULT_RECORDS,
+            files,
+            DEFAULT_LOCK_TIMEOUT_S,
+            KeyLocations(keys, heads),
+            None,
         )
     if database is None:
         database, files = config.records, files or _path(config.files)
-    keeping = Keeping(keys or _path(config.keys), heads or config.heads)
+    keeping = KeyLocations(keys or _path(config.keys), heads or config.heads)
     return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
 
 

@@ -34,10 +34,10 @@ from flasher.station import codes
 from flasher.station.adapters import Resolved, detect, resolve, worker_setups
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.events import StationEvent
-from flasher.station.people import Crew
+from flasher.station.operators import Crew
 from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import Store
 from flasher.station.socket import FILE, PIPE, TERMINAL
 from flasher.station.station import SCANS_ENDED, Station, StationOptions
@@ -177,7 +177,7 @@ def _opened_records(
             yield store
         return
     with tempfile.TemporaryDirectory(prefix="flasher-station-") as folder:
-        file, keeping = Path(folder) / "records.sqlite", Keeping(Path(folder) / "keys")
+        file, keeping = Path(folder) / "records.sqlite", KeyLocations(Path(folder) / "keys")
         with Store.open(str(file), station=config.name, keeping=keeping) as store:
             yield store
 

@@ -15,7 +15,7 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.station.config import StationConfig
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
-from flasher.station.people import Crew, load_badges
+from flasher.station.operators import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
 from flasher.station.recipe import SerialNumber
 from flasher.station.recipe_file import LoadedRecipe

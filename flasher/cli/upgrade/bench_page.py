@@ -32,7 +32,7 @@ from flasher.cli.options import Bus, holder
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, recording
 from flasher.cli.stop import Stop, stop_on_signal
-from flasher.cli.upgrade.carried import Carried
+from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
@@ -44,16 +44,16 @@ from flasher.protocol.text import printable
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
-from flasher.web.answers import AnswerProcesses, answer_routes
+from flasher.web.archive import PAGES as KEPT
+from flasher.web.archive import Archive
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
-from flasher.web.bench_state import Adapter, Doing, Saved
+from flasher.web.bench_state import Activity, Adapter, Saved
 from flasher.web.guard import BODY_MAX, Entry, application
-from flasher.web.kept import PAGES as KEPT
-from flasher.web.kept import Kept
 from flasher.web.pages import Pages
+from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server
-from flasher.web.virtual_bike import NOTES, Fault, VirtualBike
+from flasher.web.virtual_bike import NOTES, BikeFault, VirtualBike
 
 _TURN_S: Final = 0.2
 _MEMORY_MAX: Final = 4096
@@ -172,7 +172,7 @@ class _Place:
         *,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.Carried:
+    ) -> bench.UpgradeEnding:
         output = self._output
 
         @contextmanager
@@ -187,14 +187,14 @@ class _Place:
             told = self._told(adapter, job, on_event)
             yield {"on_event": told, "cancelled": cancelled, "hung_up": hung_up}
 
-        carried = Carried(job, self.bus(adapter), RecordingOptions(), output)
+        upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
         result = None
         try:
-            result = carried.write_planned(lambda: self.connect(adapter), watching)
+            result = upgrade_run.write_planned(lambda: self.connect(adapter), watching)
         except FlasherError as error:
-            carried.error = error
-        bundle = None if carried.record is None else carried.record.bundle
-        return bench.Carried(result, carried.error, bundle, carried.warning)
+            upgrade_run.error = error
+        bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
+        return bench.UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
 
     def _told(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
@@ -271,13 +271,15 @@ class VirtualBikes(_Place):
     _bikes: dict[str, VirtualBike] = field(default_factory=dict)
 
     def adapters(self, _cancelled: Callable[[], bool]) -> Sequence[Adapter]:
-        return [Adapter(fault.value, NOTES[fault]) for fault in Fault]
+        return [Adapter(fault.value, NOTES[fault]) for fault in BikeFault]
 
     def use(self, adapter: Adapter) -> None:
         """A bike stays as it was left, so that it can be rescued."""
         if adapter.name not in self._bikes:
             speed = self._bus.mock_speed
-            self._bikes[adapter.name] = VirtualBike(Fault(adapter.name), self.dialect, speed=speed)
+            self._bikes[adapter.name] = VirtualBike(
+                BikeFault(adapter.name), self.dialect, speed=speed
+            )
 
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
@@ -289,7 +291,7 @@ class VirtualBikes(_Place):
         *,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.Carried:
+    ) -> bench.UpgradeEnding:
         """What is wrong with a bike is shown, and not waited for until the overall deadline."""
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
@@ -323,7 +325,7 @@ def serve(
     ):
         memory = Memory()
         shelf = Shelf(_folder(images, memory), Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
-        answering = AnswerProcesses(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
+        answering = QueryProcesses(partial(Archive, bundle_folder(), backup_folder(), shelf.traces))
         stack.callback(answering.close)
         kind = VirtualBikes if bus.mock else Adapters
         machine = Bench(kind(bus, output, shelf, stop, memory), time.perf_counter)
@@ -372,7 +374,7 @@ def _wait(machine: Bench, worker: threading.Thread, stop: Stop) -> bool:
     was_upgrading = False
     while worker.is_alive():
         if stop():
-            was_upgrading |= machine.state.doing is Doing.UPGRADING
+            was_upgrading |= machine.state.doing is Activity.UPGRADING
             machine.close(ends_upgrade=stop.asked())
         worker.join(_TURN_S)
     return was_upgrading

@@ -28,9 +28,9 @@ from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.upgrade import text
-from flasher.cli.upgrade.carried import Carried
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
+from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import (
@@ -312,13 +312,13 @@ class _Upgrade:
         output = self.output
         ctx = click.get_current_context()
         again = shlex.join(["flasher", *rebuild_command_line(ctx, str(ctx.info_name))])
-        carried = Carried(job, self.bus, self.recorded, output, self._add_repair, again)
-        result = carried.write_planned(
+        upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
+        result = upgrade_run.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
-            lambda connection, record: self._watching(carried.job, connection, record),
+            lambda connection, record: self._watching(upgrade_run.job, connection, record),
         )
         # The bundle is told of before the error, so that the verdict stands at the end.
-        error, document = carried.error, carried.document
+        error, document = upgrade_run.error, upgrade_run.document
         show = output.result if error is None else output.progress
         if result.outcome.ok:
             for line in text.summary_lines(result, job.plan):
@@ -328,7 +328,7 @@ class _Upgrade:
                 output.progress(line, level=1)
             if document.link.unreadable:
                 output.error_line(f"warning: {text.unreadable_line(document.link.unreadable)}")
-        verdict = text.verdict_of(result, carried.checks, carried.took_s)
+        verdict = text.verdict_of(result, upgrade_run.checks, upgrade_run.took_s)
         if error is None:
             output.verdict(verdict)
             output.document(document, exit_code=result.exit_code)

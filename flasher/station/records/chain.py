@@ -16,7 +16,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, Table, select
 
 from flasher.station.records import schema
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import AuditEvent, utc_text
 from flasher.station.records.rows import beside_index, grouped, named
 from flasher.station.records.schema import audit, station
@@ -62,7 +62,7 @@ class Trail:
         self.connection = connection
         self.station = station_name
         self.key = key
-        self.heads: list[Head] = []
+        self.heads: list[ChainHead] = []
         """The rows that were added here."""
 
     def append(
@@ -90,7 +90,7 @@ class Trail:
         self.connection.execute(
             audit.insert().values(**row, station_id=station_id, hash=found, signature=signature)
         )
-        head = Head(self.station, number, row["at"], found, signature, self.key.public)
+        head = ChainHead(self.station, number, row["at"], found, signature, self.key.public)
         self.heads.append(head)
 
     def begin(self, now: datetime, records_id: str) -> None:
@@ -161,7 +161,7 @@ def without_run(connection: Connection, station_name: str, events: Iterable[str]
     return sorted(found, key=lambda row: row.number)
 
 
-def head_of(connection: Connection, run_id: int) -> Head | None:
+def head_of(connection: Connection, run_id: int) -> ChainHead | None:
     """The row that vouches for a finished run, as a head; None where there is none."""
     row = connection.execute(
         select(audit, station.c.name)
@@ -173,7 +173,7 @@ def head_of(connection: Connection, run_id: int) -> Head | None:
     if row is None:
         return None
     key = key_in_force(connection, row.name, row.number)
-    return Head(row.name, row.number, row.at, row.hash, row.signature, key or "")
+    return ChainHead(row.name, row.number, row.at, row.hash, row.signature, key or "")
 
 
 def given_up(connection: Connection, station_name: str) -> list[range]:

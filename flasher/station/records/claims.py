@@ -31,7 +31,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.rows import insert, named
 from flasher.station.records.schema import recipe, run, socket, station, unit
-from flasher.station.tally import shift_began
+from flasher.station.shift_counts import shift_began
 
 CLOCK_TOLERANCE: Final = timedelta(minutes=5)
 """Network time may set the clock back a little."""

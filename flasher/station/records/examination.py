@@ -19,8 +19,8 @@ from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.examined import Examined, ExaminedChain
 from flasher.station.records.files import FileStore
-from flasher.station.records.heads import Checkpoint, Fault, Head
-from flasher.station.records.keys import Keeping
+from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
@@ -103,7 +103,7 @@ class _Kept:
 
     place: Place
     is_elsewhere: bool
-    lasts: Mapping[str, Head]
+    lasts: Mapping[str, ChainHead]
     """The last head of each station."""
 
 
@@ -114,7 +114,7 @@ class Examiner:
         self,
         database: Database,
         files: FileStore,
-        keeping: Keeping,
+        keeping: KeyLocations,
         progress: Progress = lambda _done, _total: None,
         since: Examined | None = None,
     ) -> None:
@@ -246,7 +246,7 @@ class Examiner:
         `is_all`. Raises RecordError, UsageError for the one beside the key.
         """
 
-        def lasts(place: Place) -> dict[str, Head]:
+        def lasts(place: Place) -> dict[str, ChainHead]:
             others = place.stations(records_id) if is_all else ()
             every = dict.fromkeys([*names, *others])
             found = {name: place.of(name, records_id).last() for name in every}
@@ -274,10 +274,10 @@ class Examiner:
                 yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
             return
         first, end = trail.first.get(place, 0), 0
-        wrong: list[tuple[int, Head]] = []
+        wrong: list[tuple[int, ChainHead]] = []
         heads = each.place.of(trail.station, records_id)
         # Of the rows that were examined before, the last one vouches for all before it.
-        begin = last if first else next(e for e in heads.entries() if isinstance(e, Head))
+        begin = last if first else next(e for e in heads.entries() if isinstance(e, ChainHead))
         for head in (begin, last):
             if head.number <= trail.begin:
                 if chain.hash_at(connection, trail.station, head.number) == head.hash:
@@ -288,7 +288,7 @@ class Examiner:
         is_younger = False
         """True after the last head that was there before the records were read."""
         for index, entry in enumerate(heads.entries(after=trail.begin)):
-            if not isinstance(entry, Head):
+            if not isinstance(entry, ChainHead):
                 yield from _segment_wrong(trail, place, entry)
             elif trail.hash_of(entry.number) == entry.hash:
                 first, end = first or entry.number, max(end, entry.number)
@@ -675,9 +675,9 @@ def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
     return found
 
 
-def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | Fault) -> Iterator[Problem]:
+def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
     shown = printable(trail.station)
-    if isinstance(entry, Fault):
+    if isinstance(entry, HeadsFault):
         yield Problem(f"heads of {shown}, {entry.where}", entry.what)
     elif entry.key not in trail.keys:
         where = f"heads of {shown}, segment {entry.segment} in {place}"
@@ -685,8 +685,8 @@ def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | Fault) -> Iter
 
 
 def _not_given_up(
-    trail: _Trail, wrong: list[tuple[int, Head]], given_up_at: Mapping[int, int]
-) -> list[Head]:
+    trail: _Trail, wrong: list[tuple[int, ChainHead]], given_up_at: Mapping[int, int]
+) -> list[ChainHead]:
     """The heads without those that a person gave up, when older records were put back."""
     return [
         head
@@ -698,7 +698,7 @@ def _not_given_up(
     ]
 
 
-def _differences(trail: _Trail, place: str, held: list[Head]) -> Iterator[Problem]:
+def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
     """What heads tell that are not those of the chain."""
     where = f"audit trail of {printable(trail.station)}"
     missing = [head for head in held if head.number > trail.end]

@@ -33,7 +33,7 @@ _NUMBER: Final = re.compile(r"[0-9]{6,}")
 
 
 @dataclass(frozen=True)
-class Head:
+class ChainHead:
     """The end of a station's chain at some moment, signed."""
 
     station: str
@@ -52,7 +52,7 @@ class Checkpoint:
 
     segment: int
     """From 1."""
-    head: Head
+    head: ChainHead
     """The last one in it."""
     sha256: str
     """Of all bytes of the segment before the checkpoint."""
@@ -63,7 +63,7 @@ class Checkpoint:
 
 
 @dataclass(frozen=True)
-class Fault:
+class HeadsFault:
     """What is wrong with kept heads, and where."""
 
     where: str
@@ -89,7 +89,7 @@ class HeadsFile:
         self._last = 0
         """The last segment that was seen."""
 
-    def append(self, heads: Iterable[Head], key: SigningKey) -> None:
+    def append(self, heads: Iterable[ChainHead], key: SigningKey) -> None:
         """Add a line for each; on disk when this returns. The key signs the checkpoint of a segment
         that is full. Raises RecordError.
         """
@@ -109,7 +109,7 @@ class HeadsFile:
             _write(self._segment(number), lines)
             self._last = number
 
-    def last(self) -> Head | None:
+    def last(self) -> ChainHead | None:
         """The head that was kept last; None without any. Raises RecordError, UsageError for what is
         no file.
         """
@@ -119,11 +119,11 @@ class HeadsFile:
                 return found.head if isinstance(found, Checkpoint) else found
         return None
 
-    def first(self) -> Head | None:
+    def first(self) -> ChainHead | None:
         """The head that was kept first. Raises as `last`."""
-        return next((each for each in self.entries() if isinstance(each, Head)), None)
+        return next((each for each in self.entries() if isinstance(each, ChainHead)), None)
 
-    def entries(self, after: int = 0) -> Iterator[Head | Checkpoint | Fault]:
+    def entries(self, after: int = 0) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
         """What is kept, in the order in which it was; closed segments up to the audit row `after`
         are left out. Half a line at the end, which a station may be writing, is left out too.
         Raises as `last`.
@@ -134,7 +134,7 @@ class HeadsFile:
             is_closed = number < last
             if not self._segment(number).exists():
                 if is_closed or number > 1:
-                    yield Fault(self._shown(number), "it is missing")
+                    yield HeadsFault(self._shown(number), "it is missing")
                 continue
             if is_closed and after:
                 end = self._last_entry(number)
@@ -146,7 +146,7 @@ class HeadsFile:
                     previous = _hash_of(_checkpoint_line(entry))
                 yield entry
 
-    def of_row(self, number: int) -> tuple[Head, ...]:
+    def of_row(self, number: int) -> tuple[ChainHead, ...]:
         """The heads of one audit row: several where older records were put back. Reads one segment,
         found by the checkpoints with which they begin. Raises as `last`.
         """
@@ -155,17 +155,17 @@ class HeadsFile:
         lines = self._lines(Position(max(at, 1)), is_one=True)
         named = f'"number": {number},'.encode("ascii")  # thousands of others are not parsed
         some = (_parsed(line) for _, line in lines if named in line)
-        heads = (entry for entry in some if isinstance(entry, Head))
+        heads = (entry for entry in some if isinstance(entry, ChainHead))
         return tuple(head for head in heads if head.number == number)
 
-    def since(self, position: Position) -> Iterator[tuple[Head, Position]]:
+    def since(self, position: Position) -> Iterator[tuple[ChainHead, Position]]:
         """The heads from a position on, each with the position after it. Raises as `last`."""
         for after, line in self._lines(position):
             entry = _parsed(line)
-            if isinstance(entry, Head):
+            if isinstance(entry, ChainHead):
                 yield entry, after
 
-    def position_after(self, head: Head) -> Position | None:
+    def position_after(self, head: ChainHead) -> Position | None:
         """The position after a head, looked for from the end on; None where it is not kept. Raises
         as `last`.
         """
@@ -222,7 +222,7 @@ class HeadsFile:
         entry = _parsed(line)
         return entry.head.number if isinstance(entry, Checkpoint) else 0
 
-    def _last_entry(self, number: int) -> Head | Checkpoint | None:
+    def _last_entry(self, number: int) -> ChainHead | Checkpoint | None:
         path = self._segment(number)
         if not path.exists():
             return None
@@ -240,32 +240,34 @@ class HeadsFile:
 
     def _checked(
         self, number: int, previous: str, *, is_closed: bool
-    ) -> Iterator[Head | Checkpoint | Fault]:
+    ) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
         """What a segment holds, and what is wrong with it."""
         digest, last, entry, is_first = hashlib.sha256(), None, None, True
         where = self._shown(number)
         for count, (_, line) in enumerate(self._lines(Position(number), is_one=True), 1):
             entry = _parsed(line)
             if entry is None:
-                yield Fault(where, f"line {count} is no head")
+                yield HeadsFault(where, f"line {count} is no head")
             elif is_first and number > 1:
                 is_first = False
                 if _hash_of(line.decode("ascii", "replace")) != previous:
-                    yield Fault(where, "it does not begin with the checkpoint of the one before it")
-                if isinstance(entry, Head):
+                    yield HeadsFault(
+                        where, "it does not begin with the checkpoint of the one before it"
+                    )
+                if isinstance(entry, ChainHead):
                     yield entry
-            elif isinstance(entry, Head):
+            elif isinstance(entry, ChainHead):
                 last = entry
                 yield entry
             else:
                 stated = (entry.segment, entry.head, entry.sha256, entry.previous)
                 found = (number, last, digest.hexdigest(), previous)
                 if stated != found or not _is_whole(entry):
-                    yield Fault(where, "it was changed after it was closed")
+                    yield HeadsFault(where, "it was changed after it was closed")
                 yield entry
             digest.update(line + b"\n")
         if is_closed and not isinstance(entry, Checkpoint):
-            yield Fault(where, "its end is missing")
+            yield HeadsFault(where, "its end is missing")
 
     def _lines(
         self, position: Position, *, is_one: bool = False
@@ -310,7 +312,7 @@ def _write(path: Path, lines: list[str]) -> None:
         sync_folder(path.parent)
 
 
-def _parsed(line: bytes) -> Head | Checkpoint | None:
+def _parsed(line: bytes) -> ChainHead | Checkpoint | None:
     """What a line holds; None for anything else."""
     try:
         found = parse_json(line)
@@ -322,15 +324,15 @@ def _parsed(line: bytes) -> Head | Checkpoint | None:
         return None
 
 
-def _head(found: Any) -> Head:
+def _head(found: Any) -> ChainHead:
     """Raises TypeError, ValueError."""
-    head = Head(**found)
+    head = ChainHead(**found)
     if type(head.number) is not int:
         raise ValueError("the number of a head is no number")
     return head
 
 
-def _body(number: int, head: Head, sha256: str, previous: str, public: str) -> dict[str, Any]:
+def _body(number: int, head: ChainHead, sha256: str, previous: str, public: str) -> dict[str, Any]:
     found = asdict(Checkpoint(number, head, sha256, previous, public, ""))
     del found["signature"]
     return found

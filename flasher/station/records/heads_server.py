@@ -26,7 +26,7 @@ from sqlalchemy import (
 
 from flasher.station.records.database import Location
 from flasher.station.records.errors import mapped
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.server import make_engine
 from flasher.station.records.signatures import SigningKey
 
@@ -46,7 +46,7 @@ kept_head: Final = Table(
     Index("kept_head_of_row", "records_id", "station", "number"),
     Index("kept_head_last", "records_id", "station", "id"),
 )
-_HEAD: Final = [kept_head.c[name] for name in Head.__dataclass_fields__]
+_HEAD: Final = [kept_head.c[name] for name in ChainHead.__dataclass_fields__]
 _RULES: Final = """\
 CREATE FUNCTION kept_head_stays() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN RAISE EXCEPTION 'kept heads are neither changed nor deleted'; END $$;
@@ -96,7 +96,7 @@ class ServerHeads:
         self._place = place
         self._own = {"station": station, "records_id": records_id}
 
-    def append(self, heads: Iterable[Head], _key: SigningKey) -> None:
+    def append(self, heads: Iterable[ChainHead], _key: SigningKey) -> None:
         """Add heads; the table is made when it is not there. Raises RecordError."""
         with self._place.connected(writes=True) as connection:
             if not _is_there(connection):
@@ -107,29 +107,29 @@ class ServerHeads:
                     connection.exec_driver_sql(_RULES)
             connection.execute(kept_head.insert(), [asdict(head) | self._own for head in heads])
 
-    def last(self) -> Head | None:
+    def last(self) -> ChainHead | None:
         query = self._query().order_by(kept_head.c.id.desc()).limit(1)
         return next(iter(self._heads(query)), None)
 
-    def entries(self, after: int = 0) -> Iterator[Head]:
+    def entries(self, after: int = 0) -> Iterator[ChainHead]:
         query = self._query().where(kept_head.c.number > after).order_by(kept_head.c.id)
         with self._place.connected() as connection:
             if _is_there(connection):
                 with connection.execute(query.execution_options(yield_per=1000)) as result:
                     for row in result.mappings():
-                        yield Head(**row)
+                        yield ChainHead(**row)
 
-    def of_row(self, number: int) -> tuple[Head, ...]:
+    def of_row(self, number: int) -> tuple[ChainHead, ...]:
         return tuple(self._heads(self._query().where(kept_head.c.number == number)))
 
     def _query(self) -> Select[Any]:
         return select(*_HEAD).filter_by(**self._own)
 
-    def _heads(self, query: Select[Any]) -> list[Head]:
+    def _heads(self, query: Select[Any]) -> list[ChainHead]:
         with self._place.connected() as connection:
             if not _is_there(connection):
                 return []
-            return [Head(**row) for row in connection.execute(query).mappings()]
+            return [ChainHead(**row) for row in connection.execute(query).mappings()]
 
 
 def _is_there(connection: Connection) -> bool:

@@ -21,7 +21,7 @@ from flasher.station.records.places import FolderPlace, Place, file_name, place_
 
 
 @dataclass(frozen=True)
-class Keeping:
+class KeyLocations:
     """Where the signing key of a station is kept (None: the place of this user), and in which other
     places than beside it the heads of its chain: folders, and URLs of PostgreSQL servers.
     """
@@ -29,9 +29,9 @@ class Keeping:
     keys: Path | None = None
     heads: tuple[str, ...] = ()
 
-    def __reduce__(self) -> tuple[type[Keeping], tuple[Path | None, tuple[str, ...]]]:
+    def __reduce__(self) -> tuple[type[KeyLocations], tuple[Path | None, tuple[str, ...]]]:
         """Sent to another process without the connections of this one."""
-        return Keeping, (self.keys, self.heads)
+        return KeyLocations, (self.keys, self.heads)
 
     @property
     def keys_folder(self) -> Path:

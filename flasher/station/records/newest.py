@@ -27,7 +27,7 @@ _SHORT: Final = 20_000
 
 
 @dataclass(frozen=True)
-class Cut:
+class PageCursor:
     """Where a page begins: below or above the row with an id; neither: the newest rows."""
 
     before: int | None = None
@@ -42,7 +42,7 @@ class Cut:
         return query.order_by(row_id.desc())
 
 
-def newest_runs(connection: Connection, chosen: RunFilter, cut: Cut, size: int) -> list[int]:
+def newest_runs(connection: Connection, chosen: RunFilter, cut: PageCursor, size: int) -> list[int]:
     """The ids of at most `size` runs of a filter, those next to the cut first."""
     run, run_id = schema.run.c, schema.run.c.id
     conditions: list[ColumnElement[bool]] = []

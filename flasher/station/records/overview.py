@@ -34,7 +34,7 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.newest import Cut, newest_runs
+from flasher.station.records.newest import PageCursor, newest_runs
 from flasher.station.records.queries import VERIFIED, details_of, run_query
 from flasher.station.records.rollup import (
     ALL_SPANS,
@@ -64,8 +64,8 @@ class Page(Generic[_Row]):
     """
 
     rows: tuple[_Row, ...]
-    older: Cut | None
-    newer: Cut | None
+    older: PageCursor | None
+    newer: PageCursor | None
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ImageRecord:
 
 
 @dataclass(frozen=True)
-class Holder:
+class InstalledUnit:
     """A unit whose last transfer to the target was that of an image."""
 
     serial: str
@@ -148,7 +148,7 @@ class AuditRow:
 
 _ROWS: Final = TypeAdapter(tuple[dict[str, Any], ...])
 _RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
-_HOLDERS: Final = TypeAdapter(tuple[Holder, ...])
+_HOLDERS: Final = TypeAdapter(tuple[InstalledUnit, ...])
 _AUDIT: Final = TypeAdapter(tuple[AuditRow, ...])
 
 
@@ -159,7 +159,7 @@ class Overview:
         self._database = database
         self._rollup = Rollup(database)
 
-    def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
+    def runs(self, chosen: RunFilter, cut: PageCursor, size: int = PAGE_SIZE) -> Page[RunRecord]:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             found = newest_runs(connection, chosen, cut, size + 1)
@@ -167,7 +167,7 @@ class Overview:
         # What no station writes is shown nowhere else: reports and `verify` name it.
         return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cut, size)
 
-    def rows(self, chosen: RunFilter, cut: Cut, size: int) -> Page[dict[str, Any]]:
+    def rows(self, chosen: RunFilter, cut: PageCursor, size: int) -> Page[dict[str, Any]]:
         """The same as a report has them (`Records.table`)."""
         with self._database.reading() as connection:
             found = newest_runs(connection, chosen, cut, size + 1)
@@ -180,7 +180,9 @@ class Overview:
         with self._database.reading() as connection:
             return tuple(connection.execute(query).scalars())
 
-    def life(self, serial: str, part: str, cut: Cut, size: int = LIFE_SIZE) -> Page[RunDetails]:
+    def life(
+        self, serial: str, part: str, cut: PageCursor, size: int = LIFE_SIZE
+    ) -> Page[RunDetails]:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             last = newest_runs(connection, RunFilter(serial=serial, part=part), cut, size + 1)
@@ -204,7 +206,7 @@ class Overview:
         """When the last run of a filter began; None without runs."""
         run = schema.run.c
         with self._database.reading() as connection:
-            last = newest_runs(connection, chosen, Cut(), 1)
+            last = newest_runs(connection, chosen, PageCursor(), 1)
             query = select(run.begun_at).where(run.id.in_(last))
             found = connection.execute(query).scalar_one_or_none()
         return None if found is None else utc_moment(found)
@@ -237,7 +239,7 @@ class Overview:
         with self._database.reading() as connection:
             return tuple(ImageRecord(**row) for row in connection.execute(query).mappings())
 
-    def holders(self, sha256: str, cut: Cut, size: int = PAGE_SIZE) -> Page[Holder]:
+    def holders(self, sha256: str, cut: PageCursor, size: int = PAGE_SIZE) -> Page[InstalledUnit]:
         """A page of the units whose last transfer was that of the image with this hash."""
         query = _holders(self._artifacts(sha256))
         return self._page(_HOLDERS, query, schema.run_target.c.id, cut, size)
@@ -361,7 +363,7 @@ class Overview:
 
     def audit(
         self,
-        cut: Cut,
+        cut: PageCursor,
         *,
         event: str | None = None,
         since: datetime | None = None,
@@ -395,7 +397,7 @@ class Overview:
         rows_of: TypeAdapter[tuple[_Row, ...]],
         query: Select[Any],
         row_id: Any,
-        cut: Cut,
+        cut: PageCursor,
         size: int,
     ) -> Page[_Row]:
         query = cut.of(query.add_columns(row_id.label("cut_id")), row_id)
@@ -410,8 +412,8 @@ class Overview:
             has_older, has_newer = True, has_more
         return Page(
             rows_of.validate_python(rows),
-            Cut(before=ids[-1]) if ids and has_older else None,
-            Cut(after=ids[0]) if ids and has_newer else None,
+            PageCursor(before=ids[-1]) if ids and has_older else None,
+            PageCursor(after=ids[0]) if ids and has_newer else None,
         )
 
 

@@ -15,7 +15,7 @@ from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records.database import Location, locate
 from flasher.station.records.errors import RecordError
-from flasher.station.records.heads import Checkpoint, Fault, Head, HeadsFile, Position
+from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
 
 RETRY_S: Final = 10.0
@@ -32,13 +32,13 @@ _Found = TypeVar("_Found")
 class Heads(Protocol):
     """The heads of one station that a place keeps."""
 
-    def append(self, heads: Iterable[Head], key: SigningKey) -> None: ...
+    def append(self, heads: Iterable[ChainHead], key: SigningKey) -> None: ...
 
-    def last(self) -> Head | None: ...
+    def last(self) -> ChainHead | None: ...
 
-    def entries(self, after: int = 0) -> Iterator[Head | Checkpoint | Fault]: ...
+    def entries(self, after: int = 0) -> Iterator[ChainHead | Checkpoint | HeadsFault]: ...
 
-    def of_row(self, number: int) -> tuple[Head, ...]: ...
+    def of_row(self, number: int) -> tuple[ChainHead, ...]: ...
 
 
 class Place(Protocol):
@@ -208,7 +208,7 @@ class Copying:
     def _copy(self) -> None:
         if self._position is None:
             self._position = self._find()
-        some: list[Head] = []
+        some: list[ChainHead] = []
         for head, position in self._source.since(self._position):
             some.append(head)
             if len(some) == _SOME:
@@ -217,7 +217,7 @@ class Copying:
         if some:
             self._put(some, position)
 
-    def _put(self, some: list[Head], position: Position) -> None:
+    def _put(self, some: list[ChainHead], position: Position) -> None:
         self._target.append(some, self._key())
         self._position = position
         self._note_known()
@@ -249,7 +249,9 @@ class Copying:
         # After another head than the last one here: older records were put back, or the file
         # beside the key began later than this place.
         old = last.number - _RECENT
-        recent = {each.hash for each in self._target.entries(max(old, 0)) if isinstance(each, Head)}
+        recent = {
+            each.hash for each in self._target.entries(max(old, 0)) if isinstance(each, ChainHead)
+        }
         found = Position()
         for head, position in self._source.since(found):
             if head.hash in recent or head.number <= old:
@@ -259,7 +261,7 @@ class Copying:
 
 def lasts(
     places: Sequence[Place], station: str, records_id: str
-) -> list[tuple[Place, Head | FlasherError | None]]:
+) -> list[tuple[Place, ChainHead | FlasherError | None]]:
     """The head that each place has last, or why it does not say."""
 
     def asked(place: Place) -> Callable[[], Any]:

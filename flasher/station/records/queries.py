@@ -15,7 +15,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError
 from flasher.station.records.filters import JUDGED, counting, filtered
-from flasher.station.records.heads import Head
+from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     Figures,
     ReportedRun,
@@ -147,7 +147,7 @@ class Records:
             query = select(schema.station.c.name).order_by(schema.station.c.id)
             return tuple(connection.execute(query).scalars())
 
-    def head_of(self, run_id: RunId) -> Head | None:
+    def head_of(self, run_id: RunId) -> ChainHead | None:
         """The signed audit row that vouches for a finished run; None where there is none."""
         with self._database.reading() as connection:
             return chain.head_of(connection, run_id)
@@ -167,7 +167,7 @@ class Records:
             content = chain.contents_of(connection, [run_id])[run_id]
             return content, chain.ending_of(connection, run_id)
 
-    def natures(self) -> frozenset[bool]:
+    def unit_kinds(self) -> frozenset[bool]:
         """Whose runs there are: True for virtual units, False for real ones."""
         is_virtual = schema.run.c.is_virtual
         with self._database.reading() as connection:

@@ -21,8 +21,8 @@ from flasher.station.records.errors import (
     RecordError,
     RecordsCutError,
 )
-from flasher.station.records.heads import Head, HeadsFile
-from flasher.station.records.keys import Keeping
+from flasher.station.records.heads import ChainHead, HeadsFile
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.places import Copying, Place, lasts
 from flasher.station.records.schema import schema_info
 from flasher.station.records.signatures import SigningKey, fingerprint
@@ -36,14 +36,14 @@ class Signer:
         database: Database,
         station: str,
         now: Callable[[], datetime],
-        keeping: Keeping,
+        keeping: KeyLocations,
     ) -> None:
         self._database = database
         self._station = station
         self._now = now
         self.keeping = keeping
         self._key: SigningKey | None = None
-        self._unkept: list[Head] = []
+        self._unkept: list[ChainHead] = []
         self._heads_lock = Lock()
         self.copies: list[Copying] = []
         """To the other places, while this process is the station."""
@@ -175,7 +175,7 @@ class Signer:
                 head.number
                 for place in kept
                 for head in place.of(self._station, self.records_id).entries()
-                if isinstance(head, Head)
+                if isinstance(head, ChainHead)
                 and chain.hash_at(connection, self._station, head.number) != head.hash
             ]
         self._load()
@@ -214,7 +214,7 @@ class Signer:
     def heads_file(self) -> HeadsFile:
         return self.keeping.heads_file(self._station, self.records_id)
 
-    def _lasts(self) -> Iterator[tuple[Place, Head]]:
+    def _lasts(self) -> Iterator[tuple[Place, ChainHead]]:
         """The head that each place has last, where it can be reached and has any. Raises
         RecordError, UsageError for the one beside the key.
         """
@@ -222,7 +222,7 @@ class Signer:
         if here is not None:
             yield self.keeping.beside_key, here
         for place, last in lasts(self.keeping.elsewhere, self._station, self.records_id):
-            if isinstance(last, Head):
+            if isinstance(last, ChainHead):
                 yield place, last
 
     def _copying(self, place: Place) -> Copying:
@@ -237,7 +237,7 @@ class Signer:
     def _following(self) -> Path:
         return self.key_file.with_suffix(".new")
 
-    def _is_missing(self, head: Head) -> bool:
+    def _is_missing(self, head: ChainHead) -> bool:
         """True for a head whose row is not in the records, and was not given up."""
         with self._database.reading() as connection:
             if chain.hash_at(connection, self._station, head.number) == head.hash:

@@ -48,7 +48,7 @@ from flasher.station.records.errors import (
 from flasher.station.records.examination import Examiner, Progress
 from flasher.station.records.examined import Examined, load_examined, save_examined
 from flasher.station.records.files import FileStore
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     DEFAULT_LOCK_TIMEOUT_S,
     OUTCOMES,
@@ -73,7 +73,7 @@ from flasher.station.records.rows import insert
 from flasher.station.records.signing import Signer
 from flasher.station.records.upgrade import upgrade
 
-_USUAL: Final = Keeping()
+_USUAL: Final = KeyLocations()
 _ONLY_FINITE = "a number that is no number cannot be recorded"
 
 
@@ -91,7 +91,7 @@ class Store:
     """The records. Open with `Store.open`; a context manager."""
 
     def __init__(
-        self, database: Database, station: str, clock: Clock, keeping: Keeping = _USUAL
+        self, database: Database, station: str, clock: Clock, keeping: KeyLocations = _USUAL
     ) -> None:
         self.database = database
         self.station = station
@@ -112,7 +112,7 @@ class Store:
         lock_timeout_s: float = DEFAULT_LOCK_TIMEOUT_S,
         create: bool = True,
         read_only: bool = False,
-        keeping: Keeping = _USUAL,
+        keeping: KeyLocations = _USUAL,
         told: Callable[[str], None] = lambda _text: None,
     ) -> Self:
         """The records at an SQLAlchemy URL, or in an SQLite file; made when they are not there and
@@ -357,7 +357,7 @@ class Store:
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), event.value, data, run_id)
 
-    # -- care -------------------------------------------------------------------------------------
+    # -- maintenance ------------------------------------------------------------------------------
 
     def backup(self, path: Path) -> Backup:
         """A consistent copy of the database while the station runs, checked, whole or not there;

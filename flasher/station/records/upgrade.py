@@ -37,7 +37,7 @@ from flasher.station.records.errors import (
     mapped,
 )
 from flasher.station.records.files import whole_file
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.roles import grant_again
 from flasher.station.records.signing import Signer
 from flasher.station.records.triggers import (
@@ -69,7 +69,7 @@ def upgrade(
     location: Location,
     *,
     choose: Callable[[tuple[str, ...]], str],
-    keeping: Keeping,
+    keeping: KeyLocations,
     now: Callable[[], datetime],
     lock_timeout_s: float,
 ) -> Upgraded:

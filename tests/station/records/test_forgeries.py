@@ -17,7 +17,7 @@ from sqlalchemy import create_engine
 from sqlalchemy.exc import DBAPIError
 
 from flasher.station.records.chain import canonical, row_hash
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Problem, RunId, RunState
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
@@ -111,7 +111,7 @@ def examined(
     forger = Forger(copy)
     forge(forger, folder)
     forger.put_back()
-    keeping = Keeping(folder / "keys")
+    keeping = KeyLocations(folder / "keys")
     files = plant.store.files.folder
     with Store.open(str(copy), station="x", folder=files, read_only=True, keeping=keeping) as store:
         return store.examine().problems
@@ -171,7 +171,7 @@ def test_a_changed_row_on_a_server_is_told(
     """Each in a transaction of its own, which is examined and then rolled back: that is quicker."""
     made = Bench(tmp_path, url=postgres.records())
     fill(made)
-    keeping, files = Keeping(made.keys), made.store.files
+    keeping, files = KeyLocations(made.keys), made.store.files
     engine = create_engine(postgres_url := str(made.url))
     refused = []
     with Store.open(
@@ -306,15 +306,15 @@ def test_wholly_new_records_are_told_where_the_heads_have_to_be(
     plant: Bench, tmp_path: Path
 ) -> None:
     new = str(tmp_path / "new.sqlite")
-    with Store.open(new, station="line-2", keeping=Keeping(tmp_path / "own")) as made:
+    with Store.open(new, station="line-2", keeping=KeyLocations(tmp_path / "own")) as made:
         made.recover()
-    keeping = Keeping(tmp_path / "none")
+    keeping = KeyLocations(tmp_path / "none")
     with Store.open(new, station="x", read_only=True, keeping=keeping) as store:
         found = store.examine()
         assert not found.problems
         assert found.unkept == ("line-2",)
         assert not found.is_checked_elsewhere
-    keeping = Keeping(tmp_path / "none", (str(plant.keys),))
+    keeping = KeyLocations(tmp_path / "none", (str(plant.keys),))
     with Store.open(new, station="x", read_only=True, keeping=keeping) as store:
         assert told(store.examine().problems, "heads of line-2", "none of these records is kept")
 

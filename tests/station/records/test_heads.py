@@ -11,7 +11,7 @@ import pytest
 from flasher import files
 from flasher.errors import FlasherError
 from flasher.station.records import heads as heads_module
-from flasher.station.records.heads import Checkpoint, Fault, Head, HeadsFile, Position
+from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
 from tests.loops import each
 from tests.station.factory import Bench
@@ -25,8 +25,8 @@ def key(tmp_path: Path) -> SigningKey:
     return SigningKey.make(tmp_path / "own.key")
 
 
-def head(number: int) -> Head:
-    return Head("line-2", number, "2026-05-17", f"{number:064x}", "s" * 88, "k" * 64)
+def head(number: int) -> ChainHead:
+    return ChainHead("line-2", number, "2026-05-17", f"{number:064x}", "s" * 88, "k" * 64)
 
 
 def kept(folder: Path, key: SigningKey, count: int = 30) -> HeadsFile:
@@ -43,14 +43,14 @@ def again(file: HeadsFile) -> HeadsFile:
 
 
 def heads_of(file: HeadsFile) -> list[int]:
-    return [each.number for each in file.entries() if isinstance(each, Head)]
+    return [each.number for each in file.entries() if isinstance(each, ChainHead)]
 
 
 def faults_of(file: HeadsFile) -> list[str]:
     return [
         f"{Path(each.where).name}: {each.what}"
         for each in file.entries()
-        if isinstance(each, Fault)
+        if isinstance(each, HeadsFault)
     ]
 
 
@@ -135,7 +135,7 @@ def test_the_heads_of_a_row_are_found_without_reading_all(tmp_path: Path, key: S
 
 def test_closed_segments_up_to_a_row_are_left_out(tmp_path: Path, key: SigningKey) -> None:
     found = [
-        each for each in again(kept(tmp_path, key)).entries(after=20) if isinstance(each, Head)
+        each for each in again(kept(tmp_path, key)).entries(after=20) if isinstance(each, ChainHead)
     ]
     assert 10 <= len(found) < 20
     assert found[-1] == head(30)

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import event
 
 from flasher.station.records.model import Order, RunFilter, RunState
-from flasher.station.records.newest import Cut
+from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import Overview
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
@@ -65,7 +65,7 @@ def work_of(bench: Bench, action: Callable[[Bench], object]) -> int:
 
 
 def runs(**chosen: Any) -> Callable[[Bench], object]:
-    return lambda bench: Overview(bench.store.database).runs(RunFilter(**chosen), Cut(), 10)
+    return lambda bench: Overview(bench.store.database).runs(RunFilter(**chosen), PageCursor(), 10)
 
 
 def claim(bench: Bench) -> None:
@@ -76,7 +76,7 @@ def claim(bench: Bench) -> None:
 
 
 def image_count(bench: Bench) -> int:
-    return len(Overview(bench.store.database).holders("2" * 64, Cut(), 10).rows)
+    return len(Overview(bench.store.database).holders("2" * 64, PageCursor(), 10).rows)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def image_count(bench: Bench) -> int:
     [
         pytest.param(claim, id="claim and end"),
         pytest.param(lambda bench: bench.store.signer.public, id="key"),
-        pytest.param(lambda bench: bench.store.read.natures(), id="natures"),
+        pytest.param(lambda bench: bench.store.read.unit_kinds(), id="natures"),
         pytest.param(
             lambda bench: bench.store.read.known("BAT-36", ["W0000007", "W0000008"]), id="numbers"
         ),
@@ -97,7 +97,8 @@ def image_count(bench: Bench) -> int:
         pytest.param(runs(serial="W0000007"), id="runs of a unit"),
         pytest.param(runs(until=FIRST_DAY), id="first runs"),
         pytest.param(
-            lambda bench: Overview(bench.store.database).audit(Cut(), event="begun"), id="audit"
+            lambda bench: Overview(bench.store.database).audit(PageCursor(), event="begun"),
+            id="audit",
         ),
         pytest.param(image_count, id="units with an image"),
         pytest.param(
@@ -120,7 +121,7 @@ def test_a_search_that_finds_many_and_one_that_finds_few_find_the_same_runs(
 
     overview = Overview(benches[0].store.database)
     for chosen in (RunFilter(search="w00000"), RunFilter(search="1", socket="B")):
-        for cut in (Cut(), Cut(before=200), Cut(after=100)):
+        for cut in (PageCursor(), PageCursor(before=200), PageCursor(after=100)):
             found = []
             for units_max in (0, 5000):
                 monkeypatch.setattr(newest, "_UNITS_MAX", units_max)
@@ -151,7 +152,7 @@ def test_every_filter_finds_what_a_report_finds(
         for short, lead in ((20_000, 50), (0, 50), (0, 0)):
             monkeypatch.setattr(newest, "_SHORT", short)
             monkeypatch.setattr(newest, "_LEAD_MAX", lead)
-            page = Overview(store.database).runs(chosen, Cut(), 10_000)
+            page = Overview(store.database).runs(chosen, PageCursor(), 10_000)
             assert [row.run_id for row in page.rows] == wanted
 
 

@@ -17,12 +17,12 @@ from sqlalchemy import Connection, create_engine, select, text
 
 from flasher.errors import UsageError
 from flasher.station.board import Board
-from flasher.station.health import Watch
+from flasher.station.health import HealthWatch
 from flasher.station.records import schema
 from flasher.station.records.chain import canonical, data_of, digests_of, row_hash
 from flasher.station.records.errors import RecordsCutError
-from flasher.station.records.heads import Head, HeadsFile
-from flasher.station.records.keys import Keeping
+from flasher.station.records.heads import ChainHead, HeadsFile
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Examination, Problem
 from flasher.station.records.places import patiently, place_of
 from flasher.station.records.schema import audit, run
@@ -67,7 +67,7 @@ def forging(bench: Bench) -> Iterator[Connection]:
     engine.dispose()
 
 
-def verified(bench: Bench, keeping: Keeping | None = None) -> Examination:
+def verified(bench: Bench, keeping: KeyLocations | None = None) -> Examination:
     bench.store.close()
     files = bench.store.files.folder
     with Store.open(
@@ -129,7 +129,9 @@ def make_anew(bench: Bench) -> None:
                 .where(audit.c.id == row["id"])
                 .values(**changes, hash=before, signature=signature)
             )
-            heads.append(Head("line-2", row["number"], row["at"], before, signature, key.public))
+            heads.append(
+                ChainHead("line-2", row["number"], row["at"], before, signature, key.public)
+            )
     kept = beside(bench)
     kept.unlink()
     HeadsFile(kept).append(heads, key)
@@ -155,7 +157,7 @@ def test_what_was_forged_with_the_heads_beside_the_key_is_reported_by_another_pl
     found = verified(line)
     assert told(found.problems, "audit trail of line-2", FORGERIES[forge])
     assert all(str(tmp_path / "share") in each.what for each in found.problems)
-    alone = verified(line, Keeping(line.keys))
+    alone = verified(line, KeyLocations(line.keys))
     assert not alone.problems  # nothing tells it there, and it does not claim to
     assert not alone.is_checked_elsewhere
     assert alone.unkept == ("line-2",)
@@ -223,7 +225,9 @@ def test_a_place_that_is_gone_stops_no_line_and_is_caught_up(tmp_path: Path) -> 
     (copying,) = bench.store.signer.copies
     assert copying.wait()
     assert copying.fault
-    watch = Watch(tmp_path, bench.clock.utc, bench.clock.monotonic_s, bench.store.signer.unkept)
+    watch = HealthWatch(
+        tmp_path, bench.clock.utc, bench.clock.monotonic_s, bench.store.signer.unkept
+    )
     (check,) = (each for each in watch.look(Board()) if each.name == "heads")
     assert str(share) in check.text
     found = verified(bench)
@@ -306,6 +310,6 @@ def test_a_place_that_does_not_answer_is_not_waited_for() -> None:
 
 
 def test_a_keeping_is_sent_to_another_process_without_its_connections(postgres: Server) -> None:
-    keeping = Keeping(heads=(postgres.url("postgres"),))
+    keeping = KeyLocations(heads=(postgres.url("postgres"),))
     assert keeping.elsewhere
     assert pickle.loads(pickle.dumps(keeping)) == keeping  # noqa: S301

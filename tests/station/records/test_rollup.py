@@ -21,7 +21,7 @@ from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.overview import By, Overview, Span
 from flasher.station.records.queries import Records
 from flasher.station.records.rollup import Rollup
-from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.supervisor import shifts_of, spans_of
 from tests.station.factory import Bench
 

@@ -23,7 +23,7 @@ from flasher.station.records.errors import (
     SchemaVersionError,
     StationBusyError,
 )
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import RunKind, RunState
 from flasher.station.records.store import Store
 from flasher.station.records.triggers import fingerprint_of
@@ -45,7 +45,7 @@ class Old:
 
     @property
     def place(self) -> dict[str, Any]:
-        return {"folder": self.files, "keeping": Keeping(self.folder / "keys")}
+        return {"folder": self.files, "keeping": KeyLocations(self.folder / "keys")}
 
     def open(self, station: str = "line-2", *, read_only: bool = False, **more: Any) -> Store:
         return Store.open(
@@ -57,7 +57,7 @@ class Old:
         return upgrade.upgrade(
             database.locate(self.url, self.files),
             choose=lambda _: station,
-            keeping=Keeping(self.folder / "keys"),
+            keeping=KeyLocations(self.folder / "keys"),
             now=FakeClock().utc,
             lock_timeout_s=0.5,
         )

@@ -18,8 +18,8 @@ from flasher.station.records.errors import (
     RecordsCutError,
     Refusal,
 )
-from flasher.station.records.heads import Fault, HeadsFile
-from flasher.station.records.keys import Keeping
+from flasher.station.records.heads import HeadsFault, HeadsFile
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import TORN_TRACE, TRACE, RunId
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
@@ -231,7 +231,7 @@ def test_reading_changes_no_byte_and_a_report_of_a_backup_leaves_nothing_beside_
     copy.parent.mkdir()
     bench.store.backup(copy)
     before = {path: path.read_bytes() for path in copy.parent.rglob("*") if path.is_file()}
-    keeping = Keeping(bench.keys)
+    keeping = KeyLocations(bench.keys)
     with Store.open(str(copy), station="x", read_only=True, keeping=keeping) as store:
         assert not store.examine().problems
         assert store.read.unit(SERIAL).last
@@ -248,7 +248,7 @@ def test_records_on_media_that_nobody_can_write_are_read(
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
     monkeypatch.setattr(os, "access", lambda *_: False)
     with Store.open(
-        str(bench.path), station="x", read_only=True, keeping=Keeping(bench.keys)
+        str(bench.path), station="x", read_only=True, keeping=KeyLocations(bench.keys)
     ) as store:
         assert not store.examine().problems
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
@@ -265,7 +265,7 @@ def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: 
 def test_a_line_without_end_in_the_heads_is_told_by_its_number(tmp_path: Path) -> None:
     (tmp_path / "heads").write_bytes(b"[" * 100_000 + b"\n{}\n")
     found = HeadsFile(tmp_path / "heads").entries()
-    assert [each.what for each in found if isinstance(each, Fault)] == [
+    assert [each.what for each in found if isinstance(each, HeadsFault)] == [
         "line 1 is no head",
         "line 2 is no head",
     ]

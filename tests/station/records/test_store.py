@@ -28,7 +28,7 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
-from flasher.station.tally import shift_began
+from flasher.station.shift_counts import shift_began
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
 
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
@@ -340,7 +340,7 @@ def test_a_serial_number_is_never_that_of_a_real_and_a_virtual_unit(bench: Bench
     with pytest.raises(ClaimRefusedError, match="is a virtual unit") as caught:
         bench.claim()
     assert caught.value.refusal is Refusal.OTHER_NATURE
-    assert bench.store.read.natures() == {True}
+    assert bench.store.read.unit_kinds() == {True}
 
 
 def test_a_virtual_golden_unit_proves_nothing_about_real_sockets(bench: Bench) -> None:

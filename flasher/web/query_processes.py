@@ -1,7 +1,6 @@
-"""Answers questions to the records in processes of their own, so that a page takes no time from the
-station that serves it.
+"""Processes that query the records for pages, so that the station that serves them loses no time.
 
-A question and its answer are plain data. The processes begin with the first question.
+Questions and answers are plain data. The processes start with the first question.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class Answering(Protocol):
 Ask = Callable[[Question], Awaitable[Answer]]
 
 
-class AnswerProcesses:
+class QueryProcesses:
     """Processes that answer. `make` makes who answers in each of them; it and what it makes of are
     sent there. `close` ends them.
     """

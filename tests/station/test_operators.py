@@ -26,7 +26,7 @@ from flasher.station.events import (
 )
 from flasher.station.line import CheckPin
 from flasher.station.messages import Abort
-from flasher.station.people import (
+from flasher.station.operators import (
     HIDDEN,
     PIN_LIMIT_S,
     Crew,

@@ -11,34 +11,34 @@ import pytest
 from flasher.history import FlashHistory, Reached
 from flasher.trace.bundle import write_bundle
 from flasher.trace.taps import FlightRecorder
-from flasher.web.answers import Answer, Question
-from flasher.web.kept import Kept
+from flasher.web.archive import Archive
+from flasher.web.query_processes import Answer, Question
 from tests.cli.test_history import BEGAN
 
 
 @pytest.fixture
-def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kept:
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Archive:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     facts = {"target": "bms", "error": {"what": "The <b>bus</b> broke.", "exit_code": 4}}
     write_bundle(tmp_path / "bundles", FlightRecorder(), facts)
     for folder, name in (("backups", "bms-1.zip"), ("backups", "else.txt"), ("traces", "a.log")):
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / name).write_bytes(b"(1.0) can0 725#00\n")
-    return Kept(tmp_path / "bundles", tmp_path / "backups", tmp_path / "traces")
+    return Archive(tmp_path / "bundles", tmp_path / "backups", tmp_path / "traces")
 
 
-def _asked(kept: Kept, path: str, **fields: str) -> Answer:
+def _asked(kept: Archive, path: str, **fields: str) -> Answer:
     return kept.answer(Question(path, fields))
 
 
-def test_it_lists_bundles_with_their_reason_and_backups(kept: Kept) -> None:
+def test_it_lists_bundles_with_their_reason_and_backups(kept: Archive) -> None:
     page = _asked(kept, "/kept").body.decode()
     assert "The &lt;b&gt;bus&lt;/b&gt; broke." in page
     assert "bms-1.zip" in page
     assert "else.txt" not in page
 
 
-def test_a_bundle_whose_report_is_damaged_is_listed_with_that(kept: Kept) -> None:
+def test_a_bundle_whose_report_is_damaged_is_listed_with_that(kept: Archive) -> None:
     (bundle,) = kept.bundles.iterdir()
     (bundle / "report.json").write_text("[")
     assert "is no report of a bundle" in _asked(kept, "/kept").body.decode()
@@ -46,10 +46,10 @@ def test_a_bundle_whose_report_is_damaged_is_listed_with_that(kept: Kept) -> Non
 
 def test_nothing_kept_yet_is_said(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
-    assert _asked(Kept(missing, missing, missing), "/kept").status == 200
+    assert _asked(Archive(missing, missing, missing), "/kept").status == 200
 
 
-def test_a_bundle_is_one_file(kept: Kept) -> None:
+def test_a_bundle_is_one_file(kept: Archive) -> None:
     (bundle,) = kept.bundles.iterdir()
     answer = _asked(kept, "/kept/bundle", name=bundle.name)
     assert answer.file_name == f"{bundle.name}.zip"
@@ -68,14 +68,14 @@ def test_a_bundle_is_one_file(kept: Kept) -> None:
 )
 @pytest.mark.parametrize("name", ["../backups/bms-1.zip", "/etc/passwd", "..", "", "no.zip"])
 def test_nothing_but_what_is_listed_is_given_out(
-    kept: Kept, path: str, field: str, name: str
+    kept: Archive, path: str, field: str, name: str
 ) -> None:
     answer = _asked(kept, path, **{field: name})
     assert answer.status == 400
     assert "is not there any more" in answer.body.decode()
 
 
-def test_a_story_names_the_file_and_not_where_it_was_put(kept: Kept, tmp_path: Path) -> None:
+def test_a_story_names_the_file_and_not_where_it_was_put(kept: Archive, tmp_path: Path) -> None:
     page = _asked(kept, "/kept/story", trace="a.log").body.decode()
     assert "What a.log tells" in page
     (kept.traces / "a.log").write_bytes(b"no trace")
@@ -85,7 +85,7 @@ def test_a_story_names_the_file_and_not_where_it_was_put(kept: Kept, tmp_path: P
     assert str(tmp_path) not in answer.body.decode()
 
 
-def test_an_upgrade_without_an_end_names_what_it_left(kept: Kept) -> None:
+def test_an_upgrade_without_an_end_names_what_it_left(kept: Archive) -> None:
     history = FlashHistory()
     name = history.begin(BEGAN)
     assert "it is still running" in _asked(kept, "/kept").body.decode()

@@ -1,6 +1,6 @@
-"""What this computer keeps: its history, bundles, backups, and the stories of traces.
+"""The archive pages: history of this computer, bundles, backups and the stories of traces.
 
-It is answered in processes of their own (`flasher.web.answers`), so that no upgrade waits for it.
+Processes of their own answer them (`flasher.web.query_processes`), so that no upgrade waits.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from flasher.report.base import visible
 from flasher.report.explain_page import told
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
-from flasher.web.answers import HTML, Answer, Question
 from flasher.web.pages import Pages
+from flasher.web.query_processes import HTML, Answer, Question
 from flasher.web.translation import translator
 
 SHOWN_MAX: Final = 50
@@ -31,7 +31,7 @@ SHOWN_MAX: Final = 50
 _ZIP: Final = "application/zip"
 
 
-class KeptFile(NamedTuple):
+class ArchivedFile(NamedTuple):
     """A bundle or a backup."""
 
     name: str
@@ -42,7 +42,7 @@ class KeptFile(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Kept:
+class Archive:
     """Answers the questions of the pages. `bundles`, `backups` and `traces` are folders; the last
     one has what was dropped on the page.
     """
@@ -139,11 +139,11 @@ class Kept:
         return sorted(found, key=lambda each: each.stat().st_mtime_ns)
 
 
-PAGES: Final[Mapping[str, Callable[[Kept, Question], Answer]]] = {
-    "/kept": Kept.overview,
-    "/kept/story": Kept.story,
-    "/kept/bundle": Kept.bundle,
-    "/kept/backup": Kept.backup,
+PAGES: Final[Mapping[str, Callable[[Archive, Question], Answer]]] = {
+    "/kept": Archive.overview,
+    "/kept/story": Archive.story,
+    "/kept/bundle": Archive.bundle,
+    "/kept/backup": Archive.backup,
 }
 """The paths of the pages, and who answers."""
 
@@ -152,13 +152,13 @@ def _files(folder: Path) -> list[Path]:
     return sorted(each for each in folder.iterdir() if each.is_file()) if folder.is_dir() else []
 
 
-def _file(path: Path) -> KeptFile:
+def _file(path: Path) -> ArchivedFile:
     found = path.stat()
     at = datetime.fromtimestamp(found.st_mtime).astimezone()
-    return KeptFile(path.name, at, found.st_size)
+    return ArchivedFile(path.name, at, found.st_size)
 
 
-def _bundle(path: Path) -> KeptFile:
+def _bundle(path: Path) -> ArchivedFile:
     size_bytes = sum(each.stat().st_size for each in _files(path))
     try:
         recorded = recorded_of(path)

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from flasher.errors import UsageError
-from flasher.web.answers import Answer, Answering, AnswerProcesses, Question
+from flasher.web.query_processes import Answer, Answering, QueryProcesses, Question
 from tests.web.own_loop import in_own_loop
 
 pytestmark = pytest.mark.slow
@@ -30,8 +30,8 @@ def _broken(what: str) -> Answering:
 def test_a_question_is_answered_and_what_is_wrong_is_said() -> None:
     """A place that cannot be opened is an answer, and no process that dies again and again."""
     with (
-        closing(AnswerProcesses(_echo)) as answering,
-        closing(AnswerProcesses(partial(_broken, "no such place"))) as broken,
+        closing(QueryProcesses(_echo)) as answering,
+        closing(QueryProcesses(partial(_broken, "no such place"))) as broken,
     ):
 
         async def ask() -> list[Answer]:

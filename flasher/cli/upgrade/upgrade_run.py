@@ -1,6 +1,7 @@
-"""One upgrade with everything that is kept of it: frames, a bundle when it fails, and this
-computer's history. Nothing that goes wrong with these changes what it does: it is said in a
-warning.
+"""One recorded upgrade: its frames, a bundle when it fails, and its entry in this computer's
+history.
+
+A failure to record gives a warning; it never changes the upgrade.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]
 
 
 @dataclass
-class Carried:
+class UpgradeRun:
     """An upgrade; `write_planned` fills in what is known of it."""
 
     job: Job

@@ -1,4 +1,6 @@
-"""The care for records: `flasher station backup`, `verify`, `key`, `accept`, `upgrade`, `roles`."""
+"""Maintenance of records: `flasher station backup`, `verify`, `key`, `accept`, `upgrade`,
+`roles`.
+"""
 
 from __future__ import annotations
 

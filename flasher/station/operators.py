@@ -1,8 +1,8 @@
-"""Who works at a station: badges, what a role may override, and PINs.
+"""Operators of a station: badges, roles with what they may override, and PINs.
 
     [[person]]
     name = "Jo"
-    code = "BADGE-0017"                # what the badge's barcode says
+    code = "BADGE-0017"                # the barcode of the badge
     role = "rework"
     pin = "$argon2id$..."              # printed by `flasher station pin`
 
@@ -171,7 +171,7 @@ class Crew:
         """True for a text that may be a PIN, which somebody has typed too late."""
         return self.has_pins and pins.is_form(text)
 
-    def check_somebody(self) -> None:
+    def check_assigned(self) -> None:
         """Raises Refused before the first badge."""
         if self.has_badges and self.person is None:
             raise Refused(
@@ -184,7 +184,7 @@ class Crew:
         """
         if word not in _ROLES:
             return None
-        self.check_somebody()
+        self.check_assigned()
         person = self.person
         if person is not None and person.role not in _ROLES[word]:
             raise Refused(

@@ -1,4 +1,4 @@
-"""What came out of a station in this hour and this shift: good, bad, first-pass yield, causes."""
+"""Counts of this hour and this shift: good and bad units, first-pass yield, causes of failures."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
     return max((start for start in starts if start <= now), default=None)
 
 
-class Tally:
+class ShiftCounts:
     """Runs of the shift that goes on; those of the shift before are forgotten. `shifts`: when each
     begins, in the local time of the moments that are given.
     """

@@ -11,7 +11,7 @@ from sqlalchemy import select
 
 from flasher.errors import UsageError
 from flasher.station.records.errors import RecordsDamagedError
-from flasher.station.records.keys import Keeping
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import AuditEvent, RunState, UnitState
 from flasher.station.records.schema import audit
 from flasher.station.records.store import Store
@@ -27,7 +27,7 @@ def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Ben
     assert made.size_bytes == path.stat().st_size
     assert not list(bench.folder.glob(".*part*"))
     bench.make(RunState.PASS, "W2605004", "B")
-    keeping = Keeping(bench.folder / "of nobody")  # the kept heads know the later run as well
+    keeping = KeyLocations(bench.folder / "of nobody")  # the kept heads know the later run as well
     with Store.open(str(path), station="line-2", create=False, keeping=keeping) as copy:
         assert not copy.examine().problems
         assert copy.read.unit(SERIAL).state is UnitState.PASS
