@@ -74,6 +74,8 @@ class TargetWatcher:
         """Of its bootloader, as announced last, escaped."""
         self.heard_at: float | None = None
         """When the device last said anything."""
+        self.has_sent_message = False
+        """A whole message of its bootloader, or anything of its application, was received."""
         self.announced_at: float | None = None
         self.transfer_requests = 0
         """Of its bootloader."""
@@ -112,6 +114,7 @@ class TargetWatcher:
             self.heard_at = now
             if frame.can_id != self._boot.can_id:
                 self._hear_application()
+                self.has_sent_message = True
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
                 if isinstance(found, Message):
@@ -132,6 +135,7 @@ class TargetWatcher:
         return self.announcements > 0 or self.has_application
 
     def _hear_bootloader(self, message: Message, now: float) -> None:
+        self.has_sent_message = True
         match decode(message):
             case BootVersion(version=version):
                 self._announced(now)
@@ -251,7 +255,8 @@ class Presence:
         """One frame of an idle bus."""
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
-            if watcher.heard_at == now:
+            # The end of an announcement that began before is no evidence of its own.
+            if watcher.heard_at == now and watcher.has_sent_message:
                 self._heard_at = now
 
     def miss(self, missed_s: float) -> None:

@@ -57,6 +57,20 @@ def test_a_boot_version_is_a_unit_that_was_switched_on(presence: Presence) -> No
     assert change.how == "boot version"
 
 
+def test_the_end_of_an_announcement_is_no_unit_that_the_next_one_replaces(
+    presence: Presence,
+) -> None:
+    frames = split(BMS.answer_id, encode(BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)))
+    for frame in frames[1:]:
+        presence(frame, sent=False, now=1.0)
+    assert presence.change(1.0) is None
+    for frame in frames:
+        presence(frame, sent=False, now=1.05)
+    change = presence.change(1.05)
+    assert change is not None
+    assert (change.how, presence.exchanged_number) == ("boot version", 0)
+
+
 def test_own_frames_and_those_of_others_are_no_unit(presence: Presence) -> None:
     presence(Frame(BMS.request_id, b"\x55"), sent=False, now=1.0)
     presence(Frame(WMC.answer_id, b"\x55"), sent=False, now=1.0)
