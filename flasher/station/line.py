@@ -1,13 +1,13 @@
-"""The line of a station as a pure state machine: which label belongs to which socket, which runs
-are started, and what each socket shows.
+"""The line of a station as a pure state machine: it assigns labels to sockets, starts runs, and
+decides what each socket shows.
 
-    scans, units that come and go, what a socket's process said, what is saved, the time
+    scans, presence of units, messages of the sockets' processes, results of saving, the time
         -> Line ->
     events, claims, aborts, and entries of the audit trail
 
 It does no I/O and reads no clock: times are seconds on the station's monotonic clock. `Station`
-carries out its effects and feeds back their results. The rule that assigns labels to sockets is in
-`flasher.station.scans`.
+carries out its effects and feeds back their results. `flasher.station.scans` has the rule that
+assigns labels to sockets.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ from flasher.station.socket import (
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
-"""After this time a label without its unit, or a socket without its label, is forgotten."""
+"""After this time a label without its unit, or a socket without its label, is dropped."""
 CARD_LIMIT_S: Final = 15.0
 """The label has to follow the card of its socket within this time."""
 SHORT_OUTAGE_S: Final = 3.0
-"""A restart of the process takes less: so long a socket shows its last verdict."""
+"""A socket shows its last verdict for this time; a restart of its process takes less."""
 REACH_S: Final = 2.0
-"""A unit that is heard sooner after the prompt was in the socket before."""
+"""A unit that appears sooner after the prompt was in the socket before."""
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 NOTE_S: Final = 15.0
@@ -127,8 +127,7 @@ SocketInput = (
     | NotSaved
 )
 """`RunStarted`: the claim is in the records. `RunResult`: the process reported the end of the run,
-which is not on disk before `RunEnded`.
-"""
+which is on disk with `RunEnded`."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ class AbortRun:
 
 @dataclass(frozen=True)
 class CheckPin:
-    """Compare a PIN with its hash; then call `Line.pin_checked`, and give no scan before."""
+    """Compare a PIN with its hash; then call `Line.pin_checked`. Pass no scan before."""
 
     pin: Pin
     pin_hash: str
@@ -155,8 +154,8 @@ class CheckPin:
 
 @dataclass(frozen=True)
 class Reprint:
-    """Print the label of this unit once more, if it has passed, when that is in the audit trail
-    with `data`; then call `Line.reprinted`.
+    """Record `data` in the audit trail, then print the label of this unit again if it has passed;
+    then call `Line.reprinted`.
     """
 
     serial: str
@@ -181,15 +180,15 @@ to be published.
 
 
 CheckSerial = Callable[[str], object]
-"""Raises ValueError for a text that is no serial number of the recipe."""
+"""Raises ValueError for a text that is not a serial number of the recipe."""
 
 
 class Line:
-    """All sockets and the scans. After each call, `take` returns the effects, in their order.
+    """All sockets and the scans. After each call, `take` returns the effects in order.
 
     `arrival_limit_s`: a label with a scanned socket waits this long for its unit; then the run
-    starts all the same and reports the fault. `crew`: who has a badge; None: people are taken at
-    their word.
+    starts all the same and reports the fault. `crew`: people with badges; None: names are not
+    checked.
     """
 
     def __init__(
@@ -209,24 +208,24 @@ class Line:
         self.stopped: LineStopped | None = None
         """Why the line is stopped; None while it runs."""
         self._pin_from: Source | None = None
-        """Where the PIN came from that is being checked."""
+        """Source of the PIN that is being checked."""
         self.is_closing = False
-        """No further run is begun."""
+        """True when no further run may begin."""
         self._check_serial = check_serial
         self._arrival_limit_s = arrival_limit_s
         self._scans_labels = scans_labels
         self._crew = crew or Crew(())
         self._effects: list[Effect] = []
         self._waiting: dict[str, Waiting] = {}
-        """What was scanned and waits for another scan of the same source, by its name."""
+        """Scans that wait for another scan of the same source, by its name."""
         self._reason = ""
-        """Given by REASON, for the next label."""
+        """Reason from a REASON command, for the next label."""
         self._reasons: dict[str, str] = {}
         """Reasons by label, so that a run that starts in between does not take another one's."""
 
     @property
     def is_checking_pin(self) -> bool:
-        """True while a PIN is being checked: no scan may be given meanwhile."""
+        """True while a PIN is being checked: pass no scan meanwhile."""
         return self._pin_from is not None
 
     def take(self) -> list[Effect]:
@@ -244,9 +243,9 @@ class Line:
 
     def _ready(self, socket: Socket, what: Ready, now: float) -> None:
         if socket.can_work:
-            return  # an adapter that was opened anew between two looks at it
+            return  # the adapter was reopened between two polls
         was_short = now - socket.out_since_s < SHORT_OUTAGE_S
-        # A unit can be exchanged in a moment: one that has passed has to report its number anew.
+        # A unit can be exchanged quickly: one that has passed must report its number again.
         has_passed = socket.last is not None and socket.last.outcome is RunState.PASS
         socket.is_last_there = socket.is_last_there and was_short and not has_passed
         socket.out_of_service, socket.sees_units = None, what.sees_units
@@ -259,13 +258,13 @@ class Line:
         socket.out_of_service = what.reason or text("It cannot work.")
         reason = text("Socket {socket} is out of service.", socket=socket.name)
         self._drop_scans(socket, _FORGOTTEN, reason, text("Scan it again when it works again."))
-        # What happens in it cannot be seen now. What was silent before stays doubtful.
+        # The socket cannot be observed now. A unit that was silent before stays doubtful.
         socket.own, socket.is_own_known, socket.presence_number = None, False, 0
         if socket.occupancy is not Occupancy.SILENT:
             socket.occupancy = Occupancy.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
-        """A unit is heard, reports its serial number, or is not heard any more."""
+        """A unit appeared, reported its serial number, or fell silent."""
         socket.presence_number = what.number
         if not what.is_there:
             reason = text("Its unit is not heard any more.")
@@ -313,8 +312,8 @@ class Line:
         *,
         is_certain: bool,
     ) -> None:
-        """The unit that was heard may be out: what was scanned for it is dropped."""
-        # Nothing came for its label yet, or it said that it was another unit.
+        """The unit may have been removed: drop the scans for it."""
+        # No unit came for its label yet, or the unit reported another serial number.
         awaits = socket.begin_at_s is None or socket.is_of_another(socket.label)
         awaits = awaits and socket.binding is Binding.NAMED
         if not socket.fall_silent(is_certain=is_certain):
@@ -334,7 +333,7 @@ class Line:
         *,
         keeps_label: bool,
     ) -> None:
-        """Drop what was scanned for a unit; its socket shows for a while that it was."""
+        """Drop the scans for a unit, and show that on its socket for a while."""
         if self._drop_scans(socket, code, reason, remedy, keeps_label=keeps_label):
             socket.note = text("{reason} {remedy}", reason=reason, remedy=remedy)
             socket.note_until_s = now + NOTE_S
@@ -354,7 +353,7 @@ class Line:
             remedy = text("Scan {label}.", label=borne)
             self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket, socket.source)
         else:
-            # It may be one that woke up: it is asked who it is before anything begins.
+            # The unit may have woken up: identify it before anything begins.
             socket.begin_at_s = now if borne else now + IDENTIFY_S
 
     def _arrived_elsewhere(self, socket: Socket) -> None:
@@ -393,7 +392,7 @@ class Line:
     def _ended(self, socket: Socket, _what: RunResult, now: float) -> None:
         socket.phase = SocketPhase.SAVE
         socket.last, socket.is_last_there = LastRun(socket.serial), True
-        # In the run it may have got its number: what is heard from now on counts.
+        # The run may have written its number: only later reports count.
         socket.own, socket.is_own_known = None, False
         if not socket.is_virtual and socket.sees_units:
             socket.occupancy = Occupancy.UNKNOWN
@@ -404,7 +403,7 @@ class Line:
             socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
 
     def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
-        """A part of a run is not saved: it cannot pass, and no other run is started."""
+        """A part of a run is not saved: the run cannot pass, and no other one starts."""
         if socket.phase is SocketPhase.SAVE:
             socket.note = what.reason
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
@@ -412,7 +411,7 @@ class Line:
     # -- scans ------------------------------------------------------------------------------------
 
     def scan(self, raw: str, now: float, source: Source = UNNAMED) -> None:
-        """Something was scanned at a source."""
+        """Handle a scan of a source."""
         scanned = raw.strip()
         crew = self._crew
         person = crew.find(scanned)
@@ -425,7 +424,7 @@ class Line:
                 source,
                 lambda: ("label", self._take_mounted(socket, scanned, now, source)),
             )
-        elif crew.asked is not None and not is_mounted_label:  # no PIN that somebody types
+        elif crew.asked is not None and not is_mounted_label:  # not a typed PIN
             self._take_pin(crew.asked, scanned, source, now)
         elif person is not None:
             crew.person = person
@@ -434,7 +433,7 @@ class Line:
             self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=role)
             self._tell(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
-            # Typed too late, or too often: it must not be shown in what is said of it.
+            # A PIN typed too late or too often: no message may show it.
             reason = text("No PIN is awaited, and it is no serial number of this recipe.")
             remedy = text("Scan first what needs the PIN.")
             self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, remedy, source=source)
@@ -447,23 +446,23 @@ class Line:
     def _answer(
         self, shown: str, source: Source, understand: Callable[[], tuple[str, Socket | None]]
     ) -> None:
-        """Tell what came of a scan that is `shown` so."""
+        """Handle a scan, and report whether it was accepted; `shown` is its text for people."""
         try:
             meaning, socket = understand()
         except Refused as refused:
             self._refuse(shown, refused.code, refused.reason, refused.remedy, source=source)
         else:
-            if meaning not in (_RESUME, _REPRINT, _PIN):  # what came of it is said by other events
+            if meaning not in (_RESUME, _REPRINT, _PIN):  # other events report the result
                 name = "" if socket is None else socket.name
                 self._tell(ScanAccepted(shown, meaning, name, source.name))
 
     def _understand(self, raw: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
-        """What a scan means, and for which socket. Raises Refused."""
+        """The meaning of a scan, and its socket. Raises Refused."""
         understood = understand(raw)
         if isinstance(understood, Label):
             self._crew.check_assigned()
         was_in_doubt = waiting.is_in_doubt
-        # A refused card is for the scan that follows; two of a kind, until it is said which counts.
+        # A refused card affects the next scan; two of a kind, until it is clear which one counts.
         waiting.is_in_doubt = was_in_doubt and bool(waiting.text)
         match understood:
             case Label(serial):
@@ -483,7 +482,7 @@ class Line:
 
     @staticmethod
     def _in_doubt(waiting: Waiting) -> Refused:
-        """For a scan that may belong to something that was refused before it."""
+        """The refusal of a scan that may belong to one that was refused before it."""
         if not waiting.text:
             return Refused(
                 "NO_SOCKET",
@@ -499,7 +498,7 @@ class Line:
     # -- badges and PINs --------------------------------------------------------------------------
 
     def _take_pin(self, asked: Asked, scanned: str, source: Source, now: float) -> None:
-        """What was scanned while a PIN is awaited: it is never shown."""
+        """Handle a scan while a PIN is awaited; it is never shown."""
         if scanned.upper() == Word.CANCEL.value:
             self._end_pin(asked, "CANCELLED", text("It was cancelled."), _NOTHING)
         elif is_form(scanned):
@@ -545,7 +544,7 @@ class Line:
         self._go_on(now)
 
     def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
-        """The override that waited for its PIN is refused."""
+        """Refuse the override that waited for its PIN."""
         self._crew.asked = None
         self._tell(PinEnded(asked.person.name, is_right=False))
         self._refuse(printable(asked.text)[:80], code, reason, remedy)
@@ -553,7 +552,7 @@ class Line:
     # -- labels and commands ----------------------------------------------------------------------
 
     def _take_label(self, serial: str, waiting: Waiting, now: float) -> Socket | None:
-        """The socket that a label is for; None while it waits for one. Raises Refused."""
+        """The socket for a label; None while the label waits for one. Raises Refused."""
         card = waiting.card
         if card is not None:
             self._take_for_card(card, serial, waiting, now)
@@ -564,7 +563,7 @@ class Line:
         check_first(self.sockets, serial, waiting)
         placed = place(self.sockets, serial, waiting.source)
         for other in self._waiting.values():
-            if other.label == serial and other is not waiting:  # it is where it was scanned last
+            if other.label == serial and other is not waiting:  # its last scan counts
                 reason = text("It was scanned elsewhere.")
                 self._drop_waiting(other, _FORGOTTEN, reason, _NOTHING)
         if placed is None:
@@ -578,18 +577,20 @@ class Line:
         return socket
 
     def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
-        """A label of the scanner at a socket: as its card and the label. Raises Refused."""
+        """Handle a label from the scanner at a socket like its card and the label. Raises
+        Refused.
+        """
         self._crew.check_assigned()
         self._check_label(serial)
         self._check_takes(socket)
         self._check_for(socket, serial, source)
-        if socket.label == serial:  # it scans by itself: nobody says that the unit is there
+        if socket.label == serial:  # this scanner needs no person: no proof of a unit
             raise Refused("DOUBLE_SCAN", text("It was scanned already."), socket.wanted)
         self._take_for(socket, serial, self._waiting[source.name], now)
         return socket
 
     def _take_for_card(self, card: Socket, serial: str, waiting: Waiting, now: float) -> None:
-        """A label after the card of its socket. Raises Refused: the card was for this label."""
+        """Handle a label after the card of its socket. Raises Refused, which uses up the card."""
         try:
             self._check_label(serial)
             self._check_for(card, serial, waiting.source)
@@ -607,7 +608,7 @@ class Line:
         was_here = socket.label == serial
         for each in self.sockets.values():
             if each.label == serial:
-                each.let_go()  # it was put elsewhere
+                each.let_go()  # it was moved
         for other in self._waiting.values():
             if other.label == serial:
                 other.forget()
@@ -621,7 +622,7 @@ class Line:
         waiting.forget()
         self._bind(socket, serial, Binding.SAID, now, waiting.source)
         if was_here:
-            socket.begin_at_s = now  # said twice: do not wait until it is heard
+            socket.begin_at_s = now  # scanned twice: do not wait for its first message
 
     def _label_of(self, own: str | None) -> Waiting | None:
         """The waiting label of the unit that reports this serial number."""
@@ -635,7 +636,7 @@ class Line:
             raise Refused("LINE_STOPPED", reason, remedy)
 
     def _check_label(self, serial: str) -> None:
-        """Raises Refused for what is no label of this recipe, or can be run by nobody now."""
+        """Raises Refused for a label that is not of this recipe or cannot be run now."""
         self._check_line()
         try:
             self._check_serial(serial)
@@ -671,7 +672,7 @@ class Line:
         if waiting.label and waiting.is_in_doubt:
             raise self._in_doubt(waiting)
         if not waiting.label:
-            # Until nothing speaks against it: the label that follows must not go elsewhere.
+            # Until every check has passed: the label that follows must not go elsewhere.
             waiting.is_in_doubt = True
             waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
@@ -695,7 +696,7 @@ class Line:
 
     @staticmethod
     def _check_takes(socket: Socket) -> None:
-        """Raises Refused for a socket that can take no unit now."""
+        """Raises Refused for a socket that cannot take a unit now."""
         check_free(socket)
         check_service(socket)
         last = socket.holds
@@ -730,7 +731,7 @@ class Line:
         return socket
 
     def _cancel(self, _argument: str, _now: float, waiting: Waiting) -> None:
-        """End the wait of what was scanned at this source."""
+        """Drop the scans of this source that wait."""
         bound = [each for each in self.sockets.values() if each.label]
         own = [each for each in bound if each.source == waiting.source]
         if not (own or waiting.text or self._reason):
@@ -741,7 +742,7 @@ class Line:
             self._reasons.pop(socket.let_go(), None)
 
     def _check_waits_nowhere(self, bound: list[Socket]) -> None:
-        """Raises Refused for a CANCEL that means what was scanned at another source."""
+        """Raises Refused for a CANCEL when scans wait at another source."""
         waits: list[tuple[str, Source, str]] = [
             (
                 each.label,
@@ -794,7 +795,7 @@ class Line:
         self._effects.append(SaveAgain(tuple(unsaved)))
 
     def resumed(self, now: float, *, all_saved: bool) -> None:
-        """Result of `SaveAgain`: the line goes on, or stays stopped."""
+        """Result of `SaveAgain`: the line resumes, or stays stopped."""
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None
@@ -812,7 +813,7 @@ class Line:
             )
         self._go_on(now)
 
-    # -- the time, and what is due ----------------------------------------------------------------
+    # -- the time, and due actions ----------------------------------------------------------------
 
     def tick(self, now: float) -> None:
         for waiting in tuple(self._waiting.values()):
@@ -873,17 +874,17 @@ class Line:
         socket.note, socket.note_until_s = "", None
         socket.begin_at_s, socket.bound_at_s = None, now
         if why is Binding.NAMED:
-            return  # the unit that has passed is shown until it has left
+            return  # show the unit that has passed until it is removed
         socket.last, socket.is_last_there = None, False
         if not socket.sees_units or (was_here and why is Binding.SAID):
-            socket.begin_at_s = now  # it may sit in its bootloader, and say nothing
+            socket.begin_at_s = now  # it may be in its bootloader and send nothing
         elif why is Binding.SAID or (why is Binding.ONLY and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
     def _drop_scans(
         self, socket: Socket, code: str, reason: str, remedy: str, *, keeps_label: bool = False
     ) -> bool:
-        """Drop the card and the label that wait at a socket; False when none did."""
+        """Drop the card and the label that wait at a socket; False without any."""
         cards = [each for each in self._waiting.values() if each.card is socket]
         for waiting in cards:
             self._drop_waiting(waiting, code, reason, remedy)
@@ -897,8 +898,8 @@ class Line:
         return bool(label)
 
     def _drop_waiting(self, waiting: Waiting, code: str, reason: str, remedy: str) -> None:
-        """What waits of a source is dropped, and told to it. A label that follows a dropped card
-        must not go elsewhere.
+        """Drop the waiting scan of a source, and report it there. A label that follows a dropped
+        card must not go elsewhere.
         """
         text, card = waiting.text, waiting.card
         if text:
@@ -920,7 +921,9 @@ class Line:
         self._drop_label(socket, "NOT_IDENTIFIED", reason, remedy)
 
     def _forget_card(self, waiting: Waiting) -> None:
-        """Forget what waits; the label that waited at the chosen socket gave way to the card."""
+        """Forget the waiting scan. The label that waited at the chosen socket is replaced by the
+        card.
+        """
         card = waiting.card
         waiting.forget()
         if card is not None:
@@ -978,7 +981,7 @@ class Line:
         self._effects.append(Audit(what, self._with_author(data)))
 
     def _with_author(self, data: dict[str, str]) -> dict[str, str]:
-        """What goes into the audit trail: with badges, who it is by."""
+        """The data of an audit entry, with its author where badges are used."""
         if not self._crew.has_badges:
             return data
         return {**data, "by": "" if self._crew.person is None else self._crew.person.name}

@@ -82,28 +82,29 @@ from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
-"""How long a turn of the loop waits at the most."""
+"""A turn of the loop waits at most this long."""
 SCANS_ENDED: Final = "SCANS_ENDED"
-"""The code of a label that waited when the last scan was done."""
+"""The refusal code of labels that still wait after the last scan."""
 EventHandler = Callable[[StationEvent], None]
 
 
 @dataclass(frozen=True)
 class StationOptions:
-    """What may be set; the defaults are for a line with people."""
+    """Options of a station; the defaults suit a line with people."""
 
     arrival_limit_s: float = ARRIVAL_LIMIT_S
-    """As `Line` has it."""
+    """See `Line`."""
     end_limit_s: float = 30.0
-    """How long runs may take to end when the station is ended."""
+    """Time for runs to end when the station closes."""
     scans_labels: bool = False
-    """Virtual units are scanned by themselves."""
+    """Scan the labels of virtual units automatically."""
     mixes_virtual: bool = False
     """Real and virtual units may share the records; one serial number is never both."""
 
 
 class Station:
-    """A station with one recipe. Methods raise nothing for what happens on the line: events tell.
+    """A station with one recipe. Events report what happens on the line; methods do not raise for
+    it.
 
     `submit`, `publish`, `note`, `stop` and `abort_all` may be called from any thread, the others
     from one.
@@ -146,29 +147,29 @@ class Station:
         self._labels = labels
         self.supervisor = Supervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
-        """Runs that are claimed and not saved yet, by their sockets."""
+        """Runs that are claimed and not saved yet, by socket."""
         self._scans: deque[tuple[str, Source]] = deque()
         self._published: deque[StationEvent] = deque()
         self._notes: deque[tuple[AuditEvent, Mapping[str, str]]] = deque()
         self._checked: deque[bool] = deque()
-        """PINs that were right or wrong, and of which the line is not told yet."""
+        """Results of PIN checks that the line has not received yet."""
         self.checker = checker or pins.checker()
-        """Checks PINs, beside the loop of the station."""
+        """Checks PINs in a thread of its own."""
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
         self._is_stopping = False
         self._is_aborting = False
         self._is_open = False
 
-    # -- what a program calls ---------------------------------------------------------------------
+    # -- public calls ---------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Look for runs that a dead station left, then begin.
+        """End the runs that a dead station left, then begin.
 
         Raises RecordError; UsageError for records of the other kind of units.
         """
         sockets = self.line.sockets
-        are_mixed = _check_natures(
+        are_mixed = _check_unit_kinds(
             self.store.read.unit_kinds(),
             frozenset(each.is_virtual for each in sockets.values()),
             self.options,
@@ -201,40 +202,42 @@ class Station:
         self.turn(0.0)
 
     def submit(self, text: str, source: Source = UNNAMED) -> None:
-        """Something was scanned. A card waits for a label of the same source, and a label for a
-        card.
-        """
+        """Submit a scan. A card waits for a label of the same source, and a label for a card."""
         self._scans.append((text, source))
         self._wake()
 
     def publish(self, event: StationEvent) -> None:
-        """Something happened beside the line, as to a scanner; told in the station's turn."""
+        """Publish an event from outside the line, such as of a scanner, in the station's next
+        turn.
+        """
         self._published.append(event)
         self._wake()
 
     def note(self, what: AuditEvent, data: Mapping[str, str]) -> None:
-        """A person did something beside the line; it is in the audit trail after the next turn."""
+        """Add an action of a person outside the line to the audit trail, in the next turn."""
         self._notes.append((what, data))
         self._wake()
 
     def drop_waiting(self) -> None:
-        """Drop the cards and labels that wait: no scan follows. Called in the station's thread."""
+        """Drop the cards and labels that wait, after the last scan. Called in the station's
+        thread.
+        """
         remedy = text("Scan it again when the station runs.")
         self.line.drop_all(SCANS_ENDED, text("The scans have ended."), remedy)
         self._carry_out()
 
     def stop(self) -> None:
-        """Begin no further unit; `run` returns when the runs that go on have ended."""
+        """Begin no further unit; `run` returns after the active runs."""
         self._is_stopping = True
         self._wake()
 
     def abort_all(self) -> None:
-        """Stop, and stop the runs that go on at their next safe place."""
+        """Stop, and stop the active runs at their next safe place."""
         self._is_aborting = True
         self.stop()
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Start, and work until `stop` was called or `until` says so; then close.
+        """Start, and work until `stop` was called or `until` returns True; then close.
 
         Raises RecordError, UsageError when the station cannot begin.
         """
@@ -249,7 +252,7 @@ class Station:
             self.close()
 
     def turn(self, limit_s: float) -> None:
-        """One turn of the loop: wait up to `limit_s`, then do everything that can be done."""
+        """One turn of the loop: wait up to `limit_s`, then do all work that is due."""
         if limit_s > 0:
             self.supervisor.wait([self._wake_receiver], limit_s)
         while self._wake_receiver.poll():
@@ -269,7 +272,7 @@ class Station:
         self._on_turn()
 
     def _take_scans(self) -> None:
-        """What was scanned, and the PINs that were checked; scans wait while one is."""
+        """Feed scans and results of PIN checks to the line; scans wait during a check."""
         while self._checked or (self._scans and not self.line.is_checking_pin):
             if self._checked:
                 self.line.pin_checked(self._now, is_right=self._checked.popleft())
@@ -279,8 +282,8 @@ class Station:
             self._carry_out()
 
     def close(self) -> None:
-        """End all processes. Runs that go on are stopped, and saved if they say their end in time;
-        the others are found at the next start.
+        """End all processes. Active runs are stopped, and saved if they report their end in time;
+        the next start finds the others.
         """
         if not self._is_open:
             return
@@ -299,7 +302,7 @@ class Station:
 
     @property
     def is_running(self) -> bool:
-        """True while a run goes on that has not said its end."""
+        """True while a run has not reported its end."""
         return any(socket.is_running for socket in self.line.sockets.values())
 
     @property
@@ -341,7 +344,7 @@ class Station:
                     case line.AbortRun(socket):
                         self.supervisor.send(socket, Abort())
                     case line.SaveAgain(sockets):
-                        saved = [self._save(socket) for socket in sockets]  # every one is tried
+                        saved = [self._save(socket) for socket in sockets]  # try every one
                         all_saved = self._end_unknown() and all(saved)
                         self.line.resumed(self._now, all_saved=all_saved)
                     case line.CheckPin(pin, pin_hash):
@@ -372,7 +375,7 @@ class Station:
                 self._feed(socket, AdapterDown(reason))
                 self.tell(WorkerFailed(socket, reason, restart_in_s))
             case _:
-                pass  # beats and last words: the supervisor has taken note
+                pass  # heartbeats and endings: the supervisor handles them
 
     def _abort_running(self) -> None:
         for socket in self.line.sockets.values():
@@ -388,7 +391,7 @@ class Station:
         self._wake_sender.send_bytes(b"x")
 
     def _find_interrupted(self, runs: Iterable[RunId]) -> None:
-        """Tell the line in which sockets the units of interrupted runs were."""
+        """Pass the sockets of interrupted runs to the line."""
         for run_id in runs:
             run = self.store.read.run(run_id).run
             socket = self.line.sockets.get(run.socket)
@@ -437,26 +440,26 @@ class Station:
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
-        """What was done to a unit of this recipe's part. Raises RecordError."""
+        """The history of a unit of this recipe's part. Raises RecordError."""
         lives, part = self.store.read.units(serial), self.recipe.recipe.part
         return next((life for life in lives if life.part == part), None)
 
     def _begin(self, started: RunStarted) -> None:
-        """Let the process of a socket work on what was claimed."""
+        """Send the claimed run to the process of its socket."""
         self.tell(started)
         socket = started.socket
         if not self.supervisor.send(socket, self._runs[socket].claim):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
     def _going(self, socket: str) -> ActiveRun | None:
-        """The run of a socket, until its process has said its end."""
+        """The run of a socket, until its process has reported the end."""
         run = self._runs.get(socket)
         return run if run is not None and run.reported is None else None
 
     # -- while a run goes on ----------------------------------------------------------------------
 
     def _answer(self, socket: str, asked: Ask) -> None:
-        """Save something for the process, then reply."""
+        """Save what the process asked for, then reply."""
         run, number = self._going(socket), asked.number
         if run is None:
             reply = WriteReply(number, error="The run is not one of this station.")
@@ -497,7 +500,7 @@ class Station:
     # -- its end ----------------------------------------------------------------------------------
 
     def _end(self, socket: str, result: RunResult) -> None:
-        """The run has ended: save the outcome, then publish it."""
+        """Save the outcome of a run that ended, then publish it."""
         run = self._going(socket)
         if run is None:
             return
@@ -507,7 +510,7 @@ class Station:
         self._carry_out()
 
     def _end_lost(self, socket: str, reason: str, *, hung: bool) -> None:
-        """The process is gone, and its run with it."""
+        """End the run of a process that was lost."""
         run = self._going(socket)
         if run is None:
             return
@@ -566,7 +569,7 @@ class Station:
             self._labels.submit(self._label(socket, run))
 
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
-        """Print a label once more; why not, if it is refused."""
+        """Print a label again; returns the refusal, if any."""
         if self._labels is None:
             reason = text("This station has no printer.")
             return Refused("NO_PRINTER", reason, text("Set it up in the station's file."))
@@ -603,7 +606,7 @@ class Station:
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
     ) -> line.NotSaved:
-        """Tell it; what the line has to know of it."""
+        """Publish an error of the records; returns the input for the line."""
         self.tell(RecordNotSaved(socket, serial, run_id, _said(error), error.remedy))
         return line.NotSaved(error.what, error.remedy)
 
@@ -614,7 +617,7 @@ _NOT_PASSED: Final = Refused(
 
 
 def _not_labelled(run: RunRecord) -> Refused | None:
-    """Why a unit with this last run gets no label."""
+    """The reason why a unit with this last run gets no label."""
     if run.state is not RunState.PASS:
         return _NOT_PASSED
     if run.is_virtual or run.kind is RunKind.GOLDEN:
@@ -623,16 +626,19 @@ def _not_labelled(run: RunRecord) -> Refused | None:
 
 
 def _said(error: RecordError) -> str:
-    """What is wrong and where, in one line; what to do stands elsewhere."""
+    """An error of the records in one line: what and where, without its remedy."""
     where = f" ({error.where})" if error.where else ""
     return f"{error.what.rstrip('.')}{where}."
 
 
-def _check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> bool:
-    """Whether sockets may use records that know virtual units (True), real ones (False); `own`:
-    the same of the sockets. True when both kinds are in the records from now on.
+def _check_unit_kinds(
+    known: frozenset[bool], own: frozenset[bool], options: StationOptions
+) -> bool:
+    """Check that sockets may use records with these kinds of units: True for virtual, False for
+    real; `own` are the kinds of the sockets. Returns True when the records will hold both kinds
+    from now on.
 
-    Raises UsageError: a PASS of a virtual unit must not be taken for one of a product.
+    Raises UsageError: a PASS of a virtual unit must not be mistaken for one of a product.
     """
     are_mixed = len(own | known) == len((True, False))
     if options.mixes_virtual or not are_mixed:

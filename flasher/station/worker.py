@@ -59,14 +59,14 @@ from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
 
 REOPEN_S: Final = 1.0
-"""How often an adapter that has failed is opened again."""
+"""Interval between attempts to reopen a failed adapter."""
 BEAT_S: Final = 0.5
-"""How often it says that it is alive."""
+"""Interval between heartbeats."""
 IDLE_S: Final = 0.05
 REPLY_LIMIT_S: Final = 60.0
-"""How long it waits until the station has something on disk."""
+"""Time limit for the station to save something to disk."""
 _LOOK_S: Final = 0.1
-"""How often the pipe is looked at while a run goes on: between frames, it must cost nothing."""
+"""Interval between polls of the pipe during a run: between frames it must cost nothing."""
 
 
 class Channel(Protocol):
@@ -87,7 +87,7 @@ class StationGoneError(Exception):
 
 
 class StationPipe:
-    """The pipe to the station: sends heartbeats, and keeps messages until they are asked for."""
+    """The pipe to the station: sends heartbeats, and queues messages until they are taken."""
 
     def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
         self._channel = channel
@@ -98,14 +98,14 @@ class StationPipe:
         self._claim: Claim | None = None
         self._replies: dict[int, WriteReply] = {}
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called again and again while it waits for the station."""
+        """Called repeatedly while it waits for the station."""
         self.is_aborted = False
         self.is_over = False
-        """The station is gone, or wants the process to end."""
+        """True when the station is gone or has asked the process to end."""
         self.is_gone = False
 
     def send(self, message: FromWorker) -> None:
-        """Tell the station. Raises StationGoneError."""
+        """Send a message. Raises StationGoneError."""
         try:
             self._channel.send(message)
         except (OSError, ValueError) as error:
@@ -118,7 +118,7 @@ class StationPipe:
             self.send(event)
 
     def look(self, wait_s: float = 0.0) -> None:
-        """Receive what waits, and send a heartbeat when one is due."""
+        """Receive waiting messages, and send a heartbeat when one is due."""
         now = self._now()
         self._looked_at = now
         if now - self._beat_at >= BEAT_S and not self.is_gone:
@@ -133,19 +133,19 @@ class StationPipe:
             self.is_gone = self.is_over = True
 
     def wait(self, limit_s: float) -> None:
-        """Wait so long, unless the process is to end."""
+        """Wait up to `limit_s`; end early when the process is to end."""
         until = self._now() + limit_s
         while self._now() < until and not self.is_over:
             self.look(IDLE_S)
 
     def is_stopped(self) -> bool:
-        """Asked between frames: a person aborted, or the station is gone."""
+        """True when a person aborted the run or the station is gone; polled between frames."""
         if self._now() - self._looked_at >= _LOOK_S:
             self.look()
         return self.is_aborted or self.is_over
 
     def take_claim(self) -> Claim | None:
-        """The run to be made, once."""
+        """The run to make; returned once."""
         claim, self._claim = self._claim, None
         if claim is not None:
             self.is_aborted = False
@@ -167,7 +167,9 @@ class StationPipe:
         self._ask(ended, measurements)
 
     def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> WriteReply:
-        """Wait until it is saved. Raises StationGoneError; JournalError when it is not."""
+        """Wait until the station has saved it. Raises StationGoneError; JournalError when it was
+        not saved.
+        """
         self._asked += 1
         self.send(Ask(self._asked, what, tuple(measurements)))
         give_up_at = self._now() + REPLY_LIMIT_S
@@ -196,7 +198,7 @@ class StationPipe:
 
 
 class Worker:
-    """The work of the process, on an open connection."""
+    """The loop of the process on an open connection."""
 
     def __init__(
         self,
@@ -236,7 +238,7 @@ class Worker:
     # -- idle -------------------------------------------------------------------------------------
 
     def _watch(self) -> None:
-        """Look for units for a moment."""
+        """Watch the bus for units for a moment."""
         if self._is_down or self._is_blocked:
             self._reopen()
             return
@@ -252,7 +254,7 @@ class Worker:
                 self._presence(heard, sent=False, now=clock.now())
                 heard = link.receive(until) if clock.now() < until else None
         except TransmitBlockedError:
-            # Nobody is there to acknowledge: what waits must not be sent to the next unit.
+            # No unit acknowledges: queued frames must not reach the next one.
             self._is_blocked = True
             self._reopen()
         except BusError as error:
@@ -269,7 +271,7 @@ class Worker:
         self._listened_at = self._connection.clock.now()
 
     def _listened(self) -> None:
-        """Up to now, unless this computer stood still meanwhile."""
+        """Record that the bus was observed up to now, unless this computer stalled."""
         now, blind_s = self._connection.clock.now(), BLIND_S * self._connection.clock.speed
         if now - self._listened_at > blind_s:
             self._presence.miss(now - self._listened_at)
@@ -341,18 +343,18 @@ class Worker:
         self._pipe.send(result)
         if self._virtual is not None:
             self._virtual.run_ended()
-        # What waits was said in the run, and says nothing of who is there now.
+        # Queued frames date from the run and do not show which unit is there now.
         with suppress(BusError):
             self._connection.link.drain()
         self._watch_anew()
 
 
 def pack(path: Path) -> str:
-    """Compress a trace beside itself; its hash. The plain one is deleted. Raises OSError."""
+    """Compress a trace file, delete the plain one, and return its hash. Raises OSError."""
     made = packed(path)
     make_private(made)
     with path.open("rb") as plain, made.open("wb") as raw:
-        # Without a name and time of its own: equal traces are equal files.
+        # No name and time in the header, so that equal traces are equal files.
         with gzip.GzipFile(filename="", mode="wb", compresslevel=6, fileobj=raw, mtime=0) as out:
             shutil.copyfileobj(plain, out)
         raw.flush()
@@ -372,7 +374,7 @@ Opened = AbstractContextManager[tuple[Connection, VirtualSocket | None]]
 def open_socket(
     setup: WorkerSetup, recipe: LoadedRecipe
 ) -> Iterator[tuple[Connection, VirtualSocket | None]]:
-    """The connection that a setup names. Raises UsageError, BusError."""
+    """Open the connection of a setup. Raises UsageError, BusError."""
     if setup.bus is None:
         if setup.virtual is None:
             raise UsageError(f"Socket {setup.socket} has neither an adapter nor virtual units.")
@@ -386,7 +388,7 @@ def open_socket(
 
 
 def load_same(setup: WorkerSetup) -> LoadedRecipe:
-    """The recipe of the setup. Raises UsageError when it is not the one that the station has."""
+    """Load the recipe of the setup. Raises UsageError when it differs from the station's."""
     recipe = load_recipe(setup.recipe)
     if {str(path): sha256 for path, sha256 in recipe.files.items()} != dict(setup.files):
         raise UsageError("The recipe, or a file that it names, was changed.")
@@ -396,8 +398,9 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 def work_on(
     pipe: StationPipe, setup: WorkerSetup, recipe: LoadedRecipe, opened: Callable[[], Opened]
 ) -> None:
-    """Work in a socket until the station ends the process; an adapter that cannot be opened is
-    tried again. Raises StationGoneError.
+    """Work in a socket until the station ends the process; retry an adapter that cannot be opened.
+
+    Raises StationGoneError.
     """
     is_down = False
     while not pipe.is_over:
@@ -415,7 +418,7 @@ def work_on(
 
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
-    # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
+    # The station handles Ctrl-C and a closed terminal, and ends its processes itself.
     for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # Windows has no SIGHUP, others no SIGBREAK
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)

@@ -84,7 +84,7 @@ def image_count(bench: Bench) -> int:
     [
         pytest.param(claim, id="claim and end"),
         pytest.param(lambda bench: bench.store.signer.public, id="key"),
-        pytest.param(lambda bench: bench.store.read.unit_kinds(), id="natures"),
+        pytest.param(lambda bench: bench.store.read.unit_kinds(), id="unit-kinds"),
         pytest.param(
             lambda bench: bench.store.read.known("BAT-36", ["W0000007", "W0000008"]), id="numbers"
         ),
