@@ -1,27 +1,25 @@
-"""Detects that the unit in a socket may no longer be the one that was identified; pure.
+"""Detects that the unit in a socket may have been exchanged since it was identified; pure.
 
-A `Continuity` is a driver's tap for one target of a run. `lost` says what speaks against the same,
-uninterrupted unit:
+A `Continuity` is a driver's tap for one target of a run. `lost` holds the evidence against the
+same, uninterrupted unit:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
-  switched its power (R28); or after a silence in which it has not confirmed the reset or its
-  image;
+  switched its power (R28); or after a silence in which it has not confirmed the reset or its image;
 - it announces itself in the middle of a transfer, or an application answers, which is erased then;
-- before the run has sent anything that restarts it, the watcher counts another power-up of what it
-  had heard, also in the time before the run; or the first one, where nothing had been heard for
+- before the run has sent anything that restarts it, the watcher counts another power-up of a device
+  that it knew, also in the time before the run; or the first one of a device that was silent for
   some time when the run began;
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
-  in something that the run has not written.
+  in a field that the run has not written.
 
-That an application fell silent is not seen here: whoever asks it knows.
+It does not detect that an application fell silent: whoever asks the application knows.
 
-What a single unit may do is no evidence: announcements of one burst, however many; another burst
-after every reset that was sent and not ignored, as the first one may have come too late; a burst
-that follows a reset so soon that nobody can have put another unit in, although the confirmation was
-lost; a burst after the end of a transfer, or none; a restart of what the battery supplies while the
-battery restarts. Nor is a pause of this computer: time in which nobody listened does not count. But
-where another unit could have come in that time and would be taken for this one, `unobserved` says
-so.
+Not evidence, because a single unit may cause it: announcements of one burst, however many; another
+burst after every reset that was sent and not ignored, as the first one may have come too late; a
+burst so soon after a reset that no unit can have been exchanged, although the confirmation was
+lost; a burst after the end of a transfer, or none; a restart of devices that the battery supplies
+while the battery restarts. Time in which this computer did not read the bus does not count; where
+another unit could have come in that time unnoticed, `unobserved` reports it.
 """
 
 from __future__ import annotations
@@ -45,30 +43,29 @@ from flasher.station.presence import TargetWatcher
 from flasher.station.recipe_file import LoadedTarget
 
 _FIELDS: Final = ("model", "serial_number", "hardware_version")
-"""The fields of a version answer that stay as they are; the firmware version does not."""
+"""Fields of a version answer that must not change; the firmware version may."""
 _WRITE: Final = HEADER + Mode.WRITE.to_bytes(MODE_SIZE, "big")
 """Begins a message that may restart a device."""
 _SPACINGS_OF_QUIET: Final = 6
 _QUIET_MIN_S: Final = 0.3
 _PACE_TOLERANCE: Final = 1.5
 _EXCHANGE_S: Final = 0.25
-"""Nobody puts another unit in within so short a silence."""
+"""A unit cannot be exchanged within so short a silence."""
 _ANNOUNCED_ON: Final = 2
 """A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
-announcement may have been under way.
-"""
+announcement may have been on its way."""
 _UNOBSERVED: Final = (
     "This computer did not listen {}: another unit could have come, and would announce itself in"
     " the same way."
 )
 _MESSAGE_S: Final = 0.1
-"""The frames of one announcement come within this time."""
+"""The frames of one announcement arrive within this time."""
 
 
 class Continuity:
-    """What was sent to one target and what came from it, since it was identified.
+    """Traffic of one target since it was identified.
 
-    `blind_s`: nobody has listened in a longer time between two calls.
+    `blind_s`: a longer time between two calls is unobserved.
     """
 
     def __init__(
@@ -85,11 +82,11 @@ class Continuity:
         timings = loaded.profile.timings
         self.watcher = watcher
         self.lost = ""
-        """What speaks against the same unit; empty while nothing does."""
+        """Evidence against the same unit; empty without any."""
         self.unobserved = (
             _UNOBSERVED.format("before the run began") if was_missed and not goes_on else ""
         )
-        """When nobody listened, although another unit could have come; empty while somebody did."""
+        """Unobserved time in which another unit could have come; empty without any."""
         self.is_running = False
         """Its application has answered since the last restart."""
         self.is_told_to_update = False
@@ -108,7 +105,7 @@ class Continuity:
         """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
         self._gap_s = self.quiet_s
         self._longest_pause_s = 0.0
-        """Between two announcements before it was identified."""
+        """Longest pause between two announcements before identification."""
         self._blind_s, self._missed_s = blind_s, 0.0
         """How long nobody has listened since the last announcement, or since the reset of one
         that announced nothing.
@@ -133,10 +130,10 @@ class Continuity:
         """The same for when the transfer that goes on was requested; None: none does."""
         self._is_identified = False
         self._has_acted = False
-        """The run has sent something after which the unit may restart, or switched its power."""
+        """The run has sent a message after which the unit may restart, or switched its power."""
         self._boot_version = ""
         self._known: dict[str, frozenset[str]] = {}
-        """What each field of its identity may be; empty before it has answered."""
+        """Valid values of each identity field; empty before the first answer."""
         if watcher.answer is not None:
             self._compare(watcher.answer)
         if was_exchanged:
@@ -145,9 +142,8 @@ class Continuity:
     # -- what the run knows -----------------------------------------------------------------------
 
     def begin(self, content: Content | None) -> None:
-        """The unit was identified by its version answer; None: it has given none. From now on it
-        has to stay. One that cannot be asked is identified by nothing: it has to stay from the
-        first update command on.
+        """Note that the unit was identified by this version answer; None: it gave none. From now on
+        it must stay. A unit that cannot be asked must stay from the first update command on.
         """
         if self._is_identified or self.watcher.request is None:
             return
@@ -158,7 +154,7 @@ class Continuity:
 
     @property
     def has_answered(self) -> bool:
-        """True when it has answered who it is, before the run or in it."""
+        """True when it has sent a version answer, before the run or in it."""
         return bool(self._known)
 
     def _stay(self) -> None:
@@ -168,31 +164,33 @@ class Continuity:
         self._gap_s = max(self.quiet_s, _PACE_TOLERANCE * self._longest_pause_s)
 
     def settle(self) -> None:
-        """Its application has answered a question of the run: what was restarted has started."""
+        """Note that its application has answered the run: it has started again."""
         self.is_running, self.is_told_to_update = True, False
         self._awaits_confirmation = self._awaits_complete = False
         self._requested_s = None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
-        """A target that cannot be asked has the complete image: it may start by its bootloader."""
+        """Note that a target that cannot be asked has the complete image: its bootloader may start
+        it.
+        """
         self.is_told_to_update = False
         self._burst_until = self._now + self._timings.application_start_timeout_s
 
     def cycle_power(self) -> None:
-        """The run switches its power off and on."""
+        """Note that the run switches its power off and on."""
         self.power_cycles += 1
         self._restart()
         self._announced_on = _ANNOUNCED_ON  # the power may go a moment later
 
     def allow(self, content: Content) -> None:
-        """This is going to be written to it: the old value is as good as the new one."""
+        """Note that the run is about to write this: old and new value are both valid."""
         for name, text in _identity(content).items():
             if name in self._known:
                 self._known[name] |= {text}
 
     def wrote(self, content: Content) -> None:
-        """It was written and read back: only the new value is good."""
+        """Note that this was written and read back: only the new value is valid."""
         for name, text in _identity(content).items():
             if name in self._known:
                 self._known[name] = frozenset({text})
@@ -200,7 +198,7 @@ class Continuity:
     # -- what is sent and received ----------------------------------------------------------------
 
     def listened(self, now: float) -> None:
-        """Somebody has listened up to now; called again and again while the run uses the bus."""
+        """Note that the bus was read up to now; called repeatedly during a run."""
         passed_s = now - self._now
         if passed_s <= self._blind_s:
             self._listened_s += passed_s
@@ -287,7 +285,7 @@ class Continuity:
 
     @property
     def _pause_s(self) -> float:
-        """Since the last announcement of a burst that may go on."""
+        """Time since the last announcement of a burst that may continue."""
         return inf if self._announced_s is None else self._listened_s - self._announced_s
 
     def _restart(self) -> None:
@@ -298,7 +296,7 @@ class Continuity:
         self._burst_until = inf
 
     def _take_power_up(self, now: float, *, was_heard: bool) -> None:
-        """Its power came, and it was heard before, or had been silent."""
+        """Judge a power-up of a device that was known or silent before."""
         if self._has_acted or now <= self._supplied_until:
             return
         # A unit is held from its identification on; before that, another one may be put in.
@@ -342,7 +340,7 @@ class Continuity:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
 
     def _count_caused(self, *, goes_on: bool) -> bool:
-        """Count an announcement after a restart that the run has caused: no further burst is due
+        """Count an announcement after a restart that the run has caused; no further burst is due
         then. True for the first one of that burst.
         """
         is_caused = self._now <= self._burst_until
@@ -353,7 +351,7 @@ class Continuity:
         return is_caused and not goes_on
 
     def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
-        """Whether the announcement may be of another unit, which came while nobody listened."""
+        """Judge whether the announcement may be of another unit that came in unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
             is_after_reset = not goes_on and self._announced_on < _ANNOUNCED_ON

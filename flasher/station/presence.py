@@ -1,8 +1,8 @@
-"""What is heard on a bus: announcements of a bootloader, and whether a unit is in the socket.
+"""Presence detection on a bus: bootloader announcements, and whether a unit is in the socket.
 
-Units talk by themselves, announce themselves when their power comes, or are asked for their version
-while the socket is idle; the answer may name the unit's serial number. A target that can do none of
-it is not seen; then only a person knows.
+Units send messages on their own, announce themselves at power-up, or answer version requests while
+the socket is idle; the answer may contain the serial number. A target that does none of these is
+not detected; only a person can see it.
 """
 
 from __future__ import annotations
@@ -28,24 +28,22 @@ from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
 BLIND_S: Final = 0.15
-"""In a longer time between two looks at the bus, in real seconds, nobody has listened: whoever
-listens looks every 0.1 s. With what is thrown away before the next look it has to stay below
-`PAUSE_S`.
-"""
+"""A longer time between two polls of the bus, in real seconds, counts as unobserved; polls are 0.1
+s apart. With the frames that are discarded before the next poll it must stay below `PAUSE_S`."""
 SILENCE_S: Final = 2.0
-"""A unit of which nothing was heard for so long is out."""
+"""A unit that has sent nothing for this time is out."""
 PROBE_S: Final = 0.5
-"""How often a unit is asked whether it is there."""
+"""Interval between requests to a unit."""
 PAUSE_S: Final = 0.25
-"""Announcements of one power-up follow each other sooner."""
+"""Announcements of one power-up are less than this apart."""
 _RHYTHM_S: Final = 1.0
-"""Pauses of a bootloader that goes on announcing come again within this time."""
+"""Pauses of a bootloader that keeps announcing recur within this time."""
 _ALIKE: Final = 1.5
-"""Two pauses that differ by less than this factor are alike."""
+"""Two pauses within this factor of each other are alike."""
 
 
 class Watched(Protocol):
-    """A target, and what holds for it."""
+    """A target with its profile."""
 
     @property
     def target(self) -> Target: ...
@@ -54,9 +52,7 @@ class Watched(Protocol):
 
 
 class TargetWatcher:
-    """A driver's tap: what a device says by itself, and what it answers when it is asked for its
-    version.
-    """
+    """Tap of a driver that records a device's announcements, traffic and version answers."""
 
     def __init__(self, loaded: Watched) -> None:
         timings = loaded.profile.timings
@@ -64,16 +60,16 @@ class TargetWatcher:
         self._boot = Reassembler(loaded.target.answer_id, limit_s)
         self._own_ids = frozenset(sent_ids(loaded.target))
         self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
-        """How it is asked; None where nobody knows."""
+        """Its version request; None without a known one."""
         item = None if self.request is None else self.request.answer_item
         self._item = item
         self._answers = None if item is None else Reassembler(item.can_id, limit_s)
         self.announcements = 0
         """Of its bootloader."""
         self.version = ""
-        """Of its bootloader, as announced last, escaped."""
+        """The boot version that was announced last, escaped."""
         self.heard_at: float | None = None
-        """When the device last said anything."""
+        """Time of the last frame of the device."""
         self.has_sent_message = False
         """A whole message of its bootloader, or anything of its application, was received."""
         self.announced_at: float | None = None
@@ -84,26 +80,25 @@ class TargetWatcher:
         self.completions = 0
         """Of images, by its bootloader."""
         self.answers = 0
-        """To a question for its version, whoever asked."""
+        """Number of version answers, whoever asked."""
         self.answer: Content | None = None
-        """The last one."""
+        """The last version answer."""
         self.power_ups = 0
-        """How often another unit may have come: announcements that began after a pause, or after
-        the application was heard; an application that was heard after announcements of which no
-        end was to be expected.
-        """
+        """Number of times that another unit may have come: announcements after a pause or after
+        traffic of the application, or traffic of the application after announcements that were not
+        expected to end."""
         self.has_application = False
-        """It was heard since it announced itself."""
+        """The application has sent since the last announcement."""
         self._announcing_on_s = timings.announcing_on_s
         self._announcing_s = 0.0
-        """How long it has announced itself."""
+        """Duration of the announcements so far."""
         self._paused_s = 0.0
         """The last pause between announcements, 0 before one, and when it ended."""
         self._paused_at = float("-inf")
         self._is_pace_unknown = False
         """There was only one announcement before the last pause, the first one."""
         self._missed_s = 0.0
-        """How long nobody has listened since the last announcement."""
+        """Unobserved time since the last announcement."""
         self.serial: str | None = None
         """The serial number in its last answer, empty without one; None: it has not answered."""
 
@@ -126,12 +121,12 @@ class TargetWatcher:
 
     @property
     def is_in_bootloader(self) -> bool:
-        """True when nothing but announcements was heard since it announced itself."""
+        """True when it has sent only announcements since the first one."""
         return self.announcements > 0 and not self.has_application
 
     @property
     def is_known(self) -> bool:
-        """True when it has announced itself, or its application was heard."""
+        """True when it has announced itself or its application has sent."""
         return self.announcements > 0 or self.has_application
 
     def _hear_bootloader(self, message: Message, now: float) -> None:
@@ -149,11 +144,11 @@ class TargetWatcher:
 
     def _hear_application(self) -> None:
         if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
-            self._powered_up()  # one that has no application does not start it
+            self._powered_up()  # a device without an application does not start one
         self.has_application = True
 
     def miss(self, missed_s: float) -> None:
-        """Nobody has listened for so long: that is no pause of the device, and no silence."""
+        """Add unobserved time: it counts neither as a pause of the device nor as silence."""
         self._missed_s += missed_s
         if self.heard_at is not None:
             self.heard_at += missed_s
@@ -187,13 +182,13 @@ class TargetWatcher:
         self.announced_at, self.has_application = now, False
 
     def _powered_up(self) -> None:
-        """What it answered before may be of another unit."""
+        """Discard the earlier answers: they may be of another unit."""
         self.power_ups += 1
         self._announcing_s = 0.0
         self.serial = self.answer = None
 
     def _take(self, message: Message) -> None:
-        """A message that may be the answer."""
+        """Record a message that may be the version answer."""
         item = self._item
         if item is None or (message.mode, message.command) != (item.mode, item.command):
             return
@@ -204,19 +199,19 @@ class TargetWatcher:
 
 
 class Presence:
-    """Watches an idle bus; pure: frames and times come from outside."""
+    """Presence of a unit on an idle bus; pure: frames and times are arguments."""
 
     def __init__(self, targets: Sequence[LoadedTarget]) -> None:
         self._targets = targets
         self._probed_at: float | None = None
         self._number = 0
-        """Of the last change."""
+        """Number of the last change."""
         self.begin()
         self._requests = [each.request for each in self.watchers if each.request is not None]
 
     @property
     def sees_units(self) -> bool:
-        """True when a unit that is there can be asked."""
+        """True when a present unit can be asked."""
         return bool(self._requests)
 
     @property
@@ -224,7 +219,7 @@ class Presence:
         return sum(watcher.power_ups for watcher in self.watchers)
 
     def _is_in_bootloader(self, now: float) -> bool:
-        """True when nothing is heard but announcements."""
+        """True when only announcements are received."""
         return all(
             watcher.is_in_bootloader
             for watcher in self.watchers
@@ -232,27 +227,26 @@ class Presence:
         )
 
     def begin(self) -> None:
-        """Forget what was heard: after a run, or while nothing could be heard, all may differ."""
+        """Reset after a run or an unobserved time, when everything may have changed."""
         self.is_there: bool | None = None
-        """None: not known yet."""
+        """None while unknown."""
         self._heard_at: float | None = None
         self._began_at: float | None = None
         self._told_in_bootloader = False
         self.exchanged_number = self.missed_number = 0
-        """The number of the last change after which another unit may be there, and of the last one
-        before which nobody listened.
-        """
+        """Numbers of the last change after which another unit may be present, and of the last one
+        after unobserved time."""
         self._forget_unit()
 
     def _forget_unit(self) -> None:
         self.watchers = [TargetWatcher(each) for each in self._targets]
-        """One for each target: what was heard of the unit that is there."""
+        """One watcher a target, for the unit that is present."""
         self._told_serial: str | None = None
         self._told_power_ups = 0
         self._was_missed = False
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """One frame of an idle bus."""
+        """Handle one frame of an idle bus."""
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
             # The end of an announcement that began before is no evidence of its own.
@@ -260,7 +254,7 @@ class Presence:
                 self._heard_at = now
 
     def miss(self, missed_s: float) -> None:
-        """Nobody has listened for so long."""
+        """Add unobserved time."""
         if missed_s > PAUSE_S and any(each.is_in_bootloader for each in self.watchers):
             self._was_missed = True
         for watcher in self.watchers:
@@ -269,7 +263,7 @@ class Presence:
             self._heard_at += missed_s
 
     def probe(self, now: float) -> list[Frame]:
-        """What is to be sent now: a question to each target that can be asked, in its time."""
+        """The frames to send now: a version request to each target that has one, when due."""
         if self._probed_at is not None and now - self._probed_at < PROBE_S:
             return []
         self._probed_at = now
@@ -289,7 +283,7 @@ class Presence:
             return None
         is_power_up = heard and self._power_ups > self._told_power_ups
         in_bootloader = heard and self._is_in_bootloader(now)
-        # What the unit says that it is; None before it has said anything.
+        # The serial number that the unit reports; None before its first answer.
         said = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, said), "") if said else None
         told = (self.is_there, self._told_serial, self._told_in_bootloader)

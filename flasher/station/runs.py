@@ -41,11 +41,11 @@ class ActiveRun:
     claim: Claim
     begun_s: float
     where: str = StepName.CONNECT.value
-    """The step that goes on, with its target."""
+    """The active step, with its target."""
     journal_error: str = ""
     """Something of it could not be saved: it cannot pass any more."""
     reported: RunResult | None = None
-    """Its end, once the process said it."""
+    """Its end, once the process has reported it."""
     ended_s: float = 0.0
     attached: list[AttachmentFile] = field(default_factory=list)
     result: RunResult | None = None
@@ -54,7 +54,7 @@ class ActiveRun:
 
 
 def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
-    """Save how a run ended; what comes back is on disk. Raises RecordError."""
+    """Save the end of a run; returns what is on disk. Raises RecordError."""
     if run.result is None:
         run.result = _judged(run)
     if not run.attached:
@@ -116,7 +116,7 @@ def sentence(text: str) -> str:
 
 
 def verified_words(result: RunResult) -> str:
-    """How far each target was verified, as a person reads it."""
+    """The verification level of each target, for people."""
     return "; ".join(f"{name}: {level.words}" for name, level in result.verified.items())
 
 
@@ -155,13 +155,13 @@ def with_history(
 
 
 def _after(runs: list[RunDetails], ends: Callable[[RunDetails], bool]) -> list[RunDetails]:
-    """The runs behind the last one that ends a story."""
+    """The runs after the last one with a verdict."""
     last = next((at for at in reversed(range(len(runs))) if ends(runs[at])), -1)
     return runs[last + 1 :]
 
 
 def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
-    """What must not change, as the first of these runs that wrote anything read it."""
+    """Values that must not change, as the first of these runs with a write read them."""
     known: dict[str, str] = {}
     for run in runs:
         if not run.writes:

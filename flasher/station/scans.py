@@ -58,7 +58,7 @@ class Word(StrEnum):
 
 @dataclass
 class Waiting:
-    """What was scanned at one source and waits for the scan that belongs to it."""
+    """A scan of one source that waits for the scan that belongs to it."""
 
     source: Source
     label: str = ""
@@ -95,7 +95,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Command:
-    """A command with what stands behind its word."""
+    """A command word with its argument."""
 
     word: Word
     argument: str = ""
@@ -214,7 +214,7 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
 
 
 def check_free(socket: Socket) -> None:
-    """Raises Refused while a run of the socket goes on, or is not saved."""
+    """Raises Refused while a run of the socket is active or unsaved."""
     if socket.phase is not SocketPhase.REST:
         serial = printable(socket.serial)
         reason = text("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
@@ -267,7 +267,7 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
 
 
 def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
-    """Raises Refused for a label where another unit is known to be in the socket."""
+    """Raises Refused for a label when another unit is known to be in the socket."""
     last = socket.holds
     if last is not None and last.serial != serial:
         raise still_there(socket, last)
@@ -302,7 +302,7 @@ def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Sour
 
 
 def _way_out(socket: Socket, source: Source) -> str:
-    """What to scan so that a label does not wait for its unit any more."""
+    """The scan that releases a label which waits for its unit."""
     return Word.CANCEL.value if socket.source == source else f"{Word.FREE.value} {socket.name}"
 
 
@@ -322,7 +322,7 @@ def one_at_a_time(label: str, wanted: str, way: str = Word.CANCEL.value) -> Refu
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:
-    """For a scan that means another unit than the one that is heard."""
+    """The refusal of a scan for another unit than the detected one."""
     return Refused(
         "TAKE_OUT",
         text(

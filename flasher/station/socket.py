@@ -1,8 +1,8 @@
 """State of one socket: its process, the unit in it, its label and its last run.
 
-A unit is known by what is heard of it. One that falls silent may sleep, and is not taken for one
-that was removed, unless it would tell its serial number when it is heard again. One that announces
-a power-up, or reports another serial number, may be another one that was put in its place.
+Only traffic shows a unit. A silent one may be asleep and counts as removed only if it would report
+its serial number on waking up. A unit that announces a power-up, or reports another serial number,
+may have been exchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Shown = tuple[SocketState, str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """Where scans come from. Two with the same name are one."""
+    """Origin of scans. Sources with the same name are one."""
 
     name: str = ""
     """As events and messages have it: "scanner left"."""
@@ -33,12 +33,12 @@ class Source:
 
 SCANNER: Final = "scanner "
 PAGE: Final = "page "
-"""How the names of browsers' sessions begin."""
+"""Prefix of the names of browser sessions."""
 TERMINAL: Final = Source("terminal")
 PIPE: Final = Source("standard input")
 FILE: Final = Source("file of scans")
 UNNAMED: Final = Source()
-"""Of a program that has one."""
+"""A program that has only one source."""
 _SHOWN: Final = {
     TERMINAL.name: text("terminal"),
     PIPE.name: text("standard input"),
@@ -48,7 +48,7 @@ _SHOWN: Final = {
 
 
 def source_words(name: str) -> str:
-    """The name of a source for people."""
+    """The name of a source, for people."""
     if name.startswith(SCANNER):
         return text("scanner {name}", name=printable(name.removeprefix(SCANNER)))
     if name.startswith(PAGE):
@@ -57,7 +57,7 @@ def source_words(name: str) -> str:
 
 
 class SocketPhase(Enum):
-    """Where a socket's run is."""
+    """Progress of a socket's run."""
 
     REST = "no run"
     CLAIM = "the records are asked for a run"
@@ -66,7 +66,7 @@ class SocketPhase(Enum):
 
 
 class Occupancy(Enum):
-    """Whether a unit is in the socket."""
+    """Presence of a unit in the socket."""
 
     UNKNOWN = "nothing is known since its process began"
     THERE = "it is heard"
@@ -75,7 +75,7 @@ class Occupancy(Enum):
 
 
 class Binding(Enum):
-    """How a label was assigned to a socket."""
+    """The way in which a label was assigned to a socket."""
 
     NAMED = "the station named the socket: the unit has to arrive there, from now on"
     SAID = "a person scanned the socket's card with it, or the unit itself says so"
@@ -91,9 +91,9 @@ class LastRun:
     """None until it is on disk."""
     action: str = ""
     has_talked: bool = False
-    """Its unit was heard after the run."""
+    """Its unit has sent something after the run."""
     has_said: bool = False
-    """Its unit said its serial number after the run."""
+    """Its unit has reported its serial number after the run."""
 
 
 def _state_after(outcome: RunState) -> SocketState:
@@ -108,47 +108,47 @@ class Socket:
     is_virtual: bool = False
     phase: SocketPhase = SocketPhase.REST
     out_of_service: str | None = ""
-    """Why it cannot work; empty while it starts, None when it can."""
+    """The reason why it cannot work; empty while it starts, None when it can."""
     sees_units: bool = True
     occupancy: Occupancy = Occupancy.UNKNOWN
     own: str | None = None
-    """The serial number that the unit itself says; empty: it has none; None: not said yet."""
+    """The serial number that the unit reports; empty: it has none; None: not reported yet."""
     is_own_known: bool = False
-    """`own` is a serial number of the recipe: the unit can be told from others."""
+    """`own` is a serial number of the recipe: it identifies the unit."""
     borne: str = ""
-    """The label that a virtual unit bears."""
+    """The label on a virtual unit."""
     label: str = ""
     """The label of the next run."""
     binding: Binding = Binding.SAID
     source: Source = UNNAMED
     """Where the label was scanned."""
     begin_at_s: float | None = None
-    """When the run begins although no unit is heard, or although it does not say who it is."""
+    """Time at which the run begins even if no unit is detected or identified."""
     bound_at_s: float = 0.0
-    """When it got its label."""
+    """Time at which the label was assigned."""
     presence_number: int = 0
-    """Of the last change of presence that was reported."""
+    """Number of the last reported change of presence."""
     arrived_at_s: float = 0.0
-    """When the unit in it was heard first."""
+    """Time at which its unit was detected."""
     is_in_bootloader: bool = False
-    """Nothing but its bootloader's announcements is heard: it cannot say who it is."""
+    """It sends only announcements of its bootloader, so it cannot report its serial number."""
     serial: str = ""
-    """The unit of the run that goes on."""
+    """The unit of the active run."""
     last: LastRun | None = None
     is_last_there: bool = False
-    """The unit of the last run may be there, and nothing was heard that may be another one."""
+    """The unit of the last run may be present; no traffic suggests another one."""
     is_chosen: bool = False
     """Its card was scanned, and the label of its unit comes next."""
     interrupted: str = ""
     """The unit of a run that a dead station left in this socket."""
     note: str = ""
-    """What is wrong with the last label, or with saving."""
+    """Error of the last label, or of saving."""
     note_until_s: float | None = None
-    """The note is about what was dropped, and is shown until then."""
+    """Until then the note about a dropped scan is shown."""
     out_since_s: float = 0.0
-    """Since when it is out of service."""
+    """Start of the outage."""
     shown: Shown | None = None
-    """What was told last."""
+    """The view that was reported last."""
 
     @property
     def can_work(self) -> bool:
@@ -157,17 +157,17 @@ class Socket:
 
     @property
     def is_there(self) -> bool:
-        """True while a unit is heard in it."""
+        """True while a unit is detected in it."""
         return self.occupancy is Occupancy.THERE
 
     @property
     def is_running(self) -> bool:
-        """True from the claim until the process said the end of the run."""
+        """True from the claim until the process has reported the end of the run."""
         return self.phase in (SocketPhase.CLAIM, SocketPhase.RUN)
 
     @property
     def is_busy(self) -> bool:
-        """True while a run goes on, is not saved yet, or has its label."""
+        """True while a run is active, is not saved yet, or has its label."""
         return self.phase is not SocketPhase.REST or bool(self.label)
 
     @property
@@ -185,12 +185,12 @@ class Socket:
 
     @property
     def holds(self) -> LastRun | None:
-        """The last run, while its unit is heard or not known to be gone."""
+        """The last run, while its unit is detected or not known to be removed."""
         return None if self.occupancy is Occupancy.SILENT else self.verdict
 
     @property
     def awaits_label(self) -> bool:
-        """True when a unit is in it that has no label yet."""
+        """True when it holds a unit without a label."""
         is_free = self.can_work and self.phase is SocketPhase.REST and not self.label
         return is_free and self.is_there and self.verdict is None
 
@@ -205,13 +205,13 @@ class Socket:
     # -- the unit in it ---------------------------------------------------------------------------
 
     def is_exchange(self, what: PresenceChanged) -> bool:
-        """True when the unit that is heard may be another one than was there a moment ago."""
+        """True when the detected unit may be another one than a moment ago."""
         is_other = None not in (self.own, what.serial) and self.own != what.serial
         return self.is_there and what.is_there and (what.is_power_up or what.was_missed or is_other)
 
     def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
-        """A unit is heard, or says who it is; `is_serial`: by a number of the recipe. True when it
-        is another one than before.
+        """Note a unit that was detected or reported its serial number; `is_serial`: a number of the
+        recipe. True when it is another unit than before.
         """
         before, self.occupancy = self.occupancy, Occupancy.THERE
         self.is_in_bootloader = what.is_in_bootloader
@@ -248,12 +248,12 @@ class Socket:
         return False
 
     def _forget_note(self) -> None:
-        """Clear the note: it was about the unit that was there before."""
+        """Clear the note about the unit before."""
         if self.phase is SocketPhase.REST and self.note_until_s is None:
             self.note = ""
 
     def fall_silent(self, *, is_certain: bool) -> bool:
-        """Nothing is heard any more, or nothing is in it for certain. True when a unit was."""
+        """Note that no unit is detected any more, or certainly none is there. True when one was."""
         before = self.occupancy
         last = self.last
         # One that has passed has answered at the end of its run: it does not sleep, it was pulled.
@@ -286,8 +286,8 @@ class Socket:
 
     @property
     def is_unidentified(self) -> bool:
-        """True when its label was not scanned with its card, and the unit in it does not say who it
-        is: it does not answer, or is in its bootloader.
+        """True when its label was scanned without its card, and the unit does not identify itself:
+        it does not answer, or is in its bootloader.
         """
         could_say = self.sees_units and self.binding is Binding.NAMED and not self.borne
         return (
@@ -297,7 +297,7 @@ class Socket:
         )
 
     def is_due(self, now: float) -> bool:
-        """True when the unit of its label is there, as far as known."""
+        """True when the unit of its label is present, as far as known."""
         is_free = self.can_work and self.phase is SocketPhase.REST and not self.is_chosen
         if not (self.label and is_free) or self.is_unidentified:
             return False
@@ -316,7 +316,7 @@ class Socket:
 
     @property
     def wanted(self) -> str:
-        """What its label waits for."""
+        """The next step that its label needs."""
         shown = printable(self.label)
         if self.binding is not Binding.NAMED:
             return text("Connect {label}.", label=shown)
@@ -326,7 +326,9 @@ class Socket:
         return text("Put {label} into socket {socket}.", label=shown, socket=self.name)
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
-        """What it shows; `stopped` is why the line is stopped, `is_only`: there is no other one."""
+        """The view of the socket; `stopped` is why the line is stopped, `is_only`: there is no
+        other socket.
+        """
         if self.is_running:
             return SocketState.RUNNING, self.serial, ""
         if self.phase is SocketPhase.SAVE:
@@ -358,7 +360,7 @@ class Socket:
         return self._view_free(card)
 
     def _view_free(self, card: str) -> Shown:
-        """Without a label; `card` is what has to be scanned with it."""
+        """The view without a label; `card` is the scan that must go with it."""
         borne = text(" It bears {label}.", label=printable(self.borne)) if self.borne else ""
         if self.interrupted:
             sentence = text(

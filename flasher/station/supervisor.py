@@ -14,8 +14,8 @@ from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, Wor
 from flasher.station.worker import worker_main
 
 HANG_S: Final = 10.0
-"""A process that says nothing for so long hangs: it beats every half second, and no call of an
-adapter takes longer than some seconds."""
+"""A process that sends nothing for this time hangs: heartbeats come every half second, and no call
+of an adapter takes longer than some seconds."""
 START_S: Final = 60.0
 """A process that has only begun may take longer: it loads its adapter's driver."""
 RESTART_MIN_S: Final = 1.0
@@ -44,7 +44,7 @@ class WorkerPort(Protocol):
         """End the process at once, and wait for its end."""
 
     def join(self, limit_s: float) -> bool:
-        """Wait for its own end; False when it did not come."""
+        """Wait for it to end by itself; False when it did not."""
 
 
 class ProcessPort:
@@ -90,7 +90,7 @@ class ProcessPort:
 
 @dataclass(frozen=True)
 class WorkerLost:
-    """A process is gone and will be started again after `restart_in_s`; None: it will not."""
+    """A process was lost. It is restarted after `restart_in_s`; None: never."""
 
     reason: str
     hung: bool
@@ -101,7 +101,7 @@ Launch = Callable[[WorkerSetup], WorkerPort]
 
 
 class _Slot:
-    """What is known of one socket's process."""
+    """State of one socket's process."""
 
     def __init__(self, setup: WorkerSetup) -> None:
         self.setup = setup
@@ -109,10 +109,10 @@ class _Slot:
         self.heard_at = 0.0
         self.is_new = True
         self.start_at: float | None = 0.0
-        """When it is to be started; None: not by itself."""
+        """Time of its next start; None: not scheduled."""
         self.pause_s = RESTART_MIN_S
         self.reason = ""
-        """Why it said that it cannot work."""
+        """The reason that it reported for not working."""
 
 
 class Supervisor:
@@ -134,12 +134,12 @@ class Supervisor:
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
 
     def send(self, socket: str, message: ToWorker) -> bool:
-        """False when there is no process that could get it."""
+        """False without a process that could receive it."""
         port = self._slots[socket].port
         return port is not None and port.send(message)
 
     def wait(self, extra: Sequence[Any], limit_s: float) -> None:
-        """Return when there is something to receive, at the latest after `limit_s`."""
+        """Wait for a message, up to `limit_s`."""
         found = [port.waitable for port in self.ports.values()]
         waitables = [*filter(None, found), *extra]
         if waitables:
@@ -147,7 +147,7 @@ class Supervisor:
                 wait(waitables, timeout=limit_s)
 
     def poll(self) -> list[tuple[str, FromWorker | WorkerLost]]:
-        """What the processes said, and who of them is gone; starts those that are due."""
+        """The messages of the processes, and the lost ones; starts those that are due."""
         found: list[tuple[str, FromWorker | WorkerLost]] = []
         for name, slot in self._slots.items():
             if slot.port is None:
@@ -183,7 +183,7 @@ class Supervisor:
     # -- one process ------------------------------------------------------------------------------
 
     def _receive(self, slot: _Slot) -> tuple[list[FromWorker], bool]:
-        """Everything that it said, and whether it is gone."""
+        """All its messages, and whether it is gone."""
         messages: list[FromWorker] = []
         port = slot.port
         if port is None:

@@ -1,5 +1,5 @@
-"""What a unit says, held against recipe and manifest: versions, limits, what was written, what must
-not change.
+"""Checks of a unit's answers against recipe and manifest: versions, limits, written and unchanged
+values.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ OF_CHECK: Final = {
     IdentityCheck.PREVIOUS: codes.OLD_VERSION,
     IdentityCheck.IN_USE: codes.IN_USE,
 }
-"""The code of a check that speaks against the unit, where it is not NOT_FOR_DEVICE."""
+"""The code of a failed check, where it is not NOT_FOR_DEVICE."""
 
 
 def check_texts(allowed: Sequence[str], found: str | None, code: Code) -> None:
-    """Hold what a device says against patterns of a recipe. Raises StepFailedError."""
+    """Check reported texts against the patterns of a recipe. Raises StepFailedError."""
     if not allowed or found is None:
         return
     # Only * has a meaning in these patterns.
@@ -43,7 +43,7 @@ def check_texts(allowed: Sequence[str], found: str | None, code: Code) -> None:
 
 
 def check_measured(measured: Sequence[Measurement]) -> None:
-    """Hold measurements against their limits. Raises StepFailedError."""
+    """Check measurements against their limits. Raises StepFailedError."""
     for each in measured:
         if each.is_within:
             continue
@@ -56,12 +56,12 @@ def check_measured(measured: Sequence[Measurement]) -> None:
 
 
 def wanted_text(plan: WritePlan) -> str:
-    """What is written, as the records show it."""
+    """The written value, as the records show it."""
     return ", ".join(change.new for change in field_changes(plan, None))
 
 
 def said_of(target: UnitTarget, found: Identified) -> list[Measurement]:
-    """What a device reported of itself, as measurements without limits."""
+    """The reported identity of a device, as measurements without limits."""
     name, version = target.name, found.seen.version
     if version is None:
         return [Measurement(f"{name} identity", text=NOT_IDENTIFIED)]
@@ -83,7 +83,7 @@ def state_words(target: UnitTarget, found: Identified) -> str:
 
 
 class UnitReads:
-    """What one run reads of its unit."""
+    """Reads of one run."""
 
     def __init__(
         self, claim: Claim, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
@@ -139,7 +139,7 @@ class UnitReads:
                 yield Measurement(f"{BEFORE}{name}", text=text)
 
     def unchanged(self, measured: list[Measurement]) -> None:
-        """Hold what must not change against what it was. Raises StepFailedError."""
+        """Check that values which must not change are as before. Raises StepFailedError."""
         for target, readable in self._unchanged():
             for name, text in self._texts(target, readable).items():
                 first = self._before.get(name)

@@ -1,8 +1,8 @@
-"""The run of one unit, from the first question to the last: blocking, on an open connection.
+"""The run of one unit, from first request to last: blocking, on an open connection.
 
-It knows no database: what must be on disk before it may go on is handed to a `Journal`, and an act
-that cannot be noted is not done. What each step does stands in `unit_steps`; here is how steps are
-begun, tried again, timed, recorded and judged.
+It knows no database: a `Journal` stores what must be on disk before the run may continue, and an
+act that cannot be recorded is not done. `unit_steps` has the steps; this module begins, retries,
+times, records and judges them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from flasher.station.unit_steps import Act, UnitSteps
 from flasher.station.unit_target import StepFailedError, UnitTarget
 
 _PROGRESS_S: Final = 0.25
-"""Progress is told this often at the most: it must never fill the way to the station."""
+"""Minimum interval between reports of progress, so that they never fill the pipe to the station."""
 _STATES: Final = {
     RunState.FAIL: StepState.FAIL,
     RunState.ERROR: StepState.ERROR,
@@ -122,7 +122,7 @@ class UnitRun:
         self._hear_waiting: Callable[[], None] = lambda: None
 
     def listen_meanwhile(self) -> None:
-        """Hear what came; called while the records save something, so that this is no pause."""
+        """Read the bus while the records save something, so that this is no unobserved time."""
         with suppress(BusError):  # whoever uses the adapter next says so
             self._hear_waiting()
 
@@ -176,7 +176,7 @@ class UnitRun:
     # -- one step ---------------------------------------------------------------------------------
 
     def _do(self, steps: UnitSteps, step: StepName, target: str, act: Act | None) -> None:
-        """Try a step as often as the recipe says. Raises StepFailedError."""
+        """Try a step as often as the recipe allows. Raises StepFailedError."""
         rule = self._recipe.recipe.rule(step)
         if act is None:
             serial = self._claim.serial
@@ -247,7 +247,9 @@ class UnitRun:
         return failed
 
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
-        """What ends the run where the unit may be another one: that goes before all else."""
+        """The ending of a run whose unit may have been exchanged; it takes precedence over all
+        others.
+        """
         lost = next((each.lost for each in self._continuity.values() if each.lost), "")
         unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
         if not (lost or unobserved):

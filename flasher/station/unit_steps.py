@@ -1,7 +1,7 @@
-"""What each step of a unit's run does: identify, check, flash, write, restart, verify.
+"""Steps of a unit's run: identify, check, flash, write, restart, verify.
 
-An act gets a list for its measurements, returns a few words for the record, and raises
-StepFailedError with the code of what is wrong.
+A step adds its measurements to a list, returns a short text for the record, and raises
+StepFailedError with a code.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _OF_VERDICT: Final = {
     Verdict.SECOND_TOOL: codes.SECOND_TOOL,
     Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
 }
-"""What a bad verification is in the records."""
+"""Codes of the records for failed verifications."""
 _SPACINGS_OF_WATCH: Final = 3
 Act = Callable[[list[Measurement]], str]
 
@@ -79,9 +79,9 @@ class UnitSteps:
     ) -> None:
         self.targets = targets
         self.verified: dict[str, Verified] = {}
-        """How far each target was verified in this run."""
+        """Verification level of each target in this run."""
         self.left_behind = ""
-        """The state that a device would be left in now, where that matters."""
+        """The state in which a device would be left now, where that matters."""
         self._claim = claim
         self._is_verify_only = claim.kind is RunKind.VERIFY_ONLY
         self._recipe = recipe
@@ -98,7 +98,7 @@ class UnitSteps:
         self._reads = UnitReads(claim, recipe, scan, targets)
 
     def acts(self) -> Sequence[tuple[StepName, str, Act | None]]:
-        """Every step in order, with its target where it has one of its own; None: not needed."""
+        """Every step in order, with its target, if any; None: not needed."""
         may_write = not self._is_verify_only
         flashes: list[tuple[StepName, str, Act | None]] = [
             (StepName.FLASH, target.name, partial(self._flash, target) if may_write else None)
@@ -117,14 +117,14 @@ class UnitSteps:
 
     @property
     def has_lost_its_session(self) -> bool:
-        """True when a device was told to update and runs no application since: it cannot say any
-        more who it is, so nothing is begun anew with it.
+        """True when a device got an update command and has run no application since: it cannot
+        identify itself, so nothing may begin again with it.
         """
         return any(each.continuity.is_told_to_update and not each.goes_on for each in self.targets)
 
     def wait(self, limit_s: float) -> None:
-        """Let time pass between two tries; an application that runs is asked meanwhile who it is.
-        Raises StepFailedError when it falls silent.
+        """Wait between two tries, and keep asking a running application to identify itself. Raises
+        StepFailedError when it falls silent.
         """
         clock = self.targets[0].clock
         ends_at = clock.now() + limit_s
@@ -176,8 +176,8 @@ class UnitSteps:
         return "; ".join(said)
 
     def _check_label(self) -> None:
-        """The device's own serial number against the label. A new unit has none yet, or what its
-        maker put there; one of this recipe's numbers is that unit's own.
+        """Compare the device's serial number with the label. A new unit has none yet, or its
+        maker's; a number of this recipe belongs to that unit alone.
         """
         for found in self._identified.values():
             own = found.serial_number
@@ -229,8 +229,8 @@ class UnitSteps:
     # -- flashing ---------------------------------------------------------------------------------
 
     def _flash(self, target: UnitTarget, measured: list[Measurement]) -> str:
-        """Flash it, unless that is proven to be done: noted before, rescued by a power cycle where
-        it fell silent, noted after.
+        """Flash it unless it is proven to be done: record it before, rescue it by a power cycle
+        where it falls silent, record it after.
         """
         name, found = target.name, self._identified[target.name]
         if (
@@ -354,7 +354,9 @@ class UnitSteps:
         return f"{len(self._plans)} written"
 
     def _await(self, target: UnitTarget) -> Content:
-        """Its version answer, once it runs; noted as what it says. Raises StepFailedError."""
+        """Its version answer once the application runs, recorded as its identity. Raises
+        StepFailedError.
+        """
         was_running = target.continuity.is_running and not target.goes_on
         answer = target.await_application()
         if answer is None and was_running:
@@ -422,7 +424,7 @@ class UnitSteps:
         return "; ".join(said)
 
     def _continuity(self) -> Iterator[Measurement]:
-        """What the record says of the time in which the unit was watched."""
+        """The record's sentence on how long the unit was watched."""
         for target in self.targets:
             is_watched = target.continuity.is_running and not target.goes_on
             words = "observed" if is_watched else "not observed"
@@ -432,7 +434,9 @@ class UnitSteps:
             yield Measurement(POWER_CYCLES, float(cycles))
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
-        """How far the image is proven now. Raises StepFailedError where something is against it."""
+        """The verification level of the image now. Raises StepFailedError for evidence against
+        it.
+        """
         loaded, name = target.loaded, target.name
         needs_memory = loaded.required is Verified.MEMORY
         if target.version_request is None:

@@ -1,6 +1,6 @@
-"""One target of the unit in the socket: its `Device`, and what the station asks beside it.
+"""One target of the unit in a socket: its `Device`, and the station's own requests.
 
-Nothing here decides what a bad answer means: `unit_steps` does.
+It does not judge bad answers: `unit_steps` does.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class StepFailedError(Exception):
 
 @dataclass(frozen=True)
 class Identified:
-    """What a device said of itself before the first write."""
+    """Identity that a device reported before the first write."""
 
     seen: DeviceAnswers
     is_in_bootloader: bool
     two_devices: str
-    """What speaks for a second unit, in words; empty while nothing does."""
+    """Evidence of a second unit, as a sentence; empty without any."""
 
     @property
     def serial_number(self) -> str:
@@ -64,7 +64,7 @@ class Identified:
 
 
 class UnitTarget:
-    """A target on the bus. Methods raise BusError, and InterruptedByUserError when the run is to
+    """A target on the bus. Methods raise BusError, and InterruptedByUserError when the run must
     end.
     """
 
@@ -111,14 +111,14 @@ class UnitTarget:
             identity=loaded.profile.identity(release=loaded.release, goes_on_unchecked=True),
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
-        """How it is asked for its version; None where nobody knows."""
+        """Its version request; None without a known one."""
         self._cancelled = cancelled
 
     # -- asking -----------------------------------------------------------------------------------
 
     def identify(self) -> Identified:
-        """Ask it who it is; silence is no error here. One that has just been switched on passes
-        through its bootloader (R19): only one that goes on announcing itself has no application.
+        """Request its version; silence is not an error here. A device that was just switched on
+        passes through its bootloader (R19): only one that keeps announcing has no application.
         """
         found = self._identify_once()
         if not found.is_in_bootloader or self.version_request is None:
@@ -141,13 +141,13 @@ class UnitTarget:
         return Identified(asked.seen, announced, asked.two_devices)
 
     def is_silent(self, found: Identified) -> bool:
-        """True when it could have answered, and did not."""
+        """True when it could have answered and did not."""
         asked = self.version_request is not None
         return asked and found.seen.version is None and not found.is_in_bootloader
 
     def await_application(self) -> Content | None:
-        """Its version answer as soon as it runs; None when it does not in the time of a start, or,
-        where it has run, when it is silent.
+        """Its version answer as soon as the application runs; None when it does not start in time,
+        or was running and is silent.
         """
         may_start = self.goes_on or not self.continuity.is_running
         start_s = self.loaded.profile.timings.application_start_timeout_s
@@ -164,8 +164,8 @@ class UnitTarget:
                 return answer
 
     def find_out_who_is_there(self) -> None:
-        """Ask and listen after a transfer that failed; `continuity` notes what comes. One that has
-        sent nothing for a while is waited for: it announces itself when it has its supply again.
+        """Ask and listen after a failed transfer; `continuity` records the traffic. Waits for a
+        silent device, which announces itself when its supply returns.
         """
         timings = self.loaded.profile.timings
         tried_s = timings.packet_tries * timings.ack_timeout_s
@@ -180,8 +180,8 @@ class UnitTarget:
                 self.device.version()
 
     def confirm(self) -> None:
-        """Ask it once more who it is: `continuity` compares the answer. Raises StepFailedError when
-        an application that had answered does not any more; one that has restarted since is not
+        """Request its version again; `continuity` compares the answer. Raises StepFailedError when
+        an application that had answered no longer does; a device that has restarted since is not
         asked.
         """
         self.hear_waiting()
@@ -192,7 +192,7 @@ class UnitTarget:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} fell silent.")
 
     def hear_waiting(self) -> None:
-        """Take what came while nobody listened."""
+        """Process the frames that are queued in the driver."""
         link = self.device.connection.link
         for _ in range(_WAITING_MAX):
             frame = link.receive(AT_ONCE)
@@ -243,7 +243,7 @@ class UnitTarget:
     # -- running ----------------------------------------------------------------------------------
 
     def check_cancelled(self) -> None:
-        """Raises InterruptedByUserError when the run is to end."""
+        """Raises InterruptedByUserError when the run must end."""
         if self._cancelled():
             raise InterruptedByUserError("The run is to end.")
 
