@@ -110,8 +110,10 @@ class Continuity:
         """How long nobody has listened since the last announcement, or since the reset of one
         that announced nothing.
         """
-        self._now, self._listened_s = -inf, 0.0
-        """Up to when, and how long, somebody has listened so far."""
+        self._now, self._listened_s, self._reset_s = -inf, 0.0, -inf
+        """Up to when, and how long, somebody has listened so far; how long when the last reset was
+        sent.
+        """
         self._announced_s: float | None = None
         """The same when the last announcement of the burst came that goes on; None: none does."""
         self._burst_until = -inf
@@ -226,6 +228,9 @@ class Continuity:
             self._heard_s = self._listened_s
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
+        if watcher.confirmations > confirmations and (self._announced_s or 0.0) <= self._reset_s:
+            # Its application runs: the burst before the reset is over.
+            self._announced_s = None
         self._awaits_complete = self._awaits_complete and watcher.completions == completions
         if watcher.transfer_requests > requests and self.is_told_to_update:
             self._requested_s, self._burst_until = self._listened_s, -inf
@@ -254,6 +259,7 @@ class Continuity:
             awaits = self._awaits_confirmation or (may_be_running and not self._has_acted)
             self._has_acted = True
             is_reset = found.command in (self._reset_command, Command.RESET)
+            self._reset_s = self._listened_s if is_reset else self._reset_s
             self._announced_on = 0 if is_reset else self._announced_on
             if is_reset and not self.is_announcing:
                 self._missed_s = 0.0

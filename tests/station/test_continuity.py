@@ -78,6 +78,42 @@ def test_a_second_burst_after_the_complete_image_is_of_another_unit(
     assert "announced its bootloader" in run.continuity.lost
 
 
+@each("confirms_late", [False, True])
+def test_a_reset_that_is_confirmed_at_once_causes_one_burst(
+    tmp_path: Path, confirms_late: bool
+) -> None:
+    """The unit was switched on just before, and its application has answered nothing."""
+    run = Watched(tmp_path)
+    run.announce(1.0)
+    run.continuity.begin(None)
+    run.send(1.2, ResetCommand())
+    if not confirms_late:
+        run.hear(1.21, GeneralFeedbackMessage())
+    run.announce(1.3, 1)
+    if confirms_late:
+        run.hear(1.31, GeneralFeedbackMessage())
+    run.announce(1.35, 1 + confirms_late)
+    run.send(1.41, UpdateCommand(BMS.update_text, 256))
+    assert not run.continuity.lost
+    run.announce(1.9)
+    assert "announced its bootloader" in run.continuity.lost
+
+
+def test_an_update_command_after_a_confirmed_reset_and_one_announcement_allows_no_other_burst(
+    tmp_path: Path,
+) -> None:
+    run = Watched(tmp_path)
+    run.announce(1.0)
+    run.continuity.begin(None)
+    run.send(1.2, ResetCommand())
+    run.hear(1.21, GeneralFeedbackMessage())
+    run.announce(1.3, 1)
+    run.send(1.31, UpdateCommand(BMS.update_text, 256))
+    assert not run.continuity.lost
+    run.announce(1.8)
+    assert "announced its bootloader" in run.continuity.lost
+
+
 def test_what_announces_itself_in_a_silent_socket_came_after_the_run_began(tmp_path: Path) -> None:
     run = Watched(tmp_path, was_silent=True)
     run.announce(1.5, 1)
