@@ -424,6 +424,16 @@ UNDETECTABLE = {
             " @7.2 label by=jo unit=1 ; @8.6 pull unit=3 ; @10.0 put unit=1 socket=A"
         ),
     ),
+    "starts, and a third unit is in its socket for a moment": (
+        COMPLETE,
+        (
+            "line sockets=1 recipe=plain ; unit label=1 application=new pace=slow ;"
+            " unit label=2 application=none pace=slow ; unit label=3 ; person name=al ;"
+            " @0.53 put unit=2 socket=A ; @0.887 card by=al unit=2 ; @1.145 label by=al unit=2 ;"
+            " @4.3 pull unit=2 ; @6.287 put unit=3 socket=A ; @6.289 pull unit=3 ;"
+            " @7.289 put unit=1 socket=A ; @12.0 look"
+        ),
+    ),
     "without power": (
         SILENT,
         (

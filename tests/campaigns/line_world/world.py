@@ -482,7 +482,9 @@ class World:
             was_silent=bay.spoke_at < awaited_at - SILENCE_S,
             is_mute=not self._setup_of(act.unit).answers,
         )
-        self.exchanges.pull(bay.name, pulled)
+        was_noticed = bay.has_spoken or not bay.is_working or bay.put_at < bay.run_at
+        if was_noticed:  # else the unit before it is the one that the run has heard
+            self.exchanges.pull(bay.name, pulled)
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
