@@ -1,8 +1,8 @@
-"""The audit trail: append-only rows, one chain a station, each row hashed together with the hash of
-the row before it, and signed with the station's key.
+"""The audit trail: append-only rows, one chain a station. Each row is hashed together with the hash
+of the row before it, and signed with the station's key.
 
-The row of a finished run holds the digests of the run and of all that belongs to it, so that a
-change made behind the triggers' back is found and named (`examination`).
+The row of a finished run holds the digests of the run and its parts, so that a change made past the
+triggers is found and named (`examination`).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Trail:
     def append(
         self, now: datetime, event: str, data: Mapping[str, Any], run_id: int | None = None
     ) -> None:
-        """Add a row, in the transaction of what it tells."""
+        """Add a row, in the transaction that it records."""
         station_id = named(self.connection, station, name=self.station)
         last = self.connection.execute(
             select(audit.c.number, audit.c.hash)
@@ -116,7 +116,7 @@ def digest(data: Any) -> str:
 
 
 def data_of(text: str) -> dict[str, Any]:
-    """Parse what `canonical` wrote; empty when it is something else."""
+    """Parse the output of `canonical`; empty for anything else."""
     try:
         found = json.loads(text)
     except ValueError:
@@ -139,9 +139,7 @@ def key_of(event: str, data: Mapping[str, Any]) -> str | None:
 def key_in_force(
     connection: Connection, station_name: str, before: int | None = None
 ) -> str | None:
-    """The public key that signs the row of number `before`, or the next one; None before the first
-    row.
-    """
+    """The public key that signs row `before`, or the next row; None before the first row."""
     rows = [
         row
         for row in without_run(connection, station_name, _KEYS)
@@ -162,7 +160,7 @@ def without_run(connection: Connection, station_name: str, events: Iterable[str]
 
 
 def head_of(connection: Connection, run_id: int) -> ChainHead | None:
-    """The row that vouches for a finished run, as a head; None where there is none."""
+    """The audit row of a finished run, as a head; None without one."""
     row = connection.execute(
         select(audit, station.c.name)
         .join_from(audit, station)
@@ -177,13 +175,13 @@ def head_of(connection: Connection, run_id: int) -> ChainHead | None:
 
 
 def given_up(connection: Connection, station_name: str) -> list[range]:
-    """The rows that a person gave up as lost, when older records were put back."""
+    """Rows that a person accepted as lost when older records were restored."""
     rows = without_run(connection, station_name, [RESTORED])
     return [lost_of(data_of(row.data)) for row in rows]
 
 
 def lost_of(data: Mapping[str, Any]) -> range:
-    """The rows that a RESTORED row gives up; none where it does not say."""
+    """The rows that a RESTORED row accepts as lost."""
     first, last = data.get("lost_from"), data.get("lost_to")
     if isinstance(first, int) and isinstance(last, int):
         return range(first, last + 1)
@@ -191,14 +189,14 @@ def lost_of(data: Mapping[str, Any]) -> range:
 
 
 def ending_of(connection: Connection, run_id: int) -> dict[str, Any]:
-    """The row that vouches for a finished run; empty where there is none."""
+    """The audit row of a finished run; empty without one."""
     query = select(audit).where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
     row = connection.execute(query.order_by(audit.c.id.desc()).limit(1)).mappings().one_or_none()
     return {} if row is None else dict(row)
 
 
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
-    """The hash of a row; None where the chain has no such row."""
+    """The hash of a row; None when the chain has no such row."""
     query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)
     return connection.execute(query).scalar_one_or_none()
 
@@ -242,7 +240,7 @@ OWN: Final = {
     "writes": "what was written",
     "attachments": "its attachments",
 }
-"""What belongs to one run, in words."""
+"""The parts of a run, in words."""
 CLAIM_PARTS: Final = (CLAIM, *NAMED)
 _OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
@@ -251,8 +249,8 @@ _OUTCOME: Final = frozenset(
 
 
 def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, str]]:
-    """The digests of runs, by what they cover; a run that is not there is left out. They cover
-    names and contents, not keys of tables alone.
+    """The digests of runs, by their parts; missing runs are left out. They cover names and
+    contents, not only keys of tables.
     """
     return digests_in(contents_of(connection, run_ids))
 
@@ -274,7 +272,7 @@ def digests_in(contents: Mapping[int, Mapping[str, Any]]) -> dict[int, dict[str,
 
 
 def claim_of(content: Mapping[str, Any]) -> list[Any]:
-    """What a run was begun with, of its content."""
+    """The content of a claim."""
     claim = {name: value for name, value in content["run"].items() if name not in _OUTCOME}
     return [claim, [{**each, "reached": None} for each in content["targets"]]]
 

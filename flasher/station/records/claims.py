@@ -63,7 +63,7 @@ class Claiming:
     """The claim of one run, in the transaction of `trail`."""
 
     def __init__(self, trail: Trail, order: Order, loaded: LoadedRecipe, now: datetime) -> None:
-        """Raises ClaimRefusedError when the clock is behind the records."""
+        """Raises ClaimRefusedError when the clock is earlier than the records."""
         self._trail, self._order, self._loaded, self._now = trail, order, loaded, now
         self._part = loaded.recipe.part
         self._connection = connection = trail.connection
@@ -153,7 +153,7 @@ class Claiming:
     # -- the rules --------------------------------------------------------------------------------
 
     def _check_clock(self) -> None:
-        """The run must not stand before those that were made."""
+        """Raises ClaimRefusedError when the run would precede recorded ones."""
         last = chain.latest(self._connection, self._trail.station)
         if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
             raise ClaimRefusedError(
@@ -205,7 +205,7 @@ class Claiming:
             )
 
     def _check_nature(self) -> None:
-        """A PASS of a virtual unit says nothing about a real one, and the other way round."""
+        """Refuse to mix virtual and real units: a PASS of one proves nothing about the other."""
         is_virtual = self._order.is_virtual
         others = select(run.c.id).where(
             run.c.unit_id == self._unit_id, run.c.is_virtual != is_virtual
@@ -223,7 +223,7 @@ class Claiming:
             )
 
     def _kind(self, before: UnitState) -> RunKind:
-        """What kind of run it is. Raises ClaimRefusedError."""
+        """The kind of the run. Raises ClaimRefusedError."""
         golden = self._loaded.recipe.golden
         if golden is not None and self._order.serial in golden.serial_numbers:
             return RunKind.GOLDEN
@@ -315,8 +315,8 @@ class Claiming:
 
 
 def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
-    """True when a golden unit has to pass first. `last_pass` is when one last did on this socket;
-    `now` is in the local time zone, in which the shifts start.
+    """True when a golden unit has to pass first. `last_pass` is the time of its last one on this
+    socket; `now` is in the local time zone, in which the shifts start.
     """
     if last_pass is None:
         return True

@@ -59,14 +59,14 @@ _POSTGRESQL: Final = "postgresql+psycopg"
 _OPENED: Final = "flasher_file"
 """Which file a connection has open."""
 _CHANGE_LIMIT_S: Final = 3600.0
-"""How long a server may work on one statement that changes the schema."""
+"""Time limit of a server for one statement that changes the schema."""
 _BEFORE_ALEMBIC: Final = 2
 """The schema of records that have no revision; there are older ones, which nobody has."""
 
 
 @dataclass(frozen=True)
 class Location:
-    """Where the records are: the database, and the folder of its attachments."""
+    """Location of records: the database, and the folder of its attachments."""
 
     url: URL
     folder: Path
@@ -75,7 +75,7 @@ class Location:
 
     @property
     def file(self) -> Path | None:
-        """The database's file; None where it is no file."""
+        """The database's file; None for a server."""
         name = self.url.database
         is_file = self.url.get_backend_name() == "sqlite" and name not in (None, "", ":memory:")
         return Path(str(name)) if is_file else None
@@ -273,7 +273,7 @@ class StationLock:
         self._lock = FileLock(self._path, timeout=0, thread_local=False)
 
     def acquire(self) -> None:
-        """Become the station. Raises StationBusyError when another process is, RecordError."""
+        """Become the station. Raises StationBusyError while another process is, RecordError."""
         if self._lock.is_locked:
             return
         shown = printable(str(self._path))
@@ -293,7 +293,7 @@ class StationLock:
 
 
 def _server() -> ModuleType:
-    """What needs the driver. Raises UsageError where it is not installed."""
+    """Import the server's driver. Raises UsageError when it is not installed."""
     try:
         return importlib.import_module("flasher.station.records.server")
     except ImportError as error:
@@ -306,8 +306,8 @@ def _server() -> ModuleType:
 
 
 def read_only_sqlite(file: Path) -> sqlite3.Connection:
-    """A connection that changes nothing: not the file, not its journal, and beside it no file where
-    none can be made.
+    """A connection that changes neither the file nor its journal, and creates no file beside it
+    where possible.
     """
     log = file.with_name(file.name + "-wal")
     # Without a log nobody writes, and none can be made where the folder is read-only.
@@ -317,7 +317,7 @@ def read_only_sqlite(file: Path) -> sqlite3.Connection:
 
 
 def _identity(file: Path) -> tuple[int, int] | None:
-    """Which file has this name now; None: none."""
+    """Identity of the file with this name now; None without one."""
     try:
         found = file.stat()
     except FileNotFoundError:
@@ -410,7 +410,7 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
 
 
 def revision_of(connection: Connection) -> str:
-    """The schema that the records have; empty where they do not name one."""
+    """The schema revision of the records; empty when they have none."""
     if inspect(connection).has_table(alembic_version.name):
         query = select(alembic_version.c.version_num)
         return str(connection.execute(query).scalar_one_or_none() or "")

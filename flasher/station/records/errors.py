@@ -1,6 +1,6 @@
-"""The errors of reading and saving records, and the mapping of foreign errors to them.
+"""Errors of reading and saving records, and the mapping of foreign errors to them.
 
-Whoever gets a `RecordError` from an operation that writes must not show PASS: nothing was saved.
+After a `RecordError` of an operation that writes, nothing was saved and PASS must not be shown.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ class RuleBrokenError(RecordError):
 
 
 class RecordsMovedError(RecordError):
-    """The file of the database is not where it was opened: what is written is kept nowhere."""
+    """The database file was moved while open: writes to it would be lost."""
 
     default_code = ErrorCode.RECORDS_MOVED
 
 
 class NotFoundError(RecordError):
-    """There is no such unit or run."""
+    """No such unit or run exists."""
 
     default_code = ErrorCode.RECORDS_NOT_FOUND
 
@@ -86,7 +86,7 @@ class StationBusyError(RecordError):
 
 
 class KeyMissingError(RecordError):
-    """The station cannot sign: its key is not there, or is not the one of its audit chain."""
+    """The station cannot sign: its key is missing, or is not the one of its audit chain."""
 
     default_code = ErrorCode.STATION_KEY
 
@@ -98,7 +98,7 @@ class RecordsCutError(RecordError):
 
 
 class UnprovenError(RecordError):
-    """The records were changed: what they say is not certified."""
+    """The records were changed, so nothing in them is certified."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.VERIFICATION
     default_code = ErrorCode.RECORDS_UNPROVEN
@@ -234,7 +234,7 @@ _SYSTEM: Final[dict[int, _Kind]] = {
 
 @contextmanager
 def mapped(where: str, *, writes: bool) -> Iterator[None]:
-    """Foreign errors inside become RecordErrors; `where` names the database for a person."""
+    """Map foreign errors of the block to RecordErrors; `where` names the database for a person."""
     error: Exception
     cause = ""
     try:

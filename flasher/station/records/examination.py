@@ -54,14 +54,14 @@ _USED: Final = {
     schema.socket: schema.run.c.socket_id,
     schema.artifact: schema.run_target.c.artifact_id,
 }
-"""Rows that are made for a run only, and where it names them."""
+"""Rows that exist only for a run, and the columns that refer to them."""
 Progress = Callable[[int, int], None]
 """Is called with how much is done, and how much there is to do."""
 
 
 @dataclass
 class _Trail:
-    """What was found along the chain of one station."""
+    """Findings along the chain of one station."""
 
     station: str
     begin: int = 0
@@ -73,7 +73,7 @@ class _Trail:
     keys: list[str] = field(default_factory=list)
     """The last one signs the next row."""
     stated: tuple[int | None, Mapping[str, str]] = (None, {})
-    """What the chain states last of the schema, with its version."""
+    """The schema that the chain stated last, with its version."""
     first: dict[str, int] = field(default_factory=dict)
     """The first row of which a place keeps the head."""
 
@@ -90,7 +90,7 @@ class _Trail:
         self.hashes += found if len(found) == _HASH_BYTES else bytes(_HASH_BYTES)
 
     def hash_of(self, number: int) -> str | None:
-        """The hash of a row; None where it was not examined now."""
+        """The hash of a row; None when it was not examined now."""
         at = number - self.begin
         if not 1 <= at <= self.end - self.begin:
             return None
@@ -131,7 +131,7 @@ class Examiner:
         self._since = since
         self._trails_found: list[_Trail] = []
         self.examined: Examined | None = None
-        """What was found good; None before, and where something was not."""
+        """The state that was found good; None before, and after any finding."""
         self._traces = 0
         self._nameless = 0
 
@@ -242,8 +242,8 @@ class Examiner:
         *,
         is_all: bool = True,
     ) -> Iterator[_Kept]:
-        """The places of heads that can be reached; with the heads of other stations too where
-        `is_all`. Raises RecordError, UsageError for the one beside the key.
+        """The places of heads that can be reached; with those of other stations too when `is_all`.
+        Raises RecordError, UsageError for the place beside the key.
         """
 
         def lasts(place: Place) -> dict[str, ChainHead]:
@@ -547,7 +547,7 @@ def _records_id(connection: Connection) -> str:
 
 
 def _is_as_examined(connection: Connection, since: Examined) -> bool:
-    """True when what was examined is still there, as far as its ends and numbers tell."""
+    """True when the examined part is still there, judging by its ends and numbers."""
     if _records_id(connection) != since.records:
         return False
     audit, run = schema.audit.c, schema.run.c
@@ -566,7 +566,7 @@ def _is_as_examined(connection: Connection, since: Examined) -> bool:
 
 
 def _begun(name: str, since: Examined | None) -> _Trail:
-    """The chain of a station, from where the last examination ended."""
+    """The chain of a station, from the end of the last examination."""
     each = None if since is None else since.chains.get(name)
     if each is None:
         return _Trail(name)
@@ -579,7 +579,7 @@ def _begun(name: str, since: Examined | None) -> _Trail:
 
 
 def _wrong_with(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
-    """What is wrong with one audit row."""
+    """The faults of one audit row."""
     number, name = row["number"], row["name"]
     before = chain.GENESIS if number == 1 else chain.hash_at(connection, name, number - 1)
     if row["previous_hash"] != before:
@@ -592,7 +592,7 @@ def _wrong_with(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]
 
 
 def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
-    """How the schema differs from what the chain of a station states last."""
+    """Differences between the schema and the last statement of a station's chain."""
     rows = chain.without_run(connection, name, (chain.BEGUN, chain.MIGRATED))
     data = chain.data_of(rows[-1].data) if rows else {}
     if data.get("version") == schema.SCHEMA_VERSION:
@@ -604,8 +604,8 @@ def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
 def _kept_wrong(
     connection: Connection, each: _Kept, row: Mapping[Any, Any], records_id: str
 ) -> Iterator[tuple[str, str] | None]:
-    """What a place tells against an audit row and the end of its chain; nothing where it keeps the
-    head of that row; None where it does not.
+    """The evidence of a place against an audit row and the end of its chain; empty when it holds
+    the same head, None when it does not hold one.
     """
     name, number, place = row["name"], row["number"], each.place.shown
     last = each.lasts.get(name)
@@ -626,7 +626,7 @@ def _kept_wrong(
 
 
 def _shared(changed: Mapping[tuple[str, str], list[int]]) -> Iterator[Problem]:
-    """What several runs name, and was changed."""
+    """Changed rows that several runs refer to."""
     for (part, _), run_ids in changed.items():
         shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
         more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
@@ -660,7 +660,7 @@ class _Stated:
 
 
 def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
-    """What intact audit rows state for these runs."""
+    """Statements of intact audit rows for these runs."""
     found: dict[int, _Stated] = defaultdict(_Stated)
     query = select(schema.audit).order_by(schema.audit.c.id)
     for run_id, rows in grouped(connection, query, schema.audit.c.run_id, run_ids).items():
@@ -687,7 +687,7 @@ def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) ->
 def _not_given_up(
     trail: _Trail, wrong: list[tuple[int, ChainHead]], given_up_at: Mapping[int, int]
 ) -> list[ChainHead]:
-    """The heads without those that a person gave up, when older records were put back."""
+    """The heads except those of rows that a person accepted as lost."""
     return [
         head
         for index, head in wrong
@@ -699,7 +699,7 @@ def _not_given_up(
 
 
 def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
-    """What heads tell that are not those of the chain."""
+    """Heads that differ from the chain."""
     where = f"audit trail of {printable(trail.station)}"
     missing = [head for head in held if head.number > trail.end]
     other = [head for head in held if head.number <= trail.end]
@@ -732,7 +732,7 @@ def _unused(connection: Connection) -> Iterator[Problem]:
 def _contradictions(
     name: str, records_id: str, event: str, data: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Where an intact row does not fit these records."""
+    """Contradictions between an intact row and these records."""
     if event == chain.BEGUN and data.get("records") != records_id:
         yield "the chain is that of other records"
     if event == chain.BEGUN and data.get("station") != name:

@@ -1,5 +1,6 @@
-"""What an examination found good: where the next one goes on. Kept in a file beside the keys of
-whoever examines, signed with a key of his own.
+"""The examined part of records: the next examination continues after it.
+
+It is stored in a file beside the examiner's keys, signed with a key of the examiner.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ _TYPE: Final = TypeAdapter(Examined)
 
 
 def load_examined(path: Path, key_path: Path) -> Examined | None:
-    """What was examined; None without a file. Raises RecordError for one that was changed."""
+    """The examined part; None without a file. Raises RecordError for a changed one."""
     key = SigningKey.load(key_path)
     if key is None or not path.exists():
         return None
@@ -75,7 +76,7 @@ def load_examined(path: Path, key_path: Path) -> Examined | None:
 
 
 def save_examined(path: Path, key_path: Path, examined: Examined) -> None:
-    """Keep what was examined; the key is made when there is none. Raises RecordError."""
+    """Save the examined part, and make the key when there is none. Raises RecordError."""
     key = SigningKey.load(key_path) or SigningKey.make(key_path)
     body = _TYPE.dump_python(examined, mode="json")
     with mapped(str(path), writes=True), whole_file(path) as part:

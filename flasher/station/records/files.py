@@ -1,7 +1,7 @@
-"""Files that belong to records: beside the database, named by their hash, whole or not there.
+"""Files that belong to records: beside the database, named by their hash, complete or absent.
 
-A file is on disk, with its name, before any row names it. What no row names is left over from a
-crash and harms nothing.
+A file is on disk under its name before a row refers to it. Files without a row are left over from a
+crash and do no harm.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FileStore:
 
     @property
     def spool(self) -> Path:
-        """Where the traces of runs that go on are written, until they are saved."""
+        """The folder for traces of active runs."""
         return self.folder / "open"
 
     def add_spooled(self, run_id: int) -> list[AttachmentFile]:
@@ -89,7 +89,7 @@ class FileStore:
                 path.unlink(missing_ok=True)
 
     def spooled(self, run_id: int) -> Path:
-        """Where the trace of a run is written while it goes on."""
+        """The path of an active run's trace."""
         return self.spool / f"run-{run_id}.log"
 
     def _spooled(self, run_id: int) -> tuple[Path, Path]:
@@ -117,11 +117,11 @@ class FileStore:
                     part.unlink(missing_ok=True)
 
     def path(self, sha256: str) -> Path:
-        """Where the file with this hash lies."""
+        """The path of the file with this hash."""
         return self.folder / sha256[:2] / sha256
 
     def read(self, sha256: str) -> bytes:
-        """The bytes of a file. Raises RecordsDamagedError when it is gone or was changed."""
+        """The bytes of a file. Raises RecordsDamagedError when it is missing or changed."""
         path = self.path(sha256)
         shown, remedy = printable(str(path)), "Fetch it from a backup."
         with mapped(shown, writes=False):
@@ -136,7 +136,7 @@ class FileStore:
         return data
 
     def check(self, sha256: str) -> str:
-        """What is wrong with a file, in words; empty when nothing is."""
+        """The fault of a file, in words; empty without one."""
         try:
             self.read(sha256)
         except RecordError as error:
@@ -145,7 +145,7 @@ class FileStore:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make sure that new names in a folder are on disk; nothing where the system cannot."""
+    """Flush new names in a folder to disk, where the system can."""
     if os.name == "nt":  # Windows has no handle for it, and journals names by itself
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -157,9 +157,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A file to be written under another name, which takes its own when the block ends well; it is
-    on disk then.
-    """
+    """A temporary file that takes its own name, on disk, when the block ends without an error."""
     part = path.with_name(f".{path.name}.part")
     try:
         yield part

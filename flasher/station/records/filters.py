@@ -1,4 +1,4 @@
-"""Which runs a filter means, as conditions of a query."""
+"""Conditions of a query for the runs of a filter."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.rows import beside_index
 
 JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
-"""Runs that say something about the unit; the others are about the station."""
+"""Runs with a verdict on the unit; the others are about the station."""
 
 
 def counting(chosen: RunFilter, *columns: Any) -> Select[Any]:

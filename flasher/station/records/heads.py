@@ -64,7 +64,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class HeadsFault:
-    """What is wrong with kept heads, and where."""
+    """A fault of kept heads, with its place."""
 
     where: str
     what: str
@@ -72,7 +72,7 @@ class HeadsFault:
 
 @dataclass(frozen=True)
 class Position:
-    """Where reading goes on."""
+    """A position to continue reading from."""
 
     segment: int = 1
     offset: int = 0
@@ -110,8 +110,8 @@ class HeadsFile:
             self._last = number
 
     def last(self) -> ChainHead | None:
-        """The head that was kept last; None without any. Raises RecordError, UsageError for what is
-        no file.
+        """The last head; None without any. Raises RecordError, UsageError for a path that is not a
+        file.
         """
         for number in range(self._last_segment(), 0, -1):
             found = self._last_entry(number)
@@ -147,8 +147,8 @@ class HeadsFile:
                 yield entry
 
     def of_row(self, number: int) -> tuple[ChainHead, ...]:
-        """The heads of one audit row: several where older records were put back. Reads one segment,
-        found by the checkpoints with which they begin. Raises as `last`.
+        """The heads of one audit row: several where older records were restored. Reads one segment,
+        found by the checkpoints at the start of segments. Raises as `last`.
         """
         count = self._last_segment()
         at = bisect_left(range(1, count + 1), number, key=self._begins_after)
@@ -166,9 +166,7 @@ class HeadsFile:
                 yield entry, after
 
     def position_after(self, head: ChainHead) -> Position | None:
-        """The position after a head, looked for from the end on; None where it is not kept. Raises
-        as `last`.
-        """
+        """The position after a head, searched from the end; None without it. Raises as `last`."""
         for number in range(self._last_segment(), 0, -1):
             for after, line in self._lines(Position(number), is_one=True):
                 if _parsed(line) == head:
@@ -192,7 +190,7 @@ class HeadsFile:
         return self._last
 
     def _closed(self, number: int, key: SigningKey) -> str | None:
-        """Close a segment, unless it is; its checkpoint. None where it holds no head."""
+        """Close a segment unless it is closed; returns its checkpoint, None without a head."""
         end = self._last_entry(number)
         if isinstance(end, Checkpoint):
             return _checkpoint_line(end)
@@ -241,7 +239,7 @@ class HeadsFile:
     def _checked(
         self, number: int, previous: str, *, is_closed: bool
     ) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
-        """What a segment holds, and what is wrong with it."""
+        """The entries of a segment, and its faults."""
         digest, last, entry, is_first = hashlib.sha256(), None, None, True
         where = self._shown(number)
         for count, (_, line) in enumerate(self._lines(Position(number), is_one=True), 1):
@@ -313,7 +311,7 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 def _parsed(line: bytes) -> ChainHead | Checkpoint | None:
-    """What a line holds; None for anything else."""
+    """The entry of a line; None for anything else."""
     try:
         found = parse_json(line)
         if "checkpoint" in found:

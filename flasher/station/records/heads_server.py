@@ -97,7 +97,7 @@ class ServerHeads:
         self._own = {"station": station, "records_id": records_id}
 
     def append(self, heads: Iterable[ChainHead], _key: SigningKey) -> None:
-        """Add heads; the table is made when it is not there. Raises RecordError."""
+        """Add heads; creates the table when needed. Raises RecordError."""
         with self._place.connected(writes=True) as connection:
             if not _is_there(connection):
                 # Two stations may find that at once.

@@ -1,9 +1,8 @@
-"""Where a station keeps what is no part of its records: its signing key, and the heads of its audit
-chain.
+"""Locations of a station's signing key and of the heads of its audit chain, outside the records.
 
 Whoever can write the database but has no key cannot make a chain that verifies. The chain alone
-cannot tell that its end was cut off, or that it is an older copy of itself; heads in another place,
-where they only grow, can. Heads beside the key tell it only as long as nobody has written there.
+cannot show that its end was cut off, or that it is an older copy; heads in another, append-only
+place can. Heads beside the key show it only while nobody else can write there.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from flasher.station.records.places import FolderPlace, Place, file_name, place_
 
 @dataclass(frozen=True)
 class KeyLocations:
-    """Where the signing key of a station is kept (None: the place of this user), and in which other
-    places than beside it the heads of its chain: folders, and URLs of PostgreSQL servers.
+    """Folder of a station's signing key (None: the default of this user), and further places for
+    the heads of its chain: folders, and URLs of PostgreSQL servers.
     """
 
     keys: Path | None = None
@@ -43,7 +42,7 @@ class KeyLocations:
 
     @cached_property
     def elsewhere(self) -> tuple[Place, ...]:
-        """The other places. Raises UsageError for a URL that cannot be."""
+        """The further places. Raises UsageError for an invalid URL."""
         here = self.keys_folder.resolve()
         places = (place_of(text) for text in dict.fromkeys(self.heads))
         return tuple(
@@ -60,7 +59,7 @@ class KeyLocations:
         return self.beside_key.of(station, records_id)
 
     def examined_files(self, records_id: str) -> tuple[Path, Path]:
-        """Where whoever examines these records keeps what he found good, and his key."""
+        """The files for the examined part of these records, and the examiner's key."""
         note = self.keys_folder / file_name("examined", records_id, ".examined")
         return note, note.with_suffix(".verifier")
 

@@ -28,7 +28,7 @@ _SHORT: Final = 20_000
 
 @dataclass(frozen=True)
 class PageCursor:
-    """Where a page begins: below or above the row with an id; neither: the newest rows."""
+    """Start of a page: below or above the row with an id; neither: the newest rows."""
 
     before: int | None = None
     after: int | None = None

@@ -1,7 +1,7 @@
-"""The records as a supervisor looks at them: pages of runs and of the audit trail, the units that
-hold an image, figures over time.
+"""Queries of the supervisor's pages: runs, audit trail, units that hold an image, figures over
+time.
 
-The database counts; what is fetched has a bounded size, however many runs there are.
+The database counts; the fetched rows are bounded, however many runs there are.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ PAGE_SIZE: Final = 50
 LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
 HOLDERS_COUNTED: Final = 300
-"""The units of an image lie anywhere in the records: each is a piece of the disk to be read."""
+"""Limit of counting: the units of an image are scattered, and each costs a read of the disk."""
 _SPANS_AT_ONCE: Final = 400
 """Spans in one query: SQLite takes 500 parts."""
 _Row = TypeVar("_Row")
@@ -59,8 +59,8 @@ _Row = TypeVar("_Row")
 
 @dataclass(frozen=True)
 class Page(Generic[_Row]):
-    """Some rows, the newest first. `older` and `newer`: the cuts to the pages beside it; None where
-    there is none.
+    """Some rows, newest first. `older` and `newer`: cursors of the adjacent pages; None without
+    one.
     """
 
     rows: tuple[_Row, ...]
@@ -105,7 +105,7 @@ class Span:
 
 @dataclass(frozen=True)
 class SpanYield:
-    """Units with a run of a span that told PASS from FAIL. Golden units count in none."""
+    """Units that got a verdict in a span. Golden units are not counted."""
 
     span: Span
     units: int = 0
@@ -125,7 +125,7 @@ class SpanYield:
 
 
 class By(StrEnum):
-    """What causes are told apart by."""
+    """Grouping of causes."""
 
     SOCKET = "socket"
     RECIPE = "recipe"
@@ -203,7 +203,7 @@ class Overview:
             return tuple(connection.execute(select(name).distinct().order_by(name)).scalars())
 
     def last_begin(self, chosen: RunFilter) -> datetime | None:
-        """When the last run of a filter began; None without runs."""
+        """Start of the last run of a filter; None without runs."""
         run = schema.run.c
         with self._database.reading() as connection:
             last = newest_runs(connection, chosen, PageCursor(), 1)
@@ -245,7 +245,7 @@ class Overview:
         return self._page(_HOLDERS, query, schema.run_target.c.id, cut, size)
 
     def holder_count(self, sha256: str) -> int:
-        """How many units that are, counted up to `HOLDERS_COUNTED` and one more."""
+        """Number of those units, counted up to `HOLDERS_COUNTED` plus one."""
         target_id = schema.run_target.c.id
         # In the order of the index of the image, or a server would go through the runs of all.
         some = (
@@ -311,8 +311,8 @@ class Overview:
     def causes(
         self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]] = ()
     ) -> dict[str, Counter[str]]:
-        """How often each code ended a run without PASS, in each group; for BY.SHIFT `shifts` are
-        the spans with their names, in order.
+        """Number of runs that each code ended without PASS, in each group; for BY.SHIFT `shifts`
+        are the named spans, in order.
         """
         run = schema.run.c
         found: dict[str, Counter[str]] = defaultdict(Counter)
@@ -336,8 +336,8 @@ class Overview:
         return dict(found)
 
     def step_times(self, chosen: RunFilter) -> StepTimes:
-        """How often each duration in seconds was that of a step that passed, by the step's name.
-        Durations are rounded to three digits, no finer than a millisecond.
+        """Number of passed steps by duration in seconds, by the step's name. Durations are rounded
+        to three digits, no finer than a millisecond.
         """
         step = schema.step.c
         rounded = rounded_s()
@@ -420,7 +420,7 @@ class Overview:
 def _group_of(
     connection: Connection, by: By, shifts: Sequence[tuple[Span, str]]
 ) -> tuple[ColumnElement[Any], Callable[[Any], str | None]]:
-    """The column of a run that has its group, and the name of a value; None: no group has it."""
+    """The group's column of a run, and the name of a value; None for no group."""
     run = schema.run.c
     if by is By.SHIFT:
         begins = [utc_text(span.begin) for span, _ in shifts]

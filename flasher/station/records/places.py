@@ -1,5 +1,5 @@
-"""The places in which heads are kept: beside the station's key, in other folders, on PostgreSQL
-servers; and the copying from the first to the others, which no commit waits for.
+"""Places for heads: beside the station's key, in other folders, on PostgreSQL servers. Copies from
+the first place to the others in the background; no commit waits for them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flasher.station.records.signatures import SigningKey
 RETRY_S: Final = 10.0
 """After this time a place that could not be reached is tried again, or with the next audit row."""
 PATIENCE_S: Final = 5.0
-"""So long a place may take to say which head it has; a share that is gone may hang for ever."""
+"""Time limit for a place to return its last head; a lost share may hang for ever."""
 _END_S: Final = 2.0
 _SOME: Final = 500
 _RECENT: Final = 100_000
@@ -42,7 +42,7 @@ class Heads(Protocol):
 
 
 class Place(Protocol):
-    """Where heads are kept. All methods raise FlasherError when it cannot be reached."""
+    """A place for heads. All methods raise FlasherError when it cannot be reached."""
 
     @property
     def shown(self) -> str:
@@ -54,7 +54,7 @@ class Place(Protocol):
         """The stations of which heads of these records are kept."""
 
     def holds(self, location: Location) -> bool:
-        """True when these records themselves are there."""
+        """True when the place is in the records themselves."""
 
 
 class FolderPlace:
@@ -114,7 +114,7 @@ def file_name(station: str, records_id: str, suffix: str) -> str:
 def patiently(
     works: Sequence[Callable[[], _Found]], limit_s: float = PATIENCE_S
 ) -> list[_Found | FlasherError]:
-    """What each returns, or why it does not: they run side by side, for `limit_s` at most."""
+    """The result or error of each call; they run side by side, for `limit_s` at most."""
     found: dict[int, _Found | FlasherError] = {}
 
     def run(at: int, work: Callable[[], _Found]) -> None:
@@ -138,8 +138,8 @@ def patiently(
 
 
 class Copying:
-    """Copies the heads beside the key to one other place, in a thread of its own. What could not be
-    copied stays in the source, from which it is copied when the place can be reached again.
+    """Copies the heads beside the key to one other place, in a thread of its own. Heads that could
+    not be copied are copied when the place can be reached again.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class Copying:
         return self._known.read_text("utf-8").splitlines() if self._known.exists() else []
 
     def _find(self) -> Position:
-        """Where to go on. Raises RecordError for a place that lost what it had."""
+        """The position to continue from. Raises RecordError for a place that lost its heads."""
         last = self._target.last()
         if last is None and self.shown in self._known_places():
             raise RecordError(
@@ -262,7 +262,7 @@ class Copying:
 def lasts(
     places: Sequence[Place], station: str, records_id: str
 ) -> list[tuple[Place, ChainHead | FlasherError | None]]:
-    """The head that each place has last, or why it does not say."""
+    """The last head of each place, or its error."""
 
     def asked(place: Place) -> Callable[[], Any]:
         return lambda: place.of(station, records_id).last()

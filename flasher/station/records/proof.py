@@ -1,8 +1,8 @@
-"""Checks a PASS against its own bus trace: what was sent, what was answered, and by which unit; and
-that it was one unit from its first answer to the last.
+"""Checks a PASS against its own bus trace: requests, answers, and the identity of one unit from
+first answer to last.
 
-The trace is written by another process than the records, frame by frame; here it is read again from
-its bytes alone, by nothing that took part in the run.
+Another process than the records' writes the trace, frame by frame; this check reads its bytes with
+code that took no part in the run.
 """
 
 from __future__ import annotations

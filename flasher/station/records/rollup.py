@@ -44,7 +44,7 @@ _LOG: Final = logging.getLogger(__name__)
 _LAYOUT: Final = 2
 _RUNS_AT_ONCE: Final = 5000
 _PAUSE_S: Final = 0.2
-"""Leaves the computer to others."""
+"""Pause that leaves the computer to others."""
 _UNTIL_NEXT_S: Final = 600.0
 _SETTLED: Final = timedelta(hours=1)
 """Younger runs are not added: on a server, one with a lower id may still be on its way."""
@@ -76,12 +76,12 @@ order. `times`: how often each time of a step came in a day (its number) or mont
 
 
 _NOWHERE: Final = -1
-"""The place of a run that no span has."""
+"""The place of a run outside every span."""
 ALL_SPANS: Final = -2
 
 
 class Judged(NamedTuple):
-    """A run that told PASS from FAIL, in its day."""
+    """A run with a verdict, in its day."""
 
     day: int
     recipe: int
@@ -94,7 +94,7 @@ History = tuple[Judged, ...]
 
 
 class Day(NamedTuple):
-    """A day of the clock on the wall, in UTC."""
+    """A day of the local clock, in UTC."""
 
     number: int
     begin: str
@@ -107,11 +107,11 @@ StepTimes = dict[str, Counter[float]]
 _Times = dict[str, Counter[str]]
 """The same, with the times as JSON has them."""
 _ALL: Final = (0, 0)
-"""In place of a recipe and a socket: the times of all."""
+"""Replaces recipe and socket: the times of all."""
 
 
 def rounded_s() -> ColumnElement[float]:
-    """How long a step took, to three digits and no finer than a millisecond."""
+    """Duration of a step, to three digits and no finer than a millisecond."""
     duration_s = schema.step.c.duration_s
     return case(
         (duration_s < 1, func.round(duration_s * 1000) / 1000),
@@ -122,7 +122,7 @@ def rounded_s() -> ColumnElement[float]:
 
 @dataclass(frozen=True)
 class Rest:
-    """Runs that the sums are without: those of a filter, with further conditions."""
+    """Runs that the sums do not include: those of a filter, with further conditions."""
 
     chosen: RunFilter
     conditions: list[ColumnElement[bool]]
@@ -130,14 +130,14 @@ class Rest:
 
 @dataclass
 class Ended:
-    """How runs ended."""
+    """Counts of how runs ended."""
 
     by_state: Counter[str] = field(default_factory=Counter)
     failures: Counter[str] = field(default_factory=Counter)
     """By their codes."""
     virtual_runs: int = 0
     durations_s: list[float] = field(default_factory=list)
-    """Of those with PASS."""
+    """Durations of runs with PASS."""
 
     def add(
         self, state: str, code: str, is_virtual: int, duration_s: float | None, runs: int = 1
@@ -153,7 +153,7 @@ class Ended:
 
 @dataclass
 class Units:
-    """How many units were judged, passed at their last run, and at their first one."""
+    """Numbers of units: judged, passed at the last run, passed at the first run."""
 
     units: int = 0
     passed: int = 0
@@ -204,7 +204,7 @@ class Rollup:
         return last == begun + _RUNS_AT_ONCE
 
     def keep_up(self, now: Callable[[], datetime], wait: Callable[[float], object]) -> None:
-        """Add what is missing, and again when further days are over; never returns."""
+        """Add missing runs, and again after each day; never returns."""
         while True:
             has_more = False
             try:
@@ -218,7 +218,7 @@ class Rollup:
 
     @contextmanager
     def rolled(self, chosen: RunFilter) -> Iterator[Rolled | None]:
-        """The sums for a filter; None where there are none. Raises RecordError."""
+        """The sums for a filter; None without any. Raises RecordError."""
         is_counted = (chosen.lot, chosen.serial, chosen.search, chosen.state, chosen.code)
         if any(each is not None for each in is_counted) or not self._file.exists():
             yield None
@@ -298,7 +298,7 @@ def _begin_anew(sums: sqlite3.Connection) -> None:
 
 
 def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
-    """Up to which run the sums may go on: of a day that is over, and every one ended."""
+    """The last run that may be added: its day is over and every run before it has ended."""
     run = schema.run.c
     today = datetime.combine(now.astimezone(), time()).astimezone()
     over = utc_text(min(today, now - _SETTLED))
@@ -543,7 +543,7 @@ class Rolled:
 
     @property
     def tail(self) -> Rest:
-        """The runs that were not added yet."""
+        """The runs that are not added yet."""
         within = begun_in(self.chosen, beside_index(schema.run.c.begun_at))
         chosen = replace(self.chosen, since=None, until=None)
         return Rest(chosen, [schema.run.c.id > self.run, *within])

@@ -20,9 +20,9 @@ from flasher.protocol.text import printable
 from flasher.station.records.errors import LOCK_NOT_AVAILABLE, StationBusyError, mapped
 
 STATEMENT_LIMIT_S: Final = 30.0
-"""How long the server works on one statement before it gives it up; waits for locks not counted."""
+"""Time limit of the server for one statement, not counting waits for locks."""
 SILENCE_LIMIT_S: Final = STATEMENT_LIMIT_S + 5.0
-"""A server that has said nothing for so long hangs: its own limits do not hold any more."""
+"""A server that has sent nothing for this time hangs: its own limits no longer work."""
 _DEAD_AFTER_S: Final = 25.0
 """A computer that lost its power or its network is noticed, and its locks are free, after so long:
 the first probe after 10 s, then two more, 5 s apart, and the time for the answer to the last."""
@@ -148,7 +148,7 @@ class ServerLock:
         return session
 
     def _holder(self, session: Connection) -> str:
-        """Where the other one is; empty where the server does not say it to this user."""
+        """The client of the other process; empty when the server hides it from this user."""
         query = text(
             "SELECT host(client_addr) FROM pg_stat_activity JOIN pg_locks USING (pid)"
             " WHERE locktype = 'advisory' AND granted AND objsubid = 1"

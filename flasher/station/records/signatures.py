@@ -1,4 +1,4 @@
-"""Ed25519 signatures of a station: its private key in a file, and how a signature is checked."""
+"""Ed25519 signatures of a station: its private key file, and verification."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ KEY_MAX_SIZE: Final = 64 * 1024
 """In bytes."""
 _MODE: Final = 0o600
 AUDIT_ROW: Final = "audit row"
-"""What is signed says what it is, so that no signature can be used for something else."""
+"""The signed text names its purpose, so that a signature cannot be used for anything else."""
 SEGMENT: Final = "heads"
 EXAMINED: Final = "examined records"
 
 
 def fingerprint(public: str) -> str:
-    """What a person compares: the first 16 digits of the hash of a public key, in groups."""
+    """Fingerprint for people: the first 16 digits of the hash of a public key, in groups."""
     digits = hashlib.sha256(bytes.fromhex(public)).hexdigest()[:16]
     return "-".join(digits[at : at + 4] for at in range(0, 16, 4))
 
@@ -56,7 +56,7 @@ class SigningKey:
 
     @classmethod
     def make(cls, path: Path) -> SigningKey:
-        """A new key, on disk when this returns, for this user alone. Raises RecordError."""
+        """Make a key for this user alone; it is on disk on return. Raises RecordError."""
         key = Ed25519PrivateKey.generate()
         text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         with mapped(printable(str(path)), writes=True):
@@ -71,9 +71,9 @@ class SigningKey:
 
     @classmethod
     def load(cls, path: Path) -> SigningKey | None:
-        """The key in a file; None when there is no file. Raises KeyMissingError for a file that is
-        no key or that others may read, RecordError for one that cannot be read, UsageError for what
-        is no file.
+        """Load the key of a file; None without a file. Raises KeyMissingError for a file that is
+        not a key or that others may read, RecordError for an unreadable one, UsageError for a path
+        that is not a file.
         """
         shown = printable(str(path))
         if not path.exists():

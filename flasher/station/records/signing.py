@@ -1,4 +1,6 @@
-"""Transactions with entries in the audit chain: signed with the station's key, their heads kept."""
+"""Transactions with entries in the audit chain: signed with the station's key, their heads
+stored.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ from flasher.station.records.signatures import SigningKey, fingerprint
 
 
 class Signer:
-    """The key and the kept heads of one station. Nothing is read or made before `begin`."""
+    """The key and the kept heads of one station. `begin` reads or makes them."""
 
     def __init__(
         self,
@@ -46,7 +48,7 @@ class Signer:
         self._unkept: list[ChainHead] = []
         self._heads_lock = Lock()
         self.copies: list[Copying] = []
-        """To the other places, while this process is the station."""
+        """Copies to the other places, while this process is the station."""
 
     @cached_property
     def records_id(self) -> str:
@@ -98,11 +100,11 @@ class Signer:
             each.wait()
 
     def unkept(self) -> list[str]:
-        """The other places that have not the last heads, since they cannot be reached."""
+        """The other places that lack the last heads because they cannot be reached."""
         return [each.shown for each in self.copies if each.fault]
 
     def close(self) -> None:
-        """End the copying of heads; what is not copied is copied after the next start."""
+        """Stop copying heads; the next start copies the rest."""
         for each in self.copies:
             each.end()
         self.copies = []
@@ -130,7 +132,7 @@ class Signer:
             each.wake()
 
     def rotate(self, operator: str) -> None:
-        """Sign with a new key from now on. The one before is deleted."""
+        """Sign with a new key from now on, and delete the old one."""
         path, following = self.key_file, self._following()
         following.unlink(missing_ok=True)  # of a rotation that was not committed
         key = SigningKey.make(following)
@@ -140,7 +142,7 @@ class Signer:
         self._key = key
 
     def replace_lost(self, operator: str, reason: str) -> None:
-        """Go on with a new key, since the one before is gone. Raises UsageError when it is not."""
+        """Sign with a new key after the old one was lost. Raises UsageError when it was not."""
         path = self.key_file
         try:
             self._load()
@@ -238,7 +240,7 @@ class Signer:
         return self.key_file.with_suffix(".new")
 
     def _is_missing(self, head: ChainHead) -> bool:
-        """True for a head whose row is not in the records, and was not given up."""
+        """True for a head whose row is missing in the records and was not accepted as lost."""
         with self._database.reading() as connection:
             if chain.hash_at(connection, self._station, head.number) == head.hash:
                 return False

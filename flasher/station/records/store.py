@@ -78,7 +78,7 @@ _ONLY_FINITE = "a number that is no number cannot be recorded"
 
 
 class SystemClock:
-    """The computer's own clocks."""
+    """The clocks of this computer."""
 
     def utc(self) -> datetime:
         return datetime.now(UTC)
@@ -152,7 +152,7 @@ class Store:
         return cls(database, station, clock, keeping)
 
     def close(self) -> None:
-        """Close the database and let another process be the station."""
+        """Close the database and release the station lock."""
         self.signer.close()
         self._lock.release()
         self.database.close()
@@ -166,9 +166,8 @@ class Store:
     # -- beginning --------------------------------------------------------------------------------
 
     def become_station(self) -> None:
-        """Let this process, and no other, write the station's chain.
-
-        Raises StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
+        """Take the station lock: only this process writes the station's chain. Raises
+        StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
         """
         self._lock.acquire()
         self.signer.begin()
@@ -230,7 +229,7 @@ class Store:
     # -- while it runs ----------------------------------------------------------------------------
 
     def intent(self, run_id: RunId, target: str, what: str, value: str) -> WriteId:
-        """Note, on disk, an act that cannot be taken back, before it is done."""
+        """Record, on disk, an act that cannot be undone, before it is done."""
         with self.database.writing() as connection:
             write_id = insert(
                 connection,
@@ -245,8 +244,8 @@ class Store:
         return WriteId(write_id)
 
     def verified(self, write_id: WriteId, read_back: str | None) -> None:
-        """Note, on disk, that the act is done. `read_back` is what the device says now; None where
-        it only confirmed ("completed, not read back").
+        """Record, on disk, that the act is done. `read_back` is the value that the device reports
+        now; None when it only confirmed ("completed, not read back").
         """
         table = schema.device_write
         with self.database.writing() as connection:
@@ -351,8 +350,8 @@ class Store:
             )
 
     def note(self, event: AuditEvent, data: Mapping[str, Any], run_id: RunId | None = None) -> None:
-        """Add what a person did to the audit trail; on disk when it returns. `data` holds what
-        JSON can hold. Raises RecordError.
+        """Add an action of a person to the audit trail; on disk on return. `data` holds what JSON
+        can hold. Raises RecordError.
         """
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), event.value, data, run_id)
@@ -396,20 +395,20 @@ class Store:
         return self.signer.keeping.examined_files(self.signer.records_id)
 
     def _examined(self) -> tuple[Examined | None, tuple[str, ...]]:
-        """What was examined before, and what a person should know of it."""
+        """The examined part, and findings for a person."""
         try:
             return load_examined(*self._examined_files), ()
         except FlasherError as error:
             return None, (f"{error.what} Everything is examined.",)
 
     def release_clock(self, operator: str, reason: str) -> None:
-        """Note that the clock is right, though records of a later time are there."""
+        """Record that the clock is right although the records contain a later time."""
         self.become_station()
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), chain.CLOCK, {"by": operator, "reason": reason})
 
     def accept_restored(self, operator: str, reason: str) -> int:
-        """Go on with an older copy of the records; how many audit rows it lacks."""
+        """Accept an older copy of the records; returns the number of audit rows it lacks."""
         self._lock.acquire()
         return self.signer.accept_restored(operator, reason)
 
@@ -418,7 +417,7 @@ class Store:
         self.signer.rotate(operator)
 
     def replace_lost_key(self, operator: str, reason: str) -> None:
-        """Go on with a new key, since the one before is gone. Raises UsageError when it is not."""
+        """Replace a lost key with a new one. Raises UsageError when it is not lost."""
         self._lock.acquire()
         self.signer.replace_lost(operator, reason)
 
@@ -426,7 +425,7 @@ class Store:
 def _end_run(
     trail: Trail, run_id: int, attached: Iterable[AttachmentFile], now: datetime, **values: Any
 ) -> None:
-    """End a run with its attachments, and let the audit trail vouch for it and all its parts."""
+    """End a run with its attachments, and sign it with all its parts in the audit trail."""
     connection, run = trail.connection, schema.run
     for file in attached:
         insert(connection, schema.attachment, run_id=run_id, **asdict(file))

@@ -18,7 +18,7 @@ from flasher.station.records.schema import metadata
 
 
 class Rule(NamedTuple):
-    """`when` is what must not be, before `event` on `table`; `text` says it."""
+    """`when` is the forbidden condition before `event` on `table`; `text` is its message."""
 
     name: str
     table: str
@@ -42,9 +42,9 @@ _PARTS: Final = {
     "device_write": _RUN_IS_OVER,
     "attachment": _RUN_IS_OVER,
 }
-"""The parts of a run, and when their run is over."""
+"""The parts of a run, and the condition that their run is over."""
 _NAMED: Final = ("station", "socket", "operator", "lot", "unit", "recipe", "artifact")
-"""What runs refer to."""
+"""Tables that runs refer to."""
 
 
 def _differs(*columns: str) -> str:
@@ -218,7 +218,7 @@ def trigger_statements(dialect: str) -> list[str]:
 
 
 def drop_triggers(connection: Connection) -> None:
-    """Take all triggers away, and on a server their functions."""
+    """Remove all triggers, and on a server their functions."""
     if connection.dialect.name == "sqlite":
         query, drop = "SELECT name FROM sqlite_master WHERE type = 'trigger'", "DROP TRIGGER {}"
     else:
@@ -313,7 +313,7 @@ def _as_created(sql: str) -> str:
 
 
 def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """The differences of two fingerprints: name, and what was done to it."""
+    """The differences of two fingerprints: name and kind of change."""
     for name in sorted(stated.keys() | found.keys()):
         if name not in found:
             yield name, "it was taken away"
@@ -326,8 +326,8 @@ def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator
 def stated_differences(
     stated: Collection[tuple[object, Mapping[str, str]]], found: Mapping[str, str]
 ) -> dict[tuple[str, str], None]:
-    """How the schema differs from what the chains state of it, each difference once. A statement of
-    an older version counts no more once another chain states the newer one.
+    """Differences between the schema and the chains' statements, each once. A statement of an older
+    version is void once another chain states the newer one.
     """
     numbers = [version if isinstance(version, int) else 0 for version, _ in stated]
     newest = max(numbers, default=0)

@@ -1,7 +1,7 @@
-"""Brings records of an older schema up to date: after a backup, in one transaction.
+"""Upgrades records of an older schema: after a backup, in one transaction.
 
-Alembic runs the changes (`migrations`). What the database's own rules were before is compared with
-what the audit trail states of them, and the differences stay recorded in it with the new ones.
+Alembic runs the changes (`migrations`). The old triggers and indexes are compared with the
+statements of the audit trail; the differences are recorded there with the new ones.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ from flasher.station.records.triggers import (
 )
 
 CHANGES: Final = "flasher.station.records:migrations"
-"""Where Alembic finds the changes."""
+"""Folder of Alembic's changes."""
 NEWEST: Final = str(schema.SCHEMA_VERSION)
 
 
 @dataclass(frozen=True)
 class Upgraded:
-    """What was done."""
+    """Result of an upgrade."""
 
     before: str
-    """The schema that the records had."""
+    """The schema of the records before."""
     after: str
     backup: Path | None
     """The copy made before; None where nothing was changed, or on a server."""
@@ -119,7 +119,7 @@ def upgrade(
 
 
 def _stations(connection: Connection) -> tuple[str, ...]:
-    """The stations that have signed something."""
+    """The stations with signed rows."""
     station = schema.station.c
     signed = select(schema.audit.c.id).where(schema.audit.c.station_id == station.id).exists()
     return tuple(
@@ -142,7 +142,7 @@ def _unchanged_on_error(before: str, database: Database) -> Iterator[None]:
 
 @contextmanager
 def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
-    """A copy of an SQLite file, taken away again when nothing comes of the change."""
+    """A copy of an SQLite file, removed again when the change fails."""
     if file is None:
         yield None
         return
@@ -174,7 +174,7 @@ def _change_signed(trail: Trail, now: datetime) -> tuple[str, ...]:
 
 
 def _stated(connection: Connection) -> list[tuple[object, Mapping[str, str]]]:
-    """What the chains state of the schema: of each its last statement, with the version."""
+    """The last statement of each chain on the schema, with the version."""
     audit = schema.audit.c
     query = select(audit.station_id, audit.data).where(
         audit.event.in_((chain.BEGUN, chain.MIGRATED))
@@ -214,5 +214,5 @@ def _change(connection: Connection) -> None:
 
 
 def _missing_rows(connection: Connection) -> list[Any]:
-    """Rows that name a row that is not there: SQLite does not look for them during the change."""
+    """References to missing rows: SQLite does not check them during the change."""
     return [tuple(row) for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all()]
