@@ -187,6 +187,15 @@ STORIES = {
         " @13.48 card by=mo unit=1 ; @14.5 worker socket=B ; @14.86 card by=jo unit=2 ;"
         " @15.09 label by=mo unit=1"
     ),
+    "a card of two people that the label of one has used up": (
+        "line sockets=1 recipe=bicycle ; unit label=2 number=own application=none ;"
+        " unit label=3 pace=slow ; unit label=4 number=maker application=new pace=slow ;"
+        " person name=jo ; person name=al ; @2.2 put unit=3 socket=A ; @3.28 card by=jo unit=3 ;"
+        " @3.29 label by=jo unit=3 ; @5.85 pull unit=3 ; @6.15 put unit=4 socket=A ;"
+        " @8.0 card by=jo unit=4 ; @9.1 card by=al unit=4 ; @9.6 label by=al unit=4 ;"
+        " @11.6 pull unit=4 ; @12.7 put unit=2 socket=A ; @14.26 card by=al unit=2 ;"
+        " @23.0 label by=jo unit=4 ; @24.5 look"
+    ),
     "the adapter is away when a unit is missed": (
         "line sockets=1 recipe=bicycle ; unit label=3 ; person name=jo source=jo ;"
         " @0.0 put unit=3 socket=A ; @3.5 label by=jo unit=3 ; @24.1 pull unit=3 ;"

@@ -570,7 +570,12 @@ class World:
         person.card = None
         before = len(self._answers)
         if not self._scan(unit.label, person):
-            person.card = card if self._says_card_waits(before) else None
+            if self._says_card_waits(before):
+                person.card = card
+                return True
+            for each in self._sharing(person):  # the screen shows that no card waits any more
+                if each.card is not None and each.card[0] == socket:
+                    each.notices_at = min(each.notices_at, self.now + NOTICE_S)
         else:
             self._await_card(person, number, before)
         return True
