@@ -86,7 +86,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a scan, or what somebody has to do."""
+    """The answer to a scan, or a prompt to a person."""
 
     text: str = ""
     is_refusal: bool = False
@@ -102,7 +102,7 @@ class Spoken:
     to_pages: Mapping[str, Answer] = field(default_factory=dict)
 
     def to(self, source: str) -> Answer:
-        """The last one that is shown there: what another page scanned is not its business."""
+        """The last answer for this source; other pages' answers are not shown."""
         return max(self.to_all, self.to_pages.get(source, Answer()), key=lambda each: each.number)
 
     def with_answer(self, text: str, source: str, *, is_refusal: bool) -> Spoken:
@@ -158,7 +158,7 @@ class Board:
 
     @property
     def said(self) -> str:
-        """The answer to the last scan that was not made on a page, or what somebody has to do."""
+        """The answer to the last scan outside pages, or a prompt."""
         return self.spoken.to_all.text
 
     @property
@@ -317,7 +317,7 @@ class Board:
 
     @property
     def virtual_words(self) -> str:
-        """Says that no products come out of this station; empty when all sockets have adapters."""
+        """Notice that the station makes no products; empty when all sockets have adapters."""
         if not self.virtual_sockets:
             return ""
         if len(self.virtual_sockets) == len(self.rows):
@@ -327,18 +327,18 @@ class Board:
 
     @property
     def exchanged(self) -> frozenset[str]:
-        """Units that were not in their sockets any more when their last runs ended."""
+        """Units that had left their sockets when their last runs ended."""
         changed = codes.UNIT_CHANGED.name
         return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
     @property
     def bad_units(self) -> tuple[RunEnded, ...]:
-        """Units whose last run is no PASS."""
+        """Units whose last run is not a PASS."""
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
 
 
 def beside_words(event: LabelFailed | ScannerChanged) -> str:
-    """What happened to a label or a scanner, and what to do."""
+    """An event of a label or a scanner, with its remedy, for people."""
     if isinstance(event, LabelFailed):
         return text(
             "No label for {serial}: {reason} {remedy}",

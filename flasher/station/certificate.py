@@ -63,7 +63,7 @@ RUN_WORDS: Final = {
 
 @dataclass(frozen=True)
 class Proof:
-    """What vouches for the last run of a unit."""
+    """Evidence for the last run of a unit."""
 
     head: ChainHead | None = None
     """The signed audit row; None while the run goes on."""
@@ -84,7 +84,7 @@ class Proof:
 
 
 def proven(store: Store, life: UnitLife) -> Proof:
-    """What vouches for the last run. Raises UnprovenError where its records were changed."""
+    """Evidence for the last run. Raises UnprovenError when its records were changed."""
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
         return Proof()

@@ -178,10 +178,10 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.CANCELLED: OPERATOR_ABORT,
     Ending.UP_TO_DATE: RECIPE,
 }
-"""What a bad end of an upgrade is in the records."""
+"""Codes of the records for failed upgrades."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
 """After these a power cycle may reach the bootloader again."""
 OF_ANOTHER: Final = frozenset({UNIT_CHANGED.name, NOT_OBSERVED.name})
 """The names of those after which another unit may have been in the socket."""
 OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED, NO_BOOTLOADER, NO_RESTART})
-"""What a unit fails with that is not there any more."""
+"""Codes of a unit that has disappeared."""

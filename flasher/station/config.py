@@ -233,9 +233,7 @@ def no_two(which: str, what: str, values: list[str]) -> None:
 
 
 def load_config(path: Path) -> StationConfig:
-    """The station's file. Relative places in it are beside it. Raises UsageError naming every key
-    that is wrong.
-    """
+    """Load a station file. Raises UsageError naming every wrong key."""
     config = CONFIG.load(path)
     here = path.parent
     changes: dict[str, str] = {}

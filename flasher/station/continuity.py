@@ -173,9 +173,7 @@ class Continuity:
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
-        """Note that a target that cannot be asked has the complete image: its bootloader may start
-        it.
-        """
+        """Note a complete image on a target that cannot be asked: it may start."""
         self.is_told_to_update = False
         self._burst_until = self._now + self._timings.application_start_timeout_s
 

@@ -154,9 +154,7 @@ class CheckPin:
 
 @dataclass(frozen=True)
 class Reprint:
-    """Record `data` in the audit trail, then print the label of this unit again if it has passed;
-    then call `Line.reprinted`.
-    """
+    """Record `data`, then print the label of a passed unit again; then call `Line.reprinted`."""
 
     serial: str
     data: Mapping[str, str]
@@ -171,9 +169,7 @@ class Audit:
 
 
 Effect = Order | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
-"""An order is to be claimed, and answered by `RunStarted`, `NotClaimed` or `NotSaved`; an event is
-to be published.
-"""
+"""An order is to be claimed, with one of its results; an event is to be published."""
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -267,7 +263,7 @@ class Line:
         """A unit appeared, reported its serial number, or fell silent."""
         socket.presence_number = what.number
         if not what.is_there:
-            reason = text("Its unit is not heard any more.")
+            reason = text("Its unit sends nothing any more.")
             remedy = text("Scan it again when it is connected.")
             self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
@@ -275,7 +271,7 @@ class Line:
             code, reason, remedy = _CHANGED
             if what.was_missed and not what.is_power_up:
                 code = codes.NOT_OBSERVED.name
-                reason = text("This computer stood still, and did not see whether the unit stayed.")
+                reason = text("This computer stalled, and did not see whether the unit stayed.")
             self._silent(socket, now, code, reason, remedy, is_certain=False)
         elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
             # It may have come after its card or label was scanned, in place of a silent one.
@@ -577,9 +573,7 @@ class Line:
         return socket
 
     def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
-        """Handle a label from the scanner at a socket like its card and the label. Raises
-        Refused.
-        """
+        """Handle a label from a socket's own scanner. Raises Refused."""
         self._crew.check_assigned()
         self._check_label(serial)
         self._check_takes(socket)
@@ -631,7 +625,7 @@ class Line:
 
     def _check_line(self) -> None:
         if self.stopped is not None:
-            reason = text("The line stands: {reason}", reason=self.stopped.reason)
+            reason = text("The line is stopped: {reason}", reason=self.stopped.reason)
             remedy = text("{remedy} Then scan RESUME.", remedy=self.stopped.remedy)
             raise Refused("LINE_STOPPED", reason, remedy)
 
@@ -767,7 +761,9 @@ class Line:
 
     def _set_operator(self, argument: str, _now: float, _waiting: Waiting) -> None:
         if self._crew.has_badges:
-            raise Refused("BADGES", text("Here a badge says who works."), text("Scan your badge."))
+            raise Refused(
+                "BADGES", text("Badges identify the operator here."), text("Scan your badge.")
+            )
         self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
         self.operator = argument
 
@@ -809,7 +805,7 @@ class Line:
                 word,
                 "STILL_NOT_SAVED",
                 text("It still cannot be saved."),
-                text("Mend the cause first."),
+                text("Repair the cause first."),
             )
         self._go_on(now)
 
@@ -911,19 +907,17 @@ class Line:
     def _drop_unidentified(self, socket: Socket) -> None:
         reason = (
             text(
-                "The unit in socket {socket} is in its bootloader and cannot say who it is.",
+                "The unit in socket {socket} is in its bootloader and cannot identify itself.",
                 socket=socket.name,
             )
             if socket.is_in_bootloader
-            else text("The unit in socket {socket} does not say who it is.", socket=socket.name)
+            else text("The unit in socket {socket} does not identify itself.", socket=socket.name)
         )
         remedy = text("Scan SOCKET {socket}, then the label.", socket=socket.name)
         self._drop_label(socket, "NOT_IDENTIFIED", reason, remedy)
 
     def _forget_card(self, waiting: Waiting) -> None:
-        """Forget the waiting scan. The label that waited at the chosen socket is replaced by the
-        card.
-        """
+        """Forget the waiting scan, and the label that waited at its socket."""
         card = waiting.card
         waiting.forget()
         if card is not None:

@@ -40,7 +40,7 @@ HIDDEN: Final = "****"
 
 
 class Role(StrEnum):
-    """What a person may do."""
+    """Role of a person, with permissions."""
 
     OPERATOR = "operator"
     REWORK = "rework"

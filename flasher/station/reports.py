@@ -28,9 +28,7 @@ SCHEMA_VERSION: Final = 1
 
 @dataclass(frozen=True)
 class Report:
-    """Runs of a filter with their figures; either is read when it is asked for first, which raises
-    RecordError.
-    """
+    """Runs of a filter with their figures, read on first access. Raises RecordError."""
 
     records: Records
     chosen: RunFilter

@@ -156,9 +156,7 @@ def as_text(sealed: Sealed) -> str:
 
 
 def sealed_in(document: str) -> Sealed:
-    """What a text carries. Raises UsageError where it carries nothing, UnprovenError where that was
-    changed.
-    """
+    """The sealed content of a text. Raises UsageError, UnprovenError."""
     start = document.find(_BEGIN)
     stop = document.find(_END, start)
     if start < 0 or stop < 0:

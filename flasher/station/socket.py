@@ -326,9 +326,7 @@ class Socket:
         return text("Put {label} into socket {socket}.", label=shown, socket=self.name)
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
-        """The view of the socket; `stopped` is why the line is stopped, `is_only`: there is no
-        other socket.
-        """
+        """The view of the socket; `stopped`: why the line is stopped, `is_only`: the only one."""
         if self.is_running:
             return SocketState.RUNNING, self.serial, ""
         if self.phase is SocketPhase.SAVE:

@@ -207,9 +207,7 @@ class Station:
         self._wake()
 
     def publish(self, event: StationEvent) -> None:
-        """Publish an event from outside the line, such as of a scanner, in the station's next
-        turn.
-        """
+        """Publish an event from outside the line in the station's next turn."""
         self._published.append(event)
         self._wake()
 
@@ -219,9 +217,7 @@ class Station:
         self._wake()
 
     def drop_waiting(self) -> None:
-        """Drop the cards and labels that wait, after the last scan. Called in the station's
-        thread.
-        """
+        """Drop the cards and labels that wait. Called in the station's thread."""
         remedy = text("Scan it again when the station runs.")
         self.line.drop_all(SCANS_ENDED, text("The scans have ended."), remedy)
         self._carry_out()
@@ -477,7 +473,7 @@ class Station:
                 case StepEnded() as step:
                     self._save_step(socket, claim, step, asked.measurements)
         except RecordError as error:
-            run.journal_error = _said(error)
+            run.journal_error = _error_line(error)
             self._feed(socket, self._not_saved(socket, claim.serial, claim.run_id, error))
             self.supervisor.send(socket, WriteReply(number, error=error.what))
         else:
@@ -563,7 +559,7 @@ class Station:
         try:
             run = self.store.read.run(claim.run_id).run
         except RecordError as error:
-            self._label_failed(socket, claim.serial, _said(error))
+            self._label_failed(socket, claim.serial, _error_line(error))
             return
         if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
             self._labels.submit(self._label(socket, run))
@@ -581,7 +577,7 @@ class Station:
                 return refused
             self.store.note(AuditEvent.REPRINT, data)
         except RecordError as error:
-            return Refused(codes.RECORD_NOT_SAVED.name, _said(error), error.remedy)
+            return Refused(codes.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
         self._labels.submit(self._label("", last.run, is_reprint=True))
         return None
 
@@ -607,7 +603,7 @@ class Station:
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
     ) -> line.NotSaved:
         """Publish an error of the records; returns the input for the line."""
-        self.tell(RecordNotSaved(socket, serial, run_id, _said(error), error.remedy))
+        self.tell(RecordNotSaved(socket, serial, run_id, _error_line(error), error.remedy))
         return line.NotSaved(error.what, error.remedy)
 
 
@@ -625,7 +621,7 @@ def _not_labelled(run: RunRecord) -> Refused | None:
     return None
 
 
-def _said(error: RecordError) -> str:
+def _error_line(error: RecordError) -> str:
     """An error of the records in one line: what and where, without its remedy."""
     where = f" ({error.where})" if error.where else ""
     return f"{error.what.rstrip('.')}{where}."

@@ -1,6 +1,4 @@
-"""Checks of a unit's answers against recipe and manifest: versions, limits, written and unchanged
-values.
-"""
+"""Checks of a unit's answers against recipe and manifest: versions, limits, writes."""
 
 from __future__ import annotations
 
@@ -60,7 +58,7 @@ def wanted_text(plan: WritePlan) -> str:
     return ", ".join(change.new for change in field_changes(plan, None))
 
 
-def said_of(target: UnitTarget, found: Identified) -> list[Measurement]:
+def identity_measurements(target: UnitTarget, found: Identified) -> list[Measurement]:
     """The reported identity of a device, as measurements without limits."""
     name, version = target.name, found.seen.version
     if version is None:
@@ -74,7 +72,7 @@ def said_of(target: UnitTarget, found: Identified) -> list[Measurement]:
     ]
 
 
-def state_words(target: UnitTarget, found: Identified) -> str:
+def state_text(target: UnitTarget, found: Identified) -> str:
     if found.is_in_bootloader:
         return f"in its bootloader {target.watcher.version}, {NOT_IDENTIFIED}".replace(" ,", ",")
     if found.seen.version is None:

@@ -247,9 +247,7 @@ class UnitRun:
         return failed
 
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
-        """The ending of a run whose unit may have been exchanged; it takes precedence over all
-        others.
-        """
+        """The ending for a unit that may have been exchanged; it precedes all others."""
         lost = next((each.lost for each in self._continuity.values() if each.lost), "")
         unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
         if not (lost or unobserved):

@@ -45,8 +45,8 @@ from flasher.station.unit_checks import (
     UnitReads,
     check_measured,
     check_texts,
-    said_of,
-    state_words,
+    identity_measurements,
+    state_text,
     wanted_text,
 )
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
@@ -166,8 +166,8 @@ class UnitSteps:
                 )
             target.continuity.begin(found.seen.version)
             target.check_cancelled()
-            measured += said_of(target, found)
-            said.append(f"{target.name}: {state_words(target, found)}")
+            measured += identity_measurements(target, found)
+            said.append(f"{target.name}: {state_text(target, found)}")
         if self.targets[0].goes_on:
             measured.append(Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value))
         self._check_label()
@@ -354,9 +354,7 @@ class UnitSteps:
         return f"{len(self._plans)} written"
 
     def _await(self, target: UnitTarget) -> Content:
-        """Its version answer once the application runs, recorded as its identity. Raises
-        StepFailedError.
-        """
+        """Its version answer once the application runs. Raises StepFailedError."""
         was_running = target.continuity.is_running and not target.goes_on
         answer = target.await_application()
         if answer is None and was_running:
@@ -434,9 +432,7 @@ class UnitSteps:
             yield Measurement(POWER_CYCLES, float(cycles))
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
-        """The verification level of the image now. Raises StepFailedError for evidence against
-        it.
-        """
+        """The verification level of the image. Raises StepFailedError."""
         loaded, name = target.loaded, target.name
         needs_memory = loaded.required is Verified.MEMORY
         if target.version_request is None:

@@ -64,9 +64,7 @@ class Identified:
 
 
 class UnitTarget:
-    """A target on the bus. Methods raise BusError, and InterruptedByUserError when the run must
-    end.
-    """
+    """A target on the bus. Methods raise BusError, InterruptedByUserError."""
 
     def __init__(
         self,

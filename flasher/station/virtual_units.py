@@ -223,7 +223,7 @@ class VirtualSocket:
         self._next_at = None
         if self._is_other and self.unit is not None:
             self._is_other = False
-            return self._told("another virtual unit was put in")
+            return self._put_in("another virtual unit was put in")
         if self.unit is not None:
             self.take_out()
             self._next_at = now + self._virtual.arrive_after_s
@@ -232,9 +232,9 @@ class VirtualSocket:
         if unit is None:
             return None
         self.put(unit)
-        return self._told("a virtual unit came")
+        return self._put_in("a virtual unit came")
 
-    def _told(self, how: str) -> PresenceChanged:
+    def _put_in(self, how: str) -> PresenceChanged:
         return PresenceChanged(is_there=True, how=how, label=self.serial, is_power_up=True)
 
     def _new_unit(self) -> VirtualUnit | None:

@@ -167,9 +167,7 @@ class StationPipe:
         self._ask(ended, measurements)
 
     def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> WriteReply:
-        """Wait until the station has saved it. Raises StationGoneError; JournalError when it was
-        not saved.
-        """
+        """Wait for the station to save it. Raises StationGoneError, JournalError."""
         self._asked += 1
         self.send(Ask(self._asked, what, tuple(measurements)))
         give_up_at = self._now() + REPLY_LIMIT_S

@@ -353,7 +353,7 @@ def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
     floor.scan("SOCKET A")
     floor.units.pop("A")
     floor.go_on(2.5)
-    assert floor.text("A").startswith("Its unit is not heard any more.")
+    assert floor.text("A").startswith("Its unit sends nothing any more.")
     floor.go_on(15.0)
     assert floor.state("A") is SocketState.SILENT
 

@@ -35,9 +35,7 @@ class FileStore:
         self.folder = folder
 
     def add(self, kind: str, source: Path) -> AttachmentFile:
-        """Copy a file in, for an `Ending` to name. It is on disk when this returns. Raises
-        RecordError.
-        """
+        """Copy a file in; it is on disk on return. Raises RecordError."""
         with (
             mapped(printable(str(source)), writes=True),
             source.open("rb") as stream,

@@ -110,9 +110,7 @@ class HeadsFile:
             self._last = number
 
     def last(self) -> ChainHead | None:
-        """The last head; None without any. Raises RecordError, UsageError for a path that is not a
-        file.
-        """
+        """The last head; None without any. Raises RecordError, UsageError."""
         for number in range(self._last_segment(), 0, -1):
             found = self._last_entry(number)
             if found is not None:

@@ -59,9 +59,7 @@ _Row = TypeVar("_Row")
 
 @dataclass(frozen=True)
 class Page(Generic[_Row]):
-    """Some rows, newest first. `older` and `newer`: cursors of the adjacent pages; None without
-    one.
-    """
+    """Some rows, newest first, with the cursors of the adjacent pages."""
 
     rows: tuple[_Row, ...]
     older: PageCursor | None

@@ -81,9 +81,7 @@ class FolderPlace:
 
 
 def place_of(text: str) -> Place:
-    """The place that a setting names: a folder, or the URL of a PostgreSQL server. Raises
-    UsageError.
-    """
+    """The place of a setting: a folder, or a PostgreSQL URL. Raises UsageError."""
     if "://" not in text:
         return FolderPlace(Path(text))
     location = locate(text, Path())

@@ -1,6 +1,4 @@
-"""Transactions with entries in the audit chain: signed with the station's key, their heads
-stored.
-"""
+"""Transactions with signed entries in the audit chain."""
 
 from __future__ import annotations
 
