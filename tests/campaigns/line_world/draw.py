@@ -87,7 +87,7 @@ class Teller:
         """What takes several things at once, while nobody else is at the line."""
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
         if people and self.chance.random() < 0.75:
-            scenes = [self._scan_at_once, self._be_interrupted, self._be_interrupted]
+            scenes = [self._scan_at_once, self._lose_station, *2 * [self._be_interrupted]]
             if any(each.number == "other" for each in self.world.setup.units):
                 scenes += 3 * [self._scan_another_number]
             yield from self.chance.choice(scenes)(self.chance.choice(people))
@@ -313,8 +313,19 @@ class Teller:
         yield self._pause(), way
         yield self.chance.uniform(0.0, 0.3), stories.Pull(unit=unit)
         yield self.chance.choice((HAND_S, 0.3, 0.5)), stories.Put(unit=other, socket=bay.name)
-        wait = self.chance.uniform(0.1, 3.0) if way is not None else self.chance.uniform(0.1, 0.9)
+        # Before the other one announces itself, or before anybody reads that the card was dropped.
+        soon = self.chance.choice((self.chance.uniform(0.0, 0.1), self.chance.uniform(0.1, 0.9)))
+        wait = self.chance.uniform(0.1, 3.0) if way is not None else soon
         yield wait, stories.Label(by=name, unit=unit)
+
+    def _lose_station(self, name: str) -> Iterator[Step]:
+        """The station dies in a run."""
+        for bay in (yield from self._bring(1)):
+            unit = self._number(bay)
+            yield self._pause(), stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
+            yield self.chance.uniform(0.2, 1.5), stories.KillStation(seconds=1.0)
+            yield 5.0, None
 
     def _scan_another_number(self, name: str) -> Iterator[Step]:
         """Scan a unit that reports another number than its label."""
