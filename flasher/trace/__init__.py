@@ -1,1 +1,1 @@
-"""Recording of bus traffic, with python-can's own writers."""
+"""Recordings of bus traffic: writing, reading, decoding and explaining them."""

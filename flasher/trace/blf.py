@@ -1,8 +1,8 @@
-"""The containers of a .blf file, unpacked for python-can in pieces of a bounded size.
+"""Reader of .blf containers that hands python-can pieces of a bounded size.
 
-A .blf file is a header and objects; those of one type are containers, which hold the objects with
-the frames, packed. python-can unpacks a container at once, whatever comes out of it, and never ends
-at an object that states no size.
+A .blf file is a header and objects. Objects of one type are containers: they hold the objects with
+the frames, compressed. python-can unpacks a whole container whatever its size, and loops forever on
+an object of size 0.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _CONTAINER_TYPE: Final = 10
 _PLAIN, _PACKED = 0, 2
 _SIGNATURE: Final = b"LOBJ"
 _SEARCHED: Final = 8
-"""Bytes within which the next object begins."""
+"""The next object begins within this many bytes."""
 _FRAME_SIZES: Final = {1: 48, 73: 64, 86: 48, 100: 116, 101: 72}
-"""The least size of an object, by the types that hold a frame."""
+"""Smallest size of each object type that holds a frame."""
 _VERSIONS: Final = (1, 2)
 _OBJECT_MAX: Final = 16 * 1024 * 1024
 _PIECE_SIZE: Final = 65_536
 
 
 class UnpackedBlf:
-    """A .blf file as `can.BLFReader` takes it from an open file: the same header, and the objects
-    that hold frames in containers that are not packed.
+    """A .blf file object for `can.BLFReader`: the same header, then the objects that hold frames,
+    in uncompressed containers.
     """
 
     def __init__(self, source: BufferedIOBase, size: int, bounds: Bounds) -> None:
-        """`size` is that of the file, in bytes. Raises UnfitError."""
+        """`size` is the file's, in bytes. Raises UnfitError."""
         self._source = source
         self._bounds = bounds
         check_unpacked(self._unpacked(), size)
@@ -48,7 +48,7 @@ class UnpackedBlf:
         self._ready = bytearray()
 
     def read(self, size: int) -> bytes:
-        """The next `size` bytes; fewer at the end. Raises UnfitError."""
+        """Return the next `size` bytes, fewer at the end. Raises UnfitError."""
         while len(self._ready) < size and (piece := next(self._pieces, b"")):
             self._ready += piece
         taken = bytes(self._ready[:size])
@@ -56,10 +56,10 @@ class UnpackedBlf:
         return taken
 
     def close(self) -> None:
-        """Whoever opened the file closes it."""
+        """Do nothing: the caller closes the file that it opened."""
 
     def _header(self) -> bytes:
-        """The header, made to end where python-can knows what it holds."""
+        """The header, cut to the part that python-can reads."""
         header = self._exactly(_HEADER.size)
         signature, size = _HEADER.unpack(header)
         if signature != b"LOGG" or not _HEADER.size <= size <= _HEADER_MAX:
@@ -85,7 +85,7 @@ class UnpackedBlf:
         yield from self._contents()
 
     def _contents(self) -> Iterator[bytes]:
-        """What the containers hold, in pieces."""
+        """Yield the unpacked content of the containers in pieces."""
         while head := self._source.read(_OBJECT.size):
             if len(head) < _OBJECT.size:
                 raise UnfitError("it ends within an object")
@@ -100,7 +100,7 @@ class UnpackedBlf:
                 if method == _PACKED:
                     unpack = zlib.decompressobj()
                 elif method != _PLAIN:
-                    raise UnfitError(f"a container is packed in a way that is not known: {method}")
+                    raise UnfitError(f"a container has an unknown compression: {method}")
             while left > 0:
                 piece = self._source.read(min(left, _PIECE_SIZE))
                 left -= len(piece)
@@ -115,7 +115,7 @@ class UnpackedBlf:
             self._source.read(size % 4)  # padding
 
     def _objects(self, held: bytearray) -> Iterator[bytes]:
-        """Take the whole objects from the start of `held`; give those that hold a frame."""
+        """Remove the complete objects from the start of `held`; return those that hold a frame."""
         at = 0
         while len(held) - at >= _SEARCHED + _OBJECT.size:
             start = held.find(_SIGNATURE, at, at + _SEARCHED)

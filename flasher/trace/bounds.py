@@ -1,4 +1,4 @@
-"""How much is read of a file that says it is a trace."""
+"""Limits on reading trace files."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from io import BufferedIOBase
 from typing import Final, Self
 
 FILE_MAX_SIZE: Final = 1024 * 1024 * 1024
-"""In bytes, also of what a packed file unpacks to: half a day on a full bus."""
+"""In bytes, also after unpacking: half a day of a full bus."""
 _RATIO_MAX: Final = 50
-"""Recordings pack to a tenth; what packs better than this was made to fill a memory."""
+"""Recordings compress to a tenth; a higher ratio is an attack on memory."""
 _UNPACKED_FREE: Final = 1024 * 1024
-"""In bytes: so much may come out of the smallest packed file."""
+"""In bytes: allowed for the smallest packed file too."""
 _IDLE_MAX: Final = 100_000
 _IDLE_PER_FRAME: Final = 10
 _LINE_MAX: Final = 65_536
-"""In bytes. The longest lines are frames of other networks."""
+"""In bytes. Frames of other networks have the longest lines."""
 
 
 class UnfitError(Exception):
-    """The content is none of a trace; the text says why."""
+    """The content is not a trace; the text gives the reason."""
 
     def __init__(self, text: str, *, remedy: str = "") -> None:
-        """`remedy` is for a file that is what its suffix says, and holds what is not read."""
+        """`remedy` is for a file of the right format whose content is not supported."""
         super().__init__(text)
         self.remedy = remedy
 
 
 def check_unpacked(pieces: Iterator[bytes], packed_size: int) -> None:
-    """Unpack a file of `packed_size` bytes before anything is read out of it.
+    """Unpack a file of `packed_size` bytes once, before any frame is read.
 
-    Raises UnfitError when more comes out than of any recording. Any other damage is met again,
-    behind the frames in front of it.
+    Raises UnfitError when it is larger than any recording. Other damage is found again later, after
+    the frames before it.
     """
     most = min(FILE_MAX_SIZE, max(_UNPACKED_FREE, _RATIO_MAX * packed_size))
     size = 0
@@ -48,16 +48,16 @@ def check_unpacked(pieces: Iterator[bytes], packed_size: int) -> None:
 
 
 class Bounds:
-    """Counts what is read of one file, and ends it where no trace would go on."""
+    """Counts frames and entries of one file; stops where no trace would continue."""
 
     def __init__(self) -> None:
         self.frames = 0
-        """Counted by whoever takes them."""
+        """The caller counts them."""
         self._entries = 0
 
     def entry(self) -> None:
-        """A line or an object more was seen. Raises UnfitError when there are too many between the
-        frames: blank lines, comments.
+        """Count a line or an object. Raises UnfitError for too many without a frame (blank lines,
+        comments).
         """
         self._entries += 1
         if self._entries > _IDLE_MAX + _IDLE_PER_FRAME * self.frames:
@@ -65,10 +65,10 @@ class Bounds:
 
 
 class Lines:
-    """The lines of a file as python-can's readers of text take them from an open file.
+    """Lines of a file, for python-can's text readers.
 
-    It ends with the line in which byte number `size` stands, whatever another program adds after
-    it; None reads to the end.
+    Ends with the line that contains byte number `size`, even if another program appends; None reads
+    to the end.
     """
 
     def __init__(self, source: BufferedIOBase, size: int | None, bounds: Bounds) -> None:
@@ -92,4 +92,4 @@ class Lines:
         return raw.decode("utf-8-sig")
 
     def close(self) -> None:
-        """Whoever opened the file closes it."""
+        """Do nothing: the caller closes the file that it opened."""

@@ -1,11 +1,10 @@
-"""Bundles: what a failed command leaves behind for whoever has to find out why.
+"""Bundles: the evidence of a failed command, for later diagnosis.
 
-A folder of three files: `trace.blf`, the last frames; `transcript.txt`, what they say; and
-`report.json`, the circumstances. It appears whole, under its final name, or not at all. Only its
-owner may look into it: a command line may hold what is nobody else's business.
+A folder of three files: `trace.blf`, the last frames; `transcript.txt`, the same frames decoded;
+`report.json`, the circumstances. It appears complete under its final name, or not at all. Only its
+owner can read it: a command line may hold private data.
 
-The trace is a .blf: Wireshark, CANalyzer and python-can read it alike, with directions, remote and
-error frames.
+Wireshark, CANalyzer and python-can all read .blf with directions, remote and error frames.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from flasher.trace.taps import Entry, FlightRecorder
 
 TRACE: Final = "trace.blf"
 OLDER_TRACE: Final = "trace.log"
-"""What bundles held before."""
+"""Trace file in bundles of older versions."""
 TRANSCRIPT: Final = "transcript.txt"
 REPORT: Final = "report.json"
 PREFIX: Final = "flasher-"
-"""What the name of each bundle begins with."""
+"""Name prefix of every bundle."""
 FORMAT: Final = 1
-"""Version of report.json: counts up when a key changes its meaning."""
+"""Version of report.json; incremented when a key changes its meaning."""
 _PACKAGES: Final = {"flasher": "welling-flasher", "python_can": "python-can"}
 
 
@@ -51,10 +50,10 @@ def write_bundle(
     *,
     wall_clock: Callable[[], float] = time.time,
 ) -> Path:
-    """Write a bundle into `folder`, which is made if it is not there; returns the bundle's path.
+    """Write a bundle into `folder`, creating it if needed; returns the bundle's path.
 
-    It is named after `facts["target"]` and the time, and never overwrites anything. `facts` go into
-    report.json: dataclasses with their fields, what JSON does not know as text. Raises OSError.
+    The name is `facts["target"]` and the time; nothing is overwritten. `facts` go into report.json:
+    dataclasses by field, anything else that JSON lacks as text. Raises OSError.
     """
     now = wall_clock()
     folder.mkdir(parents=True, exist_ok=True)
@@ -77,14 +76,14 @@ def write_bundle(
 
 
 def _plain(value: Any) -> Any:
-    """What JSON does not know. The validation library is not loaded where somebody waits."""
+    """Convert for JSON without loading the validation library, while a user waits."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     return value.value if isinstance(value, Enum) else printable(str(value))
 
 
 def bundles(folder: Path) -> list[Path]:
-    """The bundles in a folder, the latest last; none where there is no such folder."""
+    """The bundles in a folder, the latest last; empty if the folder is missing."""
     if not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if path.name.startswith(PREFIX) and path.is_dir())
@@ -92,13 +91,13 @@ def bundles(folder: Path) -> list[Path]:
 
 
 def keep_last(folder: Path, count: int) -> None:
-    """Remove all bundles in a folder but the latest `count`."""
+    """Remove all bundles in a folder except the latest `count`."""
     for path in bundles(folder)[:-count]:
         shutil.rmtree(path, ignore_errors=True)
 
 
 def _names(folder: Path, base: str) -> tuple[Path, Path]:
-    """A name that is free, and the folder beside it to write into, which is made."""
+    """A free name, and the temporary folder for writing, which is created."""
     for number in count(1):
         name = base if number == 1 else f"{base}-{number}"
         part = folder / f".{name}.part"
@@ -115,7 +114,7 @@ def _names(folder: Path, base: str) -> tuple[Path, Path]:
 def _write_trace(path: Path, recorder: FlightRecorder) -> None:
     offset_s = recorder.wall_offset_s or 0.0
     writer = can.BLFWriter(path)
-    # The head of the file holds milliseconds: what counts from them is exact.
+    # The file header holds milliseconds: times relative to them are exact.
     first_at_s = next((entry.at_s for entry in recorder), 0.0) + offset_s
     writer.start_timestamp = math.floor(first_at_s * 1000) / 1000
     try:
@@ -127,8 +126,8 @@ def _write_trace(path: Path, recorder: FlightRecorder) -> None:
 
 
 def transcript(recorder: FlightRecorder) -> Iterator[str]:
-    """Every message of the ring, one line each: seconds since the oldest frame, direction, id,
-    sender and receiver, what it says.
+    """One line for each message of the ring: seconds since the oldest frame, direction, id, sender
+    and receiver, content.
     """
     pieces = TimedDecoder()
     first_at: float | None = None

@@ -1,14 +1,13 @@
-"""From CAN frames to what they say: every message of both documents, and everything else by name.
+"""Decoder of CAN frames: the messages of both documents, and everything else by name.
 
-`Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. It gives a `BusEvent`
-for each message, each stretch of damaged bytes and each foreign frame, with its fields both typed
-and as text that is safe on any screen. `TimedDecoder` adds the time that each of them took.
+`Decoder` takes the whole bus, one byte stream for each CAN id. It returns a `BusEvent` for each
+message, each stretch of damaged bytes and each foreign frame, with typed fields and as text that is
+safe on any screen. `TimedDecoder` adds how long each took.
 
-A time stamp means different things: adapters, and candump, stamp a frame when it has ended; a
-recorder of our own stamps a sent frame when it was handed over, and a queue accepts a whole message
-at once. `TimedEvent` tells beginning and end on the wire for both: frames whose stamps lie closer
-together than they can be on the wire were handed over, and their message ended when the wire could
-have carried it.
+Time stamps differ: adapters and candump stamp the end of a frame; our own recorder stamps a sent
+frame when the driver accepts it, and a queue accepts a whole message at once. `TimedEvent` computes
+begin and end on the wire for both: frames stamped closer together than the wire allows were stamped
+on acceptance, and their message ended when the wire could have carried it.
 
 Pure: the time is an argument.
 """
@@ -34,21 +33,21 @@ from flasher.wording import wording
 
 _TIMEOUT_S: Final = DEFAULT_TIMINGS.inter_frame_timeout_s
 _LONG_ID_BITS: Final = 20
-"""What a 29-bit id adds to a frame: 18 id bits, SRR and r1."""
+"""Added by a 29-bit id: 18 id bits, SRR and r1."""
 _ERROR_FRAME_BITS: Final = 20
-"""About what an error frame takes: flags, delimiter, interframe space."""
+"""Approximate: flags, delimiter, interframe space."""
 ACCEPTED_SHARE: Final = 0.9
-"""Frames that take less of their wire time than this, stamp to stamp, bear times of acceptance."""
+"""Frames whose stamps are closer than this share of their wire time were stamped on acceptance."""
 
 
 class Kind(Enum):
-    """What a `BusEvent` is."""
+    """How the decoder classifies a `BusEvent`."""
 
     MESSAGE = "message"
     UNKNOWN = "unknown"
-    """Intact, but no row of the documents."""
+    """Intact, but not in the documents."""
     MALFORMED = "malformed"
-    """A row of the documents, but not with the mode or the data that it has there."""
+    """In the documents, but with another mode or other data."""
     DAMAGED = "damaged"
     FOREIGN = "foreign"
     """A frame that no node of the documents sends."""
@@ -56,7 +55,7 @@ class Kind(Enum):
 
 
 class Field(NamedTuple):
-    """One value inside a message: `name` carries its unit, `value` goes into JSON as it is."""
+    """One value inside a message: `name` includes its unit, `value` is ready for JSON."""
 
     name: str
     value: Any
@@ -65,7 +64,7 @@ class Field(NamedTuple):
     unit: str = ""
 
     def words(self, limit: int | None = None, mark: str = "") -> str:
-        """Label, value and unit; a value is cut behind `limit` characters."""
+        """Label, value and unit; the value is cut after `limit` characters."""
         text = self.text
         if limit is not None and len(text) > limit:
             text = f"{text[:limit].rstrip()} ..."
@@ -74,8 +73,8 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True)
 class BusEvent:
-    """What happened on the bus at `at` seconds. `sender` and `receiver` are names of nodes,
-    "all" for a broadcast, and empty where the id is of no node.
+    """One event on the bus at `at` seconds. `sender` and `receiver` are node names, "all" for a
+    broadcast, empty for an id of no node.
     """
 
     at: float
@@ -87,23 +86,23 @@ class BusEvent:
     command: int | None = None
     fields: tuple[Field, ...] = ()
     is_alarm: bool = False
-    """An intact message that tells of trouble: a NAK, or faults that are set."""
+    """An intact message that reports trouble: a NAK, or active faults."""
     in_dialect: bool = True
-    """False for a message that the dialect which was asked for does not have."""
+    """False for a message that the requested dialect lacks."""
 
     @property
     def route(self) -> str:
-        """Who to whom; empty for an id of no node."""
+        """Sender and receiver; empty for an id of no node."""
         return f"{self.sender} > {self.receiver}" if self.sender else ""
 
     @property
     def marked_title(self) -> str:
-        """The title, marked where the dialect does not have the message."""
+        """The title, marked if the dialect lacks the message."""
         return self.title if self.in_dialect else f"{self.title} {NOT_IN_DIALECT}"
 
     @property
     def is_trouble(self) -> bool:
-        """True for all that does not belong on a healthy bus."""
+        """True for anything that does not belong on a healthy bus."""
         return self.is_alarm or self.kind not in (Kind.MESSAGE, Kind.FOREIGN)
 
 
@@ -142,24 +141,24 @@ def route(of_id: int) -> tuple[str, str] | None:
 
 
 def message_titles() -> tuple[str, ...]:
-    """The titles of all messages that can be told apart, each once."""
+    """The titles of all messages, each once."""
     titles = [item.title for item in catalogue.ITEMS] + list(TITLES.values())
     return tuple(dict.fromkeys(titles))
 
 
 class Decoder:
-    """Tells what the frames of a bus say, in either dialect; with a `dialect`, what that one does
-    not have is marked. Give it every frame, and `tick` at `deadline`.
+    """Decodes the frames of a bus in either dialect; with a `dialect`, marks messages that it
+    lacks. Feed every frame, and call `tick` at `deadline`.
     """
 
     def __init__(self, dialect: Dialect | None = None) -> None:
         self._dialect = dialect
         self._streams = {key: Reassembler(key, _TIMEOUT_S) for key in ROUTES}
         self._holding: dict[int, Reassembler] = {}
-        """The streams that hold the beginning of something: seldom more than two or three."""
+        """Streams with an incomplete message: rarely more than two or three."""
 
     def feed(self, frame: Frame, now: float) -> Sequence[BusEvent]:
-        """What the frame completed, in order: usually nothing, sometimes more than one."""
+        """The events that the frame completed, in order: usually none, sometimes several."""
         if frame.is_error:
             return (BusEvent(now, Kind.ERROR_FRAME, frame.can_id, wording(Kind.ERROR_FRAME)),)
         stream = self._streams.get(frame.can_id)
@@ -173,11 +172,11 @@ class Decoder:
         return [self._describe(each, now) for each in found] if found else ()
 
     def deadline(self) -> float | None:
-        """When `tick` has something to drop; None while nothing is held."""
+        """When `tick` next drops an incomplete message; None without one."""
         return min((stream.due_at for stream in self._holding.values()), default=None)
 
     def tick(self, now: float) -> list[BusEvent]:
-        """What was cut short: the rest of a message that did not come in time (R12)."""
+        """Messages cut short: their rest did not arrive in time (R12)."""
         found = [each for stream in self._holding.values() for each in stream.tick(now)]
         self._holding = {key: held for key, held in self._holding.items() if held.due_at < inf}
         return [self._describe(each, now) for each in found]
@@ -197,7 +196,7 @@ class Decoder:
 
 
 def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
-    """Kind, title, fields, and whether it tells of trouble."""
+    """Kind, title, fields, and whether the message reports trouble."""
     decoded = catalogue.decode(message)
     if decoded is not None:
         content = decoded.content
@@ -224,7 +223,7 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
 
 
 def content_fields(content: Content) -> tuple[Field, ...]:
-    """The fields of a message of chapter 3; reserved bytes only if they are not zero."""
+    """The fields of a message of chapter 3; reserved bytes only when not zero."""
     fields = []
     for name, codec in content.LAYOUT:
         value = getattr(content, name)
@@ -239,7 +238,7 @@ def content_fields(content: Content) -> tuple[Field, ...]:
 
 
 def remark(name: str, unit: str, value: object) -> str:
-    """What has to be said beside a percentage that is shown as it came (R22)."""
+    """Remark for a percentage shown as received (R22)."""
     if unit != "%" or not isinstance(value, int):
         return ""
     if value > 100:
@@ -248,7 +247,7 @@ def remark(name: str, unit: str, value: object) -> str:
 
 
 def _row_fields(row: messages.UpgradeMessage) -> tuple[Field, ...]:
-    """The fields of a message of the upgrade."""
+    """The fields of an upgrade message."""
     values = vars(row)
     return tuple(
         Field(
@@ -261,7 +260,7 @@ def _row_fields(row: messages.UpgradeMessage) -> tuple[Field, ...]:
 
 
 def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:
-    """What can be said of a message that is no row of the documents."""
+    """The fields of a message outside the documents."""
     fields = (
         Field("command", f"{message.command:04X}", "command", f"{message.command:04X}"),
         Field("mode", message.mode, "mode", f"{message.mode:02X}"),
@@ -291,7 +290,7 @@ def _raw(name: str, data: bytes) -> Field:
 
 
 def _plain_value(value: object) -> Any:
-    """A value as JSON holds it: numbers, texts, lists of them; bytes in hexadecimal."""
+    """A value for JSON: numbers, texts, lists of them; bytes in hexadecimal."""
     match value:
         case Bits():
             return flag_names(type(value), value)
@@ -311,7 +310,7 @@ def _plain_value(value: object) -> Any:
 
 
 def bits_of(frame: Frame) -> int:
-    """Bit times of any frame; without stuff bits where only the base format's are known exactly."""
+    """Bit times of any frame; stuff bits are exact for the base format, else left out."""
     if frame.is_error:
         return _ERROR_FRAME_BITS
     if frame.is_extended:
@@ -321,7 +320,7 @@ def bits_of(frame: Frame) -> int:
 
 @dataclass(frozen=True, slots=True)
 class TimedEvent:
-    """One thing seen, with the first of its frames and the bits of all of them."""
+    """One event, with its first frame and the bits of all its frames."""
 
     event: BusEvent
     begin_s: float
@@ -333,28 +332,26 @@ class TimedEvent:
     """Bits of the first frame alone."""
 
     def began_s(self, bitrate_bps: int) -> float:
-        """When the first frame began on the wire, as well as the stamps tell."""
+        """Estimated begin of the first frame on the wire."""
         if self._bears_ends(bitrate_bps):
             return self.begin_s - self.first_bits / bitrate_bps
         return self.begin_s
 
     def left_s(self, bitrate_bps: int) -> float:
-        """When the last frame had left the wire, as well as the stamps tell."""
+        """Estimated end of the last frame on the wire."""
         if self._bears_ends(bitrate_bps):
             return self.end_s
         return max(self.end_s, self.begin_s + self.bits / bitrate_bps)
 
     def _bears_ends(self, bitrate_bps: int) -> bool:
-        """True when its stamps tell when each frame ended, False when they tell when it was handed
-        over.
-        """
+        """True when stamps mark the end of each frame, False when they mark acceptance."""
         between_s = (self.bits - self.first_bits) / bitrate_bps
         return self.end_s - self.begin_s >= ACCEPTED_SHARE * between_s
 
 
 @dataclass(slots=True)
 class _Open:
-    """Frames of one id since its last timed."""
+    """Frames of one id since its last timed event."""
 
     begin_s: float
     first_bits: int
@@ -363,7 +360,7 @@ class _Open:
 
 
 class TimedDecoder:
-    """Takes the frames of a bus in the order of time, gives what they say."""
+    """Decodes the frames of a bus, in the order of time, with their wire times."""
 
     def __init__(self) -> None:
         self._decoder = Decoder()
@@ -371,7 +368,7 @@ class TimedDecoder:
         self._nothing_due_before = -inf
 
     def feed(self, frame: Frame, now: float, bits: int) -> Sequence[TimedEvent]:
-        """What was cut short before `now`, then what the frame completed."""
+        """Messages cut short before `now`, then those that the frame completed."""
         found: list[TimedEvent] = []
         if now > self._nothing_due_before:
             found = self._cut_short(now)
@@ -388,7 +385,7 @@ class TimedDecoder:
         return found
 
     def finish(self, now: float) -> list[TimedEvent]:
-        """What is left unfinished at the end."""
+        """Messages still incomplete at the end."""
         return self._cut_short(now + 2 * _TIMEOUT_S)
 
     def _cut_short(self, now: float) -> list[TimedEvent]:
@@ -400,7 +397,7 @@ class TimedDecoder:
     def _timed(self, event: BusEvent, bits: int) -> TimedEvent:
         held = None
         if event.kind not in (Kind.FOREIGN, Kind.ERROR_FRAME):
-            # A second timed out of the same frame begins and ends with it.
+            # A second event of the same frame begins and ends with it.
             held = self._open.pop(event.can_id, None)
         if held is None:
             return TimedEvent(event, event.at, event.at, bits, bits)

@@ -1,7 +1,7 @@
-"""From the frames of a trace to its story.
+"""Builds the story of a trace from its frames.
 
-The frames are read once and not kept. It goes by CAN ids alone, since most formats do not say who
-sent a frame; it reads messages and asks no host engine, which could be wrong together with it.
+Reads the frames once and keeps none. Uses CAN ids alone, as most formats do not record the sender.
+Asks no host engine: that could share its bugs.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from flasher.trace.verdict import judge, remarks
 from flasher.wording import explanation
 
 MAX_TALKERS: Final = 100
-"""Different ids that are listed; more of them are only counted."""
+"""Different ids listed; further ones are only counted."""
 _MAX_IDS: Final = 100_000
 MAX_PACKETS: Final = 200_000
-"""Packets that a story holds one by one, over all upgrades."""
+"""Packets stored one by one in a story, over all upgrades."""
 EVERYTHING_LIMIT: Final = 200_000
-"""Lines of a list when every message is wanted."""
+"""Lines of a list that shows every message."""
 WALL_TIME_FROM: Final = 1e8
-"""Stamps from here on (1973) are wall time, smaller ones count from some start."""
+"""Stamps from here on (1973) are wall time; smaller ones are relative to a start."""
 _MAY_BE_ANSWERED: Final = frozenset({Cause.RECORDING_ENDS, Cause.TOOL_STOPPED})
-"""Ends of a trace behind which the latest message may have been answered."""
+"""Ends of a trace after which the latest message may have been answered."""
 _BEGINNERS: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
-"""Messages of the tool that make an upgrade."""
+"""Messages of the tool that start an upgrade."""
 _OF_BOOTLOADERS: Final = frozenset(Command) - {Command.READ_VERSION, Command.VERSION_INFORMATION}
-"""Commands that are no word of an application."""
+"""Commands that applications never send."""
 _BURST_S: Final = 1.0
-"""An announcement so short before an update command is a part of the upgrade."""
+"""An announcement this shortly before an update command is a part of the upgrade."""
 _SHUTDOWN: Final = 0x1308
 _BY_REQUEST: Final = {target.request_id: target for target in TARGETS.values()}
 _BY_ANSWER: Final = {target.answer_id: target for target in TARGETS.values()}
@@ -79,14 +79,14 @@ def explain(
     recorded: Recorded | None = None,
     is_one_tool: bool = False,
 ) -> Story:
-    """The story of a trace: `frames` with their times in seconds, in the order of the file.
+    """Build the story of a trace: `frames` with their times in seconds, in file order.
 
-    `suffix` names the format. `bitrate_bps` None finds the dialect's own rate. `until` is the time,
-    on the same clock, up to which the bus was listened to, where that is known. `everything` keeps
-    every message as a line of its own. `is_one_tool` says that whatever is sent comes from one
-    tool, which may break the protocol on purpose. Raises what `frames` raises.
+    `suffix` names the format. `bitrate_bps` None means the dialect's own rate. `until` is when
+    listening ended, on the same clock, if known. `everything` keeps every message as a line of its
+    own. `is_one_tool` means that one tool sent everything, and may break the protocol on purpose.
+    Raises what `frames` raises.
     """
-    reading = _Reading(bitrate_bps, everything=everything, is_one_tool=is_one_tool)
+    reading = _StoryBuilder(bitrate_bps, everything=everything, is_one_tool=is_one_tool)
     now = float("-inf")
     for at, frame in frames:
         now = max(now, at)
@@ -94,8 +94,8 @@ def explain(
     return reading.story(source, suffix, until, recorded)
 
 
-class _Reading:
-    """What has been read so far."""
+class _StoryBuilder:
+    """Collects facts while the frames are read."""
 
     def __init__(self, bitrate_bps: int | None, *, everything: bool, is_one_tool: bool) -> None:
         self._given_bps = bitrate_bps
@@ -147,7 +147,7 @@ class _Reading:
         else:
             self._other(timed)
 
-    # -- who it is for ---------------------------------------------------------------------------
+    # -- routing to upgrades ----------------------------------------------------------------------
 
     def _tool(self, target: Target, timed: TimedEvent) -> None:
         upgrade = self._open.get(target)
@@ -162,7 +162,7 @@ class _Reading:
         upgrade.tool(timed)
 
     def _begin(self, target: Target, timed: TimedEvent) -> ObservedUpgrade:
-        """An upgrade, with the announcements that led to it."""
+        """Start an upgrade with the announcements that led to it."""
         heard = [
             said
             for said in self._announced.pop(target, [])
@@ -182,8 +182,8 @@ class _Reading:
         return upgrade
 
     def _end_of_restart(self, target: Target, timed: TimedEvent) -> None:
-        """A device that announced itself, was told of no update, and answers as an application now
-        was restarted: that was no upgrade.
+        """Drop an upgrade that was a mere restart: the device announced itself, received no update
+        command, and its application answers.
         """
         upgrade = self._open.get(target)
         is_application = timed.event.kind in (Kind.MESSAGE, Kind.UNKNOWN)
@@ -210,7 +210,7 @@ class _Reading:
         self._outside.add(step_of(timed.event, timed.end_s))
 
     def _other(self, timed: TimedEvent) -> None:
-        """A message between other nodes, or to all of them."""
+        """Handle a message between other nodes, or to all of them."""
         event = timed.event
         if event.kind is Kind.MESSAGE and event.can_id == BMS.broadcast_id:
             if event.command == Command.VERSION_INFORMATION:
@@ -262,8 +262,8 @@ class _Reading:
     def story(
         self, source: str, suffix: str, until: float | None, recorded: Recorded | None
     ) -> Story:
-        """All of it; nothing may be fed afterwards. `until` is when the trace ended, in seconds on
-        its clock; None where its last frame tells.
+        """The finished story; feed nothing afterwards. `until` is when the trace ended, in seconds
+        on its clock; None means at its last frame.
         """
         start = self._start or 0.0
         until_s = max(self._bus.last_at, 0.0 if until is None else until - start)
@@ -275,7 +275,7 @@ class _Reading:
         for target in tuple(self._open):
             self._close(target, until_s)
         upgrades = tuple(story for _, story in sorted(self._upgrades, key=lambda one: one[0]))
-        # What matters most: of the last upgrade of each target, the first bad verdict.
+        # The first bad verdict among the last upgrades of each target.
         verdicts = list({upgrade.target: upgrade.verdict for upgrade in upgrades}.values())
         bad = [verdict for verdict in verdicts if not verdict.cause.is_good]
         chief = next(iter(bad or verdicts), None)
@@ -313,13 +313,13 @@ class _Reading:
             text += " an upgrade."
         elif self._has_nodes:
             cause = Cause.QUERIES_ONLY
-            text = "Nobody began an upgrade; there are messages of the drive system."
+            text = "No tool began an upgrade; the trace holds messages of the drive system."
         elif bus.frames:
             cause = Cause.FOREIGN_ONLY
             text = f"None of the {bus.frames:,} frames holds a message of the drive system."
         else:
             cause = Cause.EMPTY
-            text = "There is no classic CAN frame in it."
+            text = "The trace holds no classic CAN frame."
         if bus.error_frames:
             text += f" Error frames: {bus.error_frames:,}."
         likely, remedy = explanation(cause)
@@ -337,7 +337,7 @@ class BusCounter:
         self.damaged = 0
         self.malformed = 0
         self.is_alone = True
-        """Nobody but the tool was heard."""
+        """Only the tool sent anything."""
         self._bits = 0
         self._peak_bits = 0
         self._second = 0
@@ -346,7 +346,7 @@ class BusCounter:
         self._talkers: dict[tuple[int, bool], int] = {}
 
     def frame(self, frame: Frame, now: float, bits: int) -> None:
-        """Count one frame; times do not go back."""
+        """Count one frame; times never decrease."""
         if self.first_at is None:
             self.first_at = self.last_at = now
         if now - self.last_at > self._gap[0]:
@@ -370,7 +370,7 @@ class BusCounter:
             self.is_alone = names is not None and names[0] == Node.CDL.name
 
     def note(self, event: BusEvent) -> None:
-        """Count what was no message of the documents."""
+        """Count an event that is not a message of the documents."""
         self.damaged += event.kind is Kind.DAMAGED
         self.malformed += event.kind in (Kind.MALFORMED, Kind.UNKNOWN)
 
@@ -390,7 +390,7 @@ class BusCounter:
         )
 
     def talkers(self, but: set[int]) -> list[Talker]:
-        """All senders, most frames first, without these 11-bit ids."""
+        """All senders except these 11-bit ids, most frames first."""
         found = []
         for (of_id, is_extended), frames in self._talkers.items():
             names = None if is_extended else route(of_id)

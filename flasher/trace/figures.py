@@ -1,7 +1,7 @@
-"""How well a transfer uses the bus: measured live by a tap, or out of a trace by the same code.
+"""Bus usage figures of a transfer, measured live by a tap or from a trace by the same code.
 
-`Transfer` takes messages, `LinkMeter` is the tap that makes messages of a driver's frames. Neither
-keeps frames: of each packet there remain two times, of many times a `Distribution`.
+`Transfer` takes messages; `LinkMeter` is the tap that decodes a driver's frames. Neither keeps
+frames: two times remain of each packet, and a `Distribution` of many times.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _SECONDS: Final = "d"
 
 @dataclass(frozen=True)
 class Distribution:
-    """How a number of times are spread; all in seconds. A percentile is a value that was measured
-    (the nearest rank), never one between two.
+    """Spread of times, in seconds. A percentile is a measured value (nearest rank), never
+    interpolated.
     """
 
     count: int
@@ -37,9 +37,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: Iterable[float] | Mapping[float, int]) -> Self | None:
-        """The distribution of these seconds, or of how often each came; None when there are
-        none.
-        """
+        """The distribution of these seconds, or of value counts; None without values."""
         ranked = Ranked(values)
         if not ranked:
             return None
@@ -54,9 +52,7 @@ class Distribution:
 
 
 class Ranked:
-    """Values in order, each as often as it came; millions of them take the place of those that
-    differ.
-    """
+    """Sorted values with their counts, so that millions take little memory."""
 
     def __init__(self, values: Iterable[float] | Mapping[float, int]) -> None:
         counts = Counter(values)
@@ -81,34 +77,34 @@ def _nearest_rank(ranked: Ranked, share: float) -> float:
 
 @dataclass(frozen=True)
 class LinkReport:
-    """How a transfer used the bus, over all its attempts; times in seconds."""
+    """Bus usage of a transfer, over all its attempts; times in seconds."""
 
     packets: int
-    """Packets that were sent, each once for every attempt."""
+    """Packets sent, counted once per attempt."""
     acknowledged: int
-    """Those of them whose ACK came."""
+    """Packets whose ACK arrived."""
     repetitions: int
-    """Copies of a packet beyond the first one of its attempt."""
+    """Repeated packets, within an attempt."""
     naks: int
     """NAKs while packets were sent."""
     line_s: float
-    """One copy of each acknowledged packet and its ACK, one right after the other on the wire."""
+    """Wire time of one copy of each acknowledged packet and its ACK, back to back."""
     transfer_s: float
-    """From the first frame of the first packet to the last ACK, the attempts added up."""
+    """From the first frame of the first packet to the last ACK, summed over attempts."""
     share_of_line_rate: float | None
-    """`line_s` / `transfer_s`: 1 is a bus that never waits. More than 1 on a bus that is none.
-    None while nothing was acknowledged."""
+    """`line_s` / `transfer_s`: 1 is a bus that never waits; more than 1 is a virtual bus. None
+    before the first ACK."""
     host_turnaround: Distribution | None
-    """From the last frame of an ACK to the first frame of the next packet; None without any."""
+    """From the last frame of an ACK to the first frame of the next packet; None without samples."""
     device_answer: Distribution | None
     """From a packet's last frame on the wire to the last frame of its ACK or NAK; None without
-    any. What was sent more than once is left out: nobody knows which copy was answered."""
+    samples. Repeated packets are left out: the answer may belong to any copy."""
     unreadable: int | None = None
-    """How often the adapter delivered what is no frame; None where only its frames are known."""
+    """How often the adapter delivered something other than a frame; None if not counted."""
 
 
 class Transfer:
-    """Collects packets and their answers, over all attempts. Give it messages in order."""
+    """Collects packets and answers over all attempts. Feed messages in order."""
 
     def __init__(self, bitrate_bps: int) -> None:
         self._bitrate_bps = bitrate_bps
@@ -118,13 +114,13 @@ class Transfer:
         self._naks = 0
         self._line_bits = 0
         self._past_s = 0.0
-        """Transfer time of the attempts before this one."""
+        """Transfer time of earlier attempts."""
         self._begin_s: float | None = None
         self._last_ack_s: float | None = None
         self._acked_at_s: float | None = None
-        """The ACK that the next packet has not followed yet."""
+        """Time of the ACK that no packet has followed yet."""
         self._number = 0
-        """The packet in work; 0 before the first one of an attempt."""
+        """The current packet; 0 before the first one of an attempt."""
         self._highest = 0
         self._copies = 0
         self._bits = 0
@@ -134,7 +130,7 @@ class Transfer:
         self._answers = array(_SECONDS)
 
     def begin_attempt(self) -> None:
-        """The device asks for packet 1, or is told to prepare for it."""
+        """The device requests packet 1 or receives the update command."""
         if self._begin_s is not None and self._last_ack_s is not None:
             self._past_s += self._last_ack_s - self._begin_s
         self._begin_s = self._last_ack_s = self._acked_at_s = None
@@ -161,7 +157,7 @@ class Transfer:
         self._acked_at_s = None
 
     def answer(self, number: int, timed: TimedEvent, *, is_ack: bool) -> None:
-        """The device answered a packet; what does not answer the one in work is ignored."""
+        """The device answered a packet; answers to other packets are ignored."""
         if not is_ack:
             self._naks += 1
         if number != self._number or self._is_acked:
@@ -174,7 +170,7 @@ class Transfer:
             self._line_bits += self._bits + timed.bits
             self._last_ack_s = self._acked_at_s = timed.end_s
         else:
-            self._copies = 2  # Whatever comes now may answer this copy or the next one.
+            self._copies = 2  # The next answer may belong to this copy or the next one.
 
     def report(self) -> LinkReport | None:
         """The figures so far; None before the first packet."""
@@ -185,7 +181,7 @@ class Transfer:
             transfer_s += self._last_ack_s - self._begin_s
         line_s = self._line_bits / self._bitrate_bps
         share = line_s / transfer_s if transfer_s > 0 else None
-        # Where frames take less time than on the line, nobody knows when a packet had left.
+        # On a bus faster than the line, the end of a packet is unknown.
         is_no_line = share is not None and share > 1
         return LinkReport(
             packets=self._packets,
@@ -201,7 +197,7 @@ class Transfer:
 
 
 class LinkMeter:
-    """A driver's tap that measures the transfer to `target`; `report` at any time."""
+    """A driver's tap that measures the transfer to `target`. Call `report` at any time."""
 
     def __init__(self, target: Target, bitrate_bps: int) -> None:
         self._ids = frozenset((target.request_id, target.answer_id))
@@ -229,7 +225,6 @@ class LinkMeter:
                     self._transfer.answer(_number(timed), timed, is_ack=is_ack)
 
     def report(self) -> LinkReport | None:
-        """The figures so far; None before the first packet."""
         return self._transfer.report()
 
 

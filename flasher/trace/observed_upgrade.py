@@ -1,7 +1,6 @@
-"""One upgrade of one target as it is heard on the bus: what happened, in the order of time.
+"""One upgrade of one target as observed on the bus, in the order of time.
 
-It follows no protocol: it does not know which message has to come next, it only records. What the
-facts mean is judged by `verdict`.
+It only records and does not know which message comes next. `verdict` judges the facts.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ from flasher.trace.steps import StepList, step_of
 from flasher.trace.story import PacketStory, PhaseSpan, Step, StepKind, TraceVerdict
 
 NEXT_UPGRADE_S: Final = 15.0
-"""A reset after so much silence begins another upgrade, not another attempt."""
+"""A reset after this much silence starts another upgrade, not another attempt."""
 _GAP_S: Final = 1.0
-"""Silence that is worth a line."""
+"""Silence that gets a line of its own."""
 AT_ONCE_S: Final = 0.3
-"""A tool that gives up waits longer than this for an answer, before it starts over."""
+"""A tool that gives up waits longer than this before it starts over."""
 IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
-"""A tool that is silent for so long before the transfer has waited for an answer."""
+"""A tool silent for this long before the transfer was waiting for an answer."""
 _LATE_BOOT_S: Final = 0.25
-"""Boot versions up to here after an update command may have been on their way."""
+"""Boot versions this soon after an update command may already have been on the wire."""
 _VERSION_SIZE: Final = 32
-"""Bytes of the packet before, in which a version that spans two packets may begin."""
+"""Bytes of the previous packet in which a version across two packets may begin."""
 _MAX_NOTED: Final = 10
-"""Different texts of one sort that are kept."""
+"""Different texts of one kind that are kept."""
 
 
 class Interleaving:
-    """Finds messages that begin inside another one on the same id: two senders at once."""
+    """Detects messages that begin inside another one on the same id: two senders at once."""
 
     def __init__(self) -> None:
         self.found = 0
@@ -65,7 +64,7 @@ class Interleaving:
         self._last_at = now
 
     def answered(self) -> None:
-        """The other side spoke: the message was over, whatever is missing here."""
+        """The other side answered: the message was complete, even if a part is missing here."""
         self._left = 0
 
 
@@ -82,8 +81,8 @@ def _is_head(data: bytes) -> bool:
 class ObservedUpgrade:
     """One upgrade of one target so far. Times are seconds on the trace's clock.
 
-    `steps` and `link` grow with it; `judge` gives the verdict of an attempt that is followed by
-    another one.
+    `steps` and `link` grow with it; `judge` gives the verdict of an attempt followed by another
+    one.
     """
 
     target: Target
@@ -93,16 +92,16 @@ class ObservedUpgrade:
     judge: Callable[[ObservedUpgrade, float], TraceVerdict]
     max_packets: int
     is_one_tool: bool = False
-    """All that is sent on the tool's id is known to come from one tool."""
+    """Everything on the tool's id is known to come from one tool."""
 
     phase: Phase | None = None
     phase_begin_s: float = 0.0
     spans: list[PhaseSpan] = field(default_factory=list)
     attempt: int = 1
     earlier: TraceVerdict | None = None
-    """That of the attempt before, if it had come to the transfer."""
+    """Verdict of the previous attempt, if it reached the transfer."""
     is_answered: bool = False
-    """The target said something intact."""
+    """The target sent something intact."""
 
     # Before the transfer.
     resets: int = 0
@@ -111,9 +110,9 @@ class ObservedUpgrade:
     """Name and version, and how often each was announced."""
     boot_names: set[str] = field(default_factory=set)
     is_boot_odd: bool = False
-    """A version was announced that has not the document's form."""
+    """A boot version did not have the document's form."""
     boot_changes: int = 0
-    """How often a boot version differs from the one before it in the same attempt."""
+    """How often a boot version differs from the previous one in the same attempt."""
     is_announced: bool = False
     """The bootloader announced itself in this attempt."""
     updates: int = 0
@@ -124,22 +123,22 @@ class ObservedUpgrade:
     # The transfer.
     total: int | None = None
     packets: list[PacketStory] = field(default_factory=list)
-    """In the order of first copies; their number is limited."""
+    """In the order of first copies; limited in number."""
     current: PacketStory | None = None
     restarts: int = 0
     is_restarted: bool = False
-    """The device restarted and has not been told to prepare since."""
+    """The device restarted and has received no update command since."""
     damage_from_tool: int = 0
     damage_from_device: int = 0
     damage_now: int = 0
     """Damage since the last progress."""
     is_cut_short: bool = False
-    """The latest thing on the tool's id is a message that was never finished."""
+    """The latest message on the tool's id is incomplete."""
     errors: int = 0
     errors_now: int = 0
     """Error frames since the last progress."""
     extra_acks: int = 0
-    """ACKs for a packet that was sent once and had its ACK already."""
+    """Second ACKs for packets that were sent once."""
     image_versions: set[str] = field(default_factory=set)
     """Firmware versions found inside the packets."""
 
@@ -154,12 +153,12 @@ class ObservedUpgrade:
     # Others.
     shutdown_at_s: float | None = None
     intrusions: list[str] = field(default_factory=list)
-    """What the tool's id said that this upgrade does not explain."""
+    """Messages on the tool's id that this upgrade does not explain."""
     interleaving: Interleaving = field(default_factory=Interleaving)
 
     def __post_init__(self) -> None:
         self.last_at_s = self.tool_at_s = self.begin_s
-        """The latest message of either side, and of the tool."""
+        """Time of the latest message of either side, and of the tool."""
         self.link = Transfer(self.bitrate_bps)
         self._update_at_s = self._request_at_s = self.begin_s
         self._by_number: dict[int, PacketStory] = {}
@@ -170,13 +169,13 @@ class ObservedUpgrade:
 
     @property
     def is_restart(self) -> bool:
-        """So far the device was restarted and announced itself, and was told of no update."""
+        """So far the device restarted and announced itself, and received no update command."""
         return self.is_announced and not self.updates and self.phase is Phase.BOOT
 
-    # -- what is told to it ------------------------------------------------------------------------
+    # -- inputs ------------------------------------------------------------------------------------
 
     def begins_another(self, event: BusEvent) -> bool:
-        """True when a message of the tool belongs to the next upgrade, not to this one."""
+        """True when a tool's message belongs to the next upgrade."""
         is_over = self.completed_at_s is not None or self.early_complete
         if event.command == Command.RESET:
             return is_over or event.at - self.last_at_s > NEXT_UPGRADE_S
@@ -185,7 +184,7 @@ class ObservedUpgrade:
         return False
 
     def tool(self, timed: TimedEvent) -> None:
-        """Something on the id of the tool's messages to the target."""
+        """Record an event on the id of the tool's messages to the target."""
         self._silence(timed.begin_s)
         values = values_of(timed.event)
         is_damaged = timed.event.kind is Kind.DAMAGED
@@ -200,7 +199,7 @@ class ObservedUpgrade:
         self.last_at_s = self.tool_at_s = timed.end_s
 
     def device(self, timed: TimedEvent) -> None:
-        """Something on the id of the target's answers to the tool."""
+        """Record an event on the id of the target's answers to the tool."""
         self._silence(timed.begin_s)
         self.interleaving.answered()
         self.is_answered |= timed.event.kind is not Kind.DAMAGED
@@ -288,13 +287,13 @@ class ObservedUpgrade:
         self._enter(Phase.UPDATE, timed.begin_s)
 
     def _gave_up(self, now: float) -> bool:
-        """True when a tool that has told the device to update before waited for it in vain: what it
-        sends now is its next attempt.
+        """True when the tool sent update commands and waited in vain: its next message starts
+        another attempt.
         """
         return self.updates > 0 and now - self.tool_at_s >= IN_VAIN_S
 
     def _is_undisturbed(self, now: float) -> bool:
-        """True while all goes well, so that no tool has a reason to start over."""
+        """True while nothing went wrong, so that no tool has a reason to start over."""
         if self.is_one_tool:
             return False
         packet = self.current
@@ -411,23 +410,23 @@ class ObservedUpgrade:
     # -- phases, attempts and silence --------------------------------------------------------------
 
     def _enter(self, phase: Phase, at_s: float) -> None:
-        """A phase begins, or goes on."""
+        """Begin or continue a phase."""
         if self.phase is not phase:
             self._leave(at_s)
             self.phase, self.phase_begin_s = phase, at_s
 
     def _leave(self, at_s: float) -> None:
-        """The phase, if there is one, is over."""
+        """End the current phase, if any."""
         if self.phase is not None:
             end_s = max(self.phase_begin_s, at_s)
             self.spans.append(PhaseSpan(self.phase, self.attempt, self.phase_begin_s, end_s))
 
     def _progress(self) -> None:
-        """Something went well: trouble before it explains nothing any more."""
+        """Something succeeded: earlier trouble no longer explains a failure."""
         self.damage_now = self.errors_now = 0
 
     def _next_attempt(self, at_s: float) -> None:
-        """The tool starts over: what belongs to one attempt alone begins anew."""
+        """The tool starts over: reset the facts of a single attempt."""
         is_first = self.phase is Phase.UPDATE and self.earlier is None
         if is_first or self.phase in (Phase.TRANSFER, Phase.END):
             self.earlier = self.judge(self, at_s)
@@ -453,5 +452,5 @@ class ObservedUpgrade:
 
 
 def values_of(event: BusEvent) -> dict[str, Any]:
-    """The values of the fields by their names."""
+    """Field values by name."""
     return {shown.name: shown.value for shown in event.fields}

@@ -1,8 +1,7 @@
-"""Captures of Wireshark: frames out of .pcapng and .pcap files, and a writer of .pcapng.
+"""Wireshark captures: a reader of .pcapng and .pcap files, and a writer of .pcapng.
 
-What of the formats is not needed for CAN is passed over: names, statistics, other link types. A
-frame stands in a packet as SocketCAN has it (link type 227): identifier with flags, high byte
-first, size, flags of CAN FD, data.
+The reader skips names, statistics and other link types. A CAN frame is a packet of SocketCAN (link
+type 227): identifier with flags, high byte first, size, CAN FD flags, data.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from flasher.trace.bounds import Bounds, UnfitError
 
 _LINK_TYPE_CAN: Final = 227
 _LINK_TYPES: Final = {1: "Ethernet", 113: 'Linux "any"', 190: "CAN 2.0B", 276: 'Linux "any"'}
-"""Those that are named to a person."""
+"""Link types that messages name."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _ID_MASK: Final = _ERROR - 1
@@ -37,12 +36,12 @@ _OPTION_FLAGS, _OPTION_RESOLUTION, _OPTION_OFFSET = 2, 9, 14
 _INBOUND, _OUTBOUND = 1, 2
 _BLOCK_MAX: Final = 16 * 1024 * 1024
 _PCAP_MAGICS: Final = {0xA1B2C3D4: 10**6, 0xA1B23C4D: 10**9}
-"""Units of time in a second, by what a .pcap file begins with."""
+"""Time units per second, by the first bytes of a .pcap file."""
 
 
 def frames_of_capture(source: BufferedIOBase, bounds: Bounds) -> Iterator[tuple[float, Frame]]:
-    """Time in seconds and frame of each packet, of a .pcapng or a .pcap file. Raises UnfitError for
-    what is neither, for one without CAN, and where frames of a second interface come.
+    """Time in seconds and frame of each packet of a .pcapng or .pcap file. Raises UnfitError for
+    other files, without CAN, and at frames of a second interface.
     """
     magic = source.read(4)
     source.seek(0)
@@ -60,7 +59,7 @@ def frames_of_capture(source: BufferedIOBase, bounds: Bounds) -> Iterator[tuple[
 
 @dataclass(frozen=True)
 class _Interface:
-    """What packets of an interface are, and how their times are to be read."""
+    """Link type of an interface, and the unit of its times."""
 
     link_type: int
     units_per_s: int = 10**6
@@ -68,14 +67,14 @@ class _Interface:
 
 
 class _Interfaces:
-    """The interfaces of a capture: one of them has the frames."""
+    """The interfaces of a capture: exactly one has the frames."""
 
     def __init__(self) -> None:
         self.link_types: set[int] = set()
         self._of_frames: object = None
 
     def take(self, key: object) -> None:
-        """A frame came from this one."""
+        """Note a frame of this interface."""
         if self._of_frames not in (None, key):
             raise UnfitError(
                 "it holds frames of more than one CAN interface",
@@ -84,7 +83,7 @@ class _Interfaces:
         self._of_frames = key
 
     def check_can(self) -> None:
-        """Raises UnfitError when no interface is one of CAN, though there are others."""
+        """Raises UnfitError when there are interfaces, but none is CAN."""
         if not self.link_types or _LINK_TYPE_CAN in self.link_types:
             return
         kinds = ", ".join(
@@ -152,7 +151,7 @@ def _pcapng(source: BufferedIOBase, bounds: Bounds, found: _Interfaces) -> _Pack
             read = 12
             order = "<" if mark == _BYTE_ORDER.to_bytes(4, "little") else ">"
             if mark != _BYTE_ORDER.to_bytes(4, "little" if order == "<" else "big"):
-                raise UnfitError("a section does not tell its order of bytes")
+                raise UnfitError("a section has no byte order")
             size = Struct(f"{order}L").unpack_from(head, 4)[0]
             section += 1
             interfaces = []
@@ -216,10 +215,10 @@ def _padded(size: int) -> int:
 
 
 class PcapngWriter:
-    """Writes messages of python-can, as its own writers do, with comments for Wireshark."""
+    """Writer with the interface of python-can's own, with comments for Wireshark."""
 
     def __init__(self, path: str | os.PathLike[str], comment: str = "") -> None:
-        """`comment` is one of the whole file. Raises OSError."""
+        """`comment` is for the whole file. Raises OSError."""
         self._file = Path(path).open("wb")  # noqa: SIM115  stop() closes it
         section = Struct("<LHHq").pack(_BYTE_ORDER, 1, 0, -1)
         texts = {_OPTION_COMMENT: comment.encode(), _OPTION_APPLICATION: b"flasher"}
@@ -230,7 +229,7 @@ class PcapngWriter:
         )
 
     def __call__(self, message: can.Message, comment: str = "") -> None:
-        """Write one frame; a `comment` is shown with it. Raises OSError."""
+        """Write one frame with an optional `comment`. Raises OSError."""
         flags = (
             _EXTENDED * message.is_extended_id
             | _REMOTE * message.is_remote_frame
@@ -255,7 +254,7 @@ class PcapngWriter:
 
 
 def _options(values: dict[int, bytes]) -> bytes:
-    """Options of a block; empty ones are left out."""
+    """Options of a block, without empty ones."""
     written = [
         Struct("<HH").pack(code, len(value)) + value.ljust(_padded(len(value)), b"\0")
         for code, value in values.items()

@@ -1,12 +1,11 @@
-"""Reads recorded traces of the formats that python-can knows, and captures of Wireshark, as frames
-with their times.
+"""Reader of recorded traces: the formats of python-can, and Wireshark captures.
 
-python-can parses what a file holds; what it is given of a file is bounded here, since its readers
-take a line, a container or a database of any size and read on for ever.
+python-can parses the content, but takes a line, a container or a database of any size and may read
+forever; this module limits what it is given.
 
-SQLite makes and removes files beside a database that it opens, and repairs it. So a copy is read,
-in a folder of its own: what is only looked at stays as it is, and what another program had not yet
-written into the file itself is read too.
+SQLite creates and removes files beside a database that it opens, and repairs it. So a copy in a
+temporary folder is read: the original stays unchanged, and content that another program has not yet
+merged into the file is read too.
 """
 
 from __future__ import annotations
@@ -38,21 +37,21 @@ _FRAMES: Final = "SELECT ts, arbitration_id, extended, remote, error, data FROM 
 _IS_TABLE: Final = (
     "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'messages' AND rootpage > 0"
 )
-"""A view, or a table that a program makes up, may have rows without end."""
+"""A view or a virtual table may have endless rows."""
 _COMPANIONS: Final = ("-journal", "-wal")
-"""What SQLite writes beside a database; both hold what belongs into it."""
+"""Files that SQLite writes beside a database; both hold parts of its content."""
 _COPIED_MAX_SIZE: Final = 256 * 1024 * 1024
 _VALUE_MAX: Final = 65_536
 """In bytes, of one value."""
 _ROW_MIN_SIZE: Final = 8
 """In bytes, of the smallest row of seven columns: a damaged file may lead in circles."""
 
-SUFFIXES = ".asc .blf .csv .db .log .mf4 .pcap .pcapng .trc, also with .gz behind it"
+SUFFIXES = ".asc .blf .csv .db .log .mf4 .pcap .pcapng .trc, also followed by .gz"
 _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
-"""In bytes, of a format that is not read piece by piece."""
+"""In bytes, for a format that is read in one piece."""
 _PIECE_SIZE: Final = 65_536
 _TIME_MAX_S: Final = 1e11
-"""About the year 5000. Beyond, and before its negative, no clock tells the time."""
+"""About the year 5000. No clock gives a later time, or its negative."""
 _DATA_MAX: Final = 8
 _LINE_READERS: Final = {
     ".asc": can.ASCReader,
@@ -65,11 +64,10 @@ _OTHERS: Final = (".blf", ".db", ".mf4", *_CAPTURES)
 
 
 def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
-    """Time in seconds and frame, one after the other, as they stand in the file; CAN FD frames are
-    left out. Times are those of the file: seconds since its start or since 1970.
+    """Yield time in seconds and frame, in file order, without CAN FD frames.
 
-    Raises UsageError for a file that cannot be opened, whose suffix is not known, or whose content
-    is not what the suffix says.
+    Times are those of the file: seconds since its start or since 1970. Raises UsageError for a file
+    that cannot be opened, whose suffix is unknown, or whose content does not match the suffix.
     """
     shown = printable(os.fspath(path))
     suffixes = [suffix.lower() for suffix in Path(path).suffixes]
@@ -77,7 +75,7 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
     suffix = "".join(suffixes[-2:-1] if is_packed else suffixes[-1:])
     if suffix not in (*_LINE_READERS, *_OTHERS):
         raise UsageError(
-            f"{shown}: no trace format has this suffix.", remedy=f"Known are {SUFFIXES}."
+            f"{shown}: no trace format has this suffix.", remedy=f"Known suffixes: {SUFFIXES}."
         )
     with opened(path, FILE_MAX_SIZE, may_grow=True) as (file, size):
         bounds = Bounds()
@@ -105,8 +103,8 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
             remedy = error.remedy if isinstance(error, UnfitError) else ""
             wrong = "is not a trace of the format that its suffix says"
             raise UsageError(
-                f"{shown} {'is no trace of one CAN bus' if remedy else wrong}.",
-                where=f"behind frame {bounds.frames:,}" if bounds.frames else "at its beginning",
+                f"{shown} {'is not a trace of one CAN bus' if remedy else wrong}.",
+                where=f"after frame {bounds.frames:,}" if bounds.frames else "at its beginning",
                 cause=printable(f"{reason}{error!s:.100}"),
                 remedy=remedy or "Record it again, or rename it to the suffix of its format.",
             ) from error
@@ -115,7 +113,7 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
 def _frames(
     suffix: str, source: BufferedIOBase, size: int, path: Path, bounds: Bounds
 ) -> Iterator[tuple[float, Frame]]:
-    """What the reader of the format makes of a file. Raises whatever it raises."""
+    """The frames from the format's reader. Raises whatever that raises."""
     if suffix == ".db":
         yield from _frames_of_database(source, path)
         return
@@ -159,7 +157,7 @@ def _mf4_reader(whole: bytes) -> can.MF4Reader:
 
 
 def _check(at_s: float, frame: Frame) -> None:
-    """Raises UnfitError for a time or an id that no bus can have."""
+    """Raises UnfitError for an impossible time or id."""
     if not math.isfinite(at_s) or abs(at_s) > _TIME_MAX_S:
         raise UnfitError(f"a frame has the time {at_s!r}")
     is_long = frame.is_extended or frame.is_error
@@ -182,9 +180,9 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[float, Frame]]:
-    """Time in seconds and frame of each row. `path` leads to what belongs to the file.
+    """Time in seconds and frame of each row. `path` locates the companion files.
 
-    Raises UnfitError, and sqlite3.Error for what is no such database.
+    Raises UnfitError, and sqlite3.Error for an invalid database.
     """
     with _copied(source, path) as copy, closing(sqlite3.connect(copy)) as connection:
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _VALUE_MAX)
@@ -194,7 +192,7 @@ def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[fl
         for at_s, can_id, extended, remote, error, held in connection.execute(_FRAMES):
             left -= 1
             if left < 0:
-                raise UnfitError("it has more rows than it has room for")
+                raise UnfitError("it claims more rows than fit into its size")
             data = b"" if held is None and remote else held
             kinds = (
                 isinstance(at_s, int | float),

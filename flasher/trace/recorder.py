@@ -1,4 +1,4 @@
-"""Writes every frame in both directions to a file; its suffix chooses the format."""
+"""Recorder of all frames in both directions to a file; the suffix chooses the format."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from flasher.trace.pcapng import PcapngWriter
 _CANDUMP_ERROR: Final = 0x2000_0080
 """Error frame, bus error."""
 _INTERFACE_MAX: Final = 15
-"""Characters in the name of an interface of Linux, which is all that can-utils have room for."""
+"""Characters of a Linux interface name: can-utils have no room for more."""
 _NOT_IN_NAME: Final = re.compile(r"[^A-Za-z0-9.:_-]")
 _COMMIT_FRAMES: Final = 500
-"""Frames that a process which is killed leaves unwritten, at the most."""
+"""At most this many frames are lost when the process is killed."""
 ONE_TOOL_CHANNEL: Final = "conformance"
-"""Channel of a log in which one tool breaks the protocol on purpose."""
+"""Channel in logs of the conformance suite, which breaks the protocol on purpose."""
 
 
 def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0) -> can.Message:
-    """A frame as python-can's writers take it, at wall time `at_s`."""
+    """A frame as a python-can message at wall time `at_s`."""
     return can.Message(
         timestamp=at_s,
         arbitration_id=frame.can_id,
@@ -44,7 +44,7 @@ def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0)
 
 
 class Writer(Protocol):
-    """What all writers of traces have."""
+    """Common interface of all trace writers."""
 
     def __call__(self, msg: can.Message, /) -> None: ...
 
@@ -52,9 +52,8 @@ class Writer(Protocol):
 
 
 class CandumpWriter:
-    """Writes messages of python-can as `candump -L` does, so that canplayer, log2asc and Wireshark
-    read them. python-can's own writer adds a letter for the direction, with which Wireshark takes
-    the file for no capture.
+    """Writes the format of `candump -L`, for canplayer, log2asc and Wireshark. python-can's own
+    writer adds a direction letter that Wireshark does not accept.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -81,8 +80,8 @@ class CandumpWriter:
 
 
 class DatabaseWriter:
-    """Writes messages into an SQLite file, in the table that python-can reads. python-can's own
-    writer ends with frames still in its queue, and adds to a file that is there.
+    """Writes to an SQLite file, in the table that python-can reads. python-can's own writer loses
+    queued frames at the end, and appends to an existing file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -117,7 +116,7 @@ class DatabaseWriter:
             self._do(self._connection.commit)
 
     def stop(self) -> None:
-        """Close the file; ValueError when that was done before. Raises OSError."""
+        """Close the file. Raises ValueError when already closed, and OSError."""
         if self._is_closed:
             raise ValueError("it is closed")
         self._is_closed = True
@@ -127,7 +126,7 @@ class DatabaseWriter:
             self._connection.close()
 
     def _do(self, work: Callable[..., object], *arguments: object) -> None:
-        """Raises OSError for what the database says."""
+        """Execute a statement; raises OSError for errors of the database."""
         try:
             work(*arguments)
         except sqlite3.Error as error:
@@ -135,9 +134,9 @@ class DatabaseWriter:
 
 
 def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
-    """What writes the format that the suffix names, for its owner's eyes alone; in messages it is
-    `called` so. Raises UsageError for a suffix that is not known, or whose format needs a package
-    that is not installed, and for a file that cannot be written.
+    """Create the writer for the suffix of the file, readable by its owner only; messages name it
+    `called`. Raises UsageError for an unknown suffix, a missing package, or a file that cannot be
+    written.
     """
     suffix, shown = Path(path).suffix.lower(), printable(called or os.fspath(path)) or "''"
     try:
@@ -171,8 +170,8 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
 
 @contextmanager
 def _created_for_its_owner(path: str | os.PathLike[str]) -> Iterator[None]:
-    """The file is there, readable by its owner alone, when somebody opens it in the block. If that
-    fails, none is left, and one that was there is as it was. Raises OSError.
+    """Create the file for its owner only, before the block opens it. On failure a new file is
+    removed and an existing one is unchanged. Raises OSError.
     """
     was_there = os.path.lexists(path)
     make_private(path, is_appended_to=True)
@@ -190,9 +189,8 @@ class Recorder:
 
     Times in the file are wall-clock times, counted from the start by the driver's clock, so that a
     jump of the wall clock leaves no gap. Use as a context manager: formats like .blf are complete
-    only when closed. Raises UsageError for a suffix that python-can does not know or a file that
-    cannot be written. A disk that fills up later ends the recording and nothing else: `failure`
-    then says why.
+    only when closed. Raises UsageError for an unknown suffix or a file that cannot be written. A
+    full disk ends the recording and nothing else; see `failure`.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -211,7 +209,7 @@ class Recorder:
 
     @property
     def channel(self) -> str:
-        """Which adapter the frames come from. Only `.log` names it, `can0` where it is empty."""
+        """Adapter of the frames. Only `.log` stores it; empty means `can0`."""
         return self._channel
 
     @channel.setter

@@ -1,4 +1,4 @@
-"""Where a story comes from: a trace file, or a bundle's folder with the trace and report in it."""
+"""Sources of a story: a trace file, or a bundle's folder with trace and report."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _RATE_MAX_BPS: Final = 10_000_000
 
 
 def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
-    """The story of a trace of any format that python-can reads, or of a bundle's folder.
+    """Explain a trace file of any known format, or a bundle's folder.
 
-    Raises UsageError for what is neither.
+    Raises UsageError for anything else.
     """
     damage: list[str] = []
     trace = trace_file(path)
@@ -48,8 +48,8 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
 
 
 def trace_file(path: Path) -> Path:
-    """The trace itself: of a bundle's folder, the file in it. Raises UsageError for a folder that
-    is no bundle.
+    """The trace file itself, or the one in a bundle's folder. Raises UsageError for any other
+    folder.
     """
     if not path.is_dir():
         return path
@@ -57,14 +57,14 @@ def trace_file(path: Path) -> Path:
         if (path / name).is_file():
             return path / name
     raise UsageError(
-        f"{printable(str(path))} is a folder, but no bundle: there is no {TRACE} in it.",
-        remedy="Name a trace file, or the folder that a failed command has left.",
+        f"{printable(str(path))} is a folder, but not a bundle: it lacks {TRACE} in it.",
+        remedy="Name a trace file, or the folder that a failed command wrote.",
     )
 
 
 def _as_the_tool_ended(story: Story) -> Story:
-    """A bundle is written when the tool has ended: where its trace breaks off, it was the tool that
-    stopped, and not the recording.
+    """A bundle is written after the tool ended: a trace that stops early means that the tool
+    stopped, not the recording.
     """
     recorded = story.recorded
     if recorded is None or recorded.exit_code is None:
@@ -89,8 +89,8 @@ def _as_the_tool_ended(story: Story) -> Story:
 
 
 def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
-    """The frames of a trace up to where it cannot be read on, which is noted in `damage`: a
-    recorder that was killed leaves half a line behind. Raises UsageError when not one can be read.
+    """The frames up to the first unreadable one, which is noted in `damage`: a killed recorder
+    leaves half a line. Raises UsageError if no frame can be read.
     """
     count = 0
     try:
@@ -104,7 +104,7 @@ def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, 
 
 
 def _is_of_conformance(path: Path) -> bool:
-    """True for a log of the conformance suite: its channel says so."""
+    """True for a log of the conformance suite, by its channel."""
     if path.suffix.lower() != ".log" or not path.is_file():
         return False
     with opened(path, None, may_grow=True) as (file, _):
@@ -116,7 +116,7 @@ def _suffix(path: Path) -> str:
 
 
 def _report(path: Path) -> dict[str, Any]:
-    """The report of a bundle; empty when there is none."""
+    """The report of a bundle; empty if missing."""
     try:
         if not path.exists():
             return {}
@@ -132,14 +132,14 @@ def _report(path: Path) -> dict[str, Any]:
 
 def _no_report(path: Path, cause: str) -> UsageError:
     return UsageError(
-        f"{printable(str(path))} is no report of a bundle.",
+        f"{printable(str(path))} is not the report of a bundle.",
         cause=printable(cause),
         remedy=f"Explain the {TRACE} in the same folder instead.",
     )
 
 
 def recorded_of(path: Path) -> Recorded:
-    """What the command said that has left a bundle. Raises UsageError where its report is none."""
+    """The outcome that the command wrote to its bundle. Raises UsageError for a broken report."""
     return _recorded(_report(path / REPORT))
 
 

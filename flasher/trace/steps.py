@@ -1,4 +1,4 @@
-"""The list of steps of a story: good packets folded, error frames counted, never endless."""
+"""The steps of a story: good packets folded, error frames counted, length limited."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.story import PacketRun, Step, StepKind, StoryLine
 
 MAX_STEPS: Final = 1000
-"""Lines that one list keeps: the first half of them and the last half."""
+"""Lines kept of one list: its first and its last half."""
 _VALUE_WIDTH: Final = 64
 """Longer values are cut."""
 _ERRORS: Final = "error frames"
 
 
 class StepList:
-    """Collects lines; `fold` packets that were sent once and acknowledged into runs."""
+    """Collects lines; `fold` combines packets sent once and acknowledged into runs."""
 
     def __init__(self, *, fold: bool = True, limit: int = MAX_STEPS) -> None:
         self._fold = fold
@@ -27,14 +27,14 @@ class StepList:
         self._tail: deque[StoryLine] = deque(maxlen=self._half)
         self._taken = 0
         self._pending: tuple[int, float, Step] | None = None
-        """A packet that waits for its ACK: number, begin, and its line if that does not come."""
+        """A packet waiting for its ACK: number, begin, and its line if none arrives."""
         self._run: PacketRun | None = None
         self._errors = 0
         self._errors_at = (0.0, 0.0)
 
     @property
     def left_out(self) -> int:
-        """Lines that were not kept."""
+        """Number of lines dropped."""
         return self._taken - len(self._head) - len(self._tail)
 
     def add(self, step: Step) -> None:
@@ -42,7 +42,7 @@ class StepList:
         self._keep(step)
 
     def packet(self, number: int, begin_s: float, step: Step) -> None:
-        """A packet; it becomes a line of its own unless its ACK is the next thing."""
+        """Add a packet; it gets its own line unless its ACK follows directly."""
         if not self._fold:
             self.add(step)
             return
@@ -52,7 +52,7 @@ class StepList:
         self._pending = (number, begin_s, step)
 
     def ack(self, number: int, step: Step) -> None:
-        """An ACK; with the packet before it a part of a run."""
+        """Add an ACK; with the packet before it, it extends a run."""
         if self._pending is None or self._pending[0] != number:
             self.add(step)
             return
@@ -65,7 +65,7 @@ class StepList:
             self._run = PacketRun(number, number, begin_s, step.at_s)
 
     def error_frame(self, at_s: float) -> None:
-        """An error frame; many in a row are one line."""
+        """Add an error frame; consecutive ones share a line."""
         if not self._errors:
             self._flush()
             self._errors_at = (at_s, at_s)
@@ -107,8 +107,8 @@ class StepList:
 
 
 def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[StoryLine, ...]:
-    """The lines of an upgrade, in which what the tool said and the `device` left unanswered is
-    trouble. `is_over`: nothing more came after the last one.
+    """The lines of an upgrade, with the tool's messages that `device` left unanswered marked as
+    trouble. `is_over`: nothing followed the last one.
     """
     lines = list(steps.lines())
     gap = len(lines) // 2 - 1 if steps.left_out else None
@@ -133,7 +133,7 @@ def step_of(event: BusEvent, at_s: float) -> Step:
     """A bus event as a line."""
     kind = StepKind.DAMAGED if event.kind is Kind.DAMAGED else StepKind.MESSAGE
     width = None if event.is_alarm else _VALUE_WIDTH  # no fault is left out
-    # Image bytes, and a constant text that repeats the title, say nothing.
+    # Image bytes, and a constant text that repeats the title, add nothing.
     told = (shown for shown in event.fields if shown.name not in ("payload", "text"))
     said = ", ".join(shown.words(width) for shown in told)
     return Step(

@@ -1,9 +1,8 @@
-"""The story of a recorded trace, as data: what `flasher explain` prints, draws, and gives as JSON.
+"""The story of a recorded trace as data: `flasher explain` prints, draws and exports it.
 
-Dataclasses and nothing else; those of packets grow while the trace is read. All times named
-`..._s` are seconds since the first frame of the trace. Every text is safe to show in a terminal; a
-page still has to escape it for HTML.
-JSON is made of them by `flasher.cli.documents.as_json`.
+Dataclasses only; those of packets grow while the trace is read. Times named `..._s` are seconds
+since the first frame of the trace. Every text is safe to show in a terminal; a page still has to
+escape it for HTML. `flasher.cli.documents.as_json` makes the JSON.
 """
 
 from __future__ import annotations
@@ -16,11 +15,13 @@ from flasher.trace.figures import LinkReport
 
 
 class Cause(Enum):
-    """How an upgrade ended and why, or what a trace without one holds; the value is a headline."""
+    """Result of an upgrade and its reason, or the content of a trace without one; the value is a
+    headline.
+    """
 
     # It went well.
     COMPLETED = "completed"
-    """The device said complete. A version that it answered afterwards is in the verdict's text."""
+    """The device reported complete. The verdict's text has any version it answered later."""
     CONFIRMED_BY_VERSION = "confirmed_by_version"
 
     # It did not begin.
@@ -41,7 +42,7 @@ class Cause(Enum):
     BUS_TROUBLE = "bus_trouble"
     TOOL_STOPPED = "tool_stopped"
     TOOL_ENDED = "tool_ended"
-    """By its own word, in a bundle."""
+    """As the tool's report in the bundle states."""
 
     # The end.
     REFUSED = "refused"
@@ -57,60 +58,60 @@ class Cause(Enum):
 
     @property
     def is_good(self) -> bool:
-        """True when the device has the new image, by its own word."""
+        """True when the device reported that it has the new image."""
         return self in {Cause.COMPLETED, Cause.CONFIRMED_BY_VERSION}
 
     @property
     def is_upgrade(self) -> bool:
-        """False for a trace in which there is none."""
+        """False for a trace without an upgrade."""
         return self not in {Cause.QUERIES_ONLY, Cause.FOREIGN_ONLY, Cause.EMPTY}
 
 
 @dataclass(frozen=True)
 class TraceVerdict:
-    """What went wrong (or right), where, most likely why, and what to do."""
+    """What went wrong (or right), where, the likely cause, and the next step."""
 
     cause: Cause
     phase: Phase | None
-    """The phase in which it was decided; None outside of an upgrade."""
+    """Phase of the decision; None outside of an upgrade."""
     packet: int | None
-    """The packet that was in work, from 1; None outside of the transfer."""
+    """The current packet, from 1; None outside of the transfer."""
     attempt: int
     """From 1; 0 without an upgrade."""
     text: str
     """What happened, one or two sentences."""
     likely: str = ""
-    """Most likely why; empty when there is nothing to explain."""
+    """Likely cause; empty when nothing needs an explanation."""
     remedy: str = ""
-    """What to do; empty when there is nothing to do."""
+    """Next step; empty when none is needed."""
 
 
 class StepKind(Enum):
-    """What a step is, to choose how to draw it."""
+    """Kind of a step, which decides how it is drawn."""
 
     MESSAGE = "message"
-    """An intact message of the documents, or an unknown one: an arrow from sender to receiver."""
+    """An intact message, in the documents or not: an arrow from sender to receiver."""
     DAMAGED = "damaged"
-    """Bytes that were no message, on the id of sender and receiver."""
+    """Bytes without a valid message, on the id of sender and receiver."""
     ERROR_FRAMES = "error frames"
-    """One or more error frames in a row; no sender."""
+    """Consecutive error frames; no sender."""
     GAP = "gap"
-    """Neither tool nor device sent anything for a notable time; no sender."""
+    """Notable silence of tool and device; no sender."""
     NOTE = "note"
-    """A remark of the explanation itself; no sender."""
+    """A remark of the explanation; no sender."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One message or one notable thing."""
+    """One message or one notable event."""
 
     at_s: float
-    """When it was complete: its last frame."""
+    """Time of its last frame."""
     kind: StepKind
     sender: str
-    """Name of the node ("CDL", "BMS"); empty where there is none."""
+    """Name of the node ("CDL", "BMS"); empty without one."""
     receiver: str
-    """Name of the node, "all" for a broadcast; empty where there is none."""
+    """Name of the node, "all" for a broadcast; empty without one."""
     title: str
     """"reset", "boot version", "packet", "NAK", ..."""
     text: str
@@ -121,7 +122,7 @@ class Step:
 
 @dataclass(frozen=True)
 class PacketRun:
-    """Packets `first` to `last`, each sent once and acknowledged: one line in place of hundreds."""
+    """Packets `first` to `last`, each sent once and acknowledged: one line instead of hundreds."""
 
     first: int
     last: int
@@ -136,7 +137,7 @@ class PacketRun:
 
 
 StoryLine = Step | PacketRun
-"""What a list of steps holds, in the order of time."""
+"""An entry of a list of steps."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ class PacketStory:
     sent_at_s: float
     """Last frame of its first copy."""
     answered_at_s: float | None
-    """Its ACK; None when there was none."""
+    """Time of its ACK; None without one."""
     answer_s: float | None
     """From the last frame of the latest copy to the ACK; None without one."""
 
@@ -182,30 +183,30 @@ class UpgradeStory:
     begin_s: float
     end_s: float
     image_size_bytes: int | None
-    """As the update command says; None when it is not in the trace."""
+    """From the update command; None if that is not in the trace."""
     total_packets: int | None
-    """As the packets say; None when there are none."""
+    """From the packets; None without any."""
     boot_version: str | None
-    """Name and version as announced; None when it never was."""
+    """Announced name and version; None if never announced."""
     running_version: str | None
-    """Version that the application answered after the upgrade; None when it did not."""
+    """Version that the application answered after the upgrade; None without an answer."""
     attempts: int
     phases: tuple[PhaseSpan, ...]
     packets: tuple[PacketStory, ...]
-    """In the order of their first copies; attempts one after the other."""
+    """In the order of first copies; attempts one after the other."""
     steps: tuple[StoryLine, ...]
     steps_left_out: int
-    """Steps beyond the number that is kept."""
+    """Number of steps dropped."""
     link: LinkReport | None
     """None when no packet was sent."""
     remarks: tuple[str, ...]
-    """What else was remarkable, whatever the verdict: restarts that were recovered from, error
-    frames, queries in the middle, SHUTDOWN."""
+    """Remarkable events, whatever the verdict: recovered restarts, error frames, queries,
+    SHUTDOWN."""
     verdict: TraceVerdict
 
 
 class TalkerKind(Enum):
-    """Who else was heard."""
+    """Kind of a sender outside of the upgrades."""
 
     NODE = "node"
     FOREIGN = "foreign"
@@ -213,7 +214,7 @@ class TalkerKind(Enum):
 
 @dataclass(frozen=True)
 class Talker:
-    """One CAN id on which somebody spoke outside of the upgrades' dialogues."""
+    """One CAN id with traffic outside of the upgrades' dialogues."""
 
     can_id: int
     is_extended: bool
@@ -232,14 +233,14 @@ class BusFigures:
     frames: int
     """All frames, error frames not counted."""
     load: float | None
-    """Mean share of the time that was taken, 0 to 1; None for a trace of no duration."""
+    """Mean bus load, 0 to 1; None for a trace of no duration."""
     peak_load: float | None
-    """The same in the busiest second; None for a trace that is shorter than one."""
+    """Bus load in the busiest second; None for a shorter trace."""
     error_frames: int
     damaged: int
-    """Pieces of bytes on the drive system's ids that were no message (wrong CRC, cut short ...)."""
+    """Byte pieces on the drive system's ids without a valid message (wrong CRC, cut short ...)."""
     malformed: int
-    """Intact messages that break their row of the documents, or that no row knows."""
+    """Intact messages that the documents lack, or with content they forbid."""
     longest_gap_s: float
     """The longest time without any frame."""
     longest_gap_at_s: float
@@ -248,27 +249,27 @@ class BusFigures:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What the flasher that wrote a bundle said itself; read from its report.json."""
+    """Outcome that the flasher stored in a bundle's report.json."""
 
     command: str
     exit_code: int | None
     error: str
-    """What it reported, in its own words: what, where, likely cause, what to do; may be empty."""
+    """The reported error: what, where, likely cause, next step; may be empty."""
 
 
 @dataclass(frozen=True)
 class Story:
-    """All that a trace tells."""
+    """Everything that a trace shows."""
 
     source: str
     """Name of the file or bundle, safe to show."""
     format: str
     """Suffix of the trace file, without the dot."""
     started_at: float | None
-    """Wall time of the first frame in seconds since 1970; None where the format does not say."""
+    """Wall time of the first frame in seconds since 1970; None if the format lacks it."""
     duration_s: float
     bitrate_bps: int
-    """The rate for which times on the wire were computed."""
+    """Rate used to compute times on the wire."""
     frames: int
     bus: BusFigures
     upgrades: tuple[UpgradeStory, ...]
@@ -276,13 +277,13 @@ class Story:
     talkers: tuple[Talker, ...]
     """Most frames first."""
     verdict: TraceVerdict
-    """That of the upgrade which matters most: the last one of each target, the first bad of these;
-    or what the trace holds instead."""
+    """The first bad verdict among the last upgrades of each target; without an upgrade, what the
+    trace holds."""
     steps: tuple[StoryLine, ...]
-    """What was said outside of upgrades."""
+    """Messages outside of upgrades."""
     steps_left_out: int
     talkers_left_out: int = 0
     recorded: Recorded | None = None
     """For a bundle only."""
     damage: str = ""
-    """Where and why the file could not be read on: the story is that of what stands before."""
+    """Where and why reading stopped; the story covers the part before."""

@@ -1,8 +1,7 @@
-"""Taps of the driver: the flight recorder, and what keeps echoes from other taps.
+"""Taps of the driver: the flight recorder, and a filter that removes echoes.
 
-The flight recorder keeps the last frames in both directions, always, at the price of a few
-megabytes. Nothing is written until somebody asks for it (`bundle`); memory is bounded whatever a
-bus carries.
+The flight recorder always keeps the last frames in both directions, in a few megabytes. They are
+written only on request (`bundle`).
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ class Entry(NamedTuple):
 class FlightRecorder:
     """A driver's tap that keeps the last `limit` frames, and counts all of them.
 
-    `wall_offset_s` turns times of the driver's clock into seconds since 1970. It is taken once, at
-    the first frame, so that a jump of the wall clock leaves no gap.
+    `wall_offset_s` converts the driver's clock to seconds since 1970. It is measured once, at the
+    first frame, so that a jump of the wall clock leaves no gap.
     """
 
     def __init__(
@@ -39,7 +38,7 @@ class FlightRecorder:
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._wall_clock = wall_clock
         self.frames = 0
-        """All frames so far, also those that the ring has forgotten."""
+        """All frames so far, including those dropped from the ring."""
         self.wall_offset_s: float | None = None
         """None before the first frame."""
 
@@ -62,21 +61,21 @@ class FlightRecorder:
 
 
 class _Tap(Protocol):
-    """As `flasher.driver.Tap`."""
+    """The same as `flasher.driver.Tap`."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None: ...
 
 
 class Unechoed:
-    """A driver's tap in front of others, which keeps an adapter's echoes from them: a frame that
-    was sent stands in a trace once. `taps` is asked at each frame: more may come later.
+    """A driver's tap that hides an adapter's echoes from other taps, so that a trace shows each
+    sent frame once. `taps` is called at each frame: more may be added later.
     """
 
     def __init__(self, taps: Callable[[], Sequence[_Tap]]) -> None:
         self._taps = taps
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Hand on one frame, unless it is an echo."""
+        """Pass one frame on, unless it is an echo."""
         if frame.is_echo:
             return
         for tap in self._taps():

@@ -1,7 +1,7 @@
-"""What the facts of an upgrade mean: how it ended, where, most likely why, what to do.
+"""Judges an observed upgrade: how it ended, where, the likely cause, the next step.
 
-Causes that concern the whole bus (a second tool, no acknowledgement, two devices) are looked for
-first, as their symptoms would be taken for the fault of a phase.
+Causes that concern the whole bus (a second tool, no acknowledgement, two devices) are checked
+first, as their symptoms look like the fault of a phase.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from flasher.trace.story import Cause, TraceVerdict
 from flasher.wording import explanation
 
 _SILENT_S: Final = 1.0
-"""A tool that says nothing for so long, while it is its turn, has stopped."""
+"""A tool silent for this long, when it should send, has stopped."""
 _ACK_WAIT_S: Final = 0.4
-"""A packet without an answer for so long is unanswered, even if it was sent only once."""
+"""A packet without an answer for this long is unanswered, even if sent only once."""
 _RESETS: Final = 3
-"""So many unanswered resets are not the beginning of a trace that was cut off."""
+"""This many unanswered resets are not the begin of a truncated trace."""
 _ERRORS: Final = 3
-"""So many error frames since the last progress are the reason, not a chance."""
+"""This many error frames since the last progress are the reason, not a coincidence."""
 _EXTRA_ACKS: Final = 3
 _DEAD_AGAIN: Final = frozenset({Cause.NO_BOOT_VERSION, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN})
 
@@ -33,8 +33,8 @@ class _Found(NamedTuple):
 
 
 def judge(upgrade: ObservedUpgrade, until_s: float, *, is_alone: bool = False) -> TraceVerdict:
-    """The verdict. The trace is known to go on until `until_s`; `is_alone` when nobody but the tool
-    was ever heard.
+    """The verdict. The trace continues until `until_s`; `is_alone` when only the tool sent
+    anything.
     """
     found = _completed(upgrade) or _spoiled(upgrade, is_alone=is_alone)
     if found is None:
@@ -70,40 +70,42 @@ def _completed(upgrade: ObservedUpgrade) -> _Found | None:
     if upgrade.completed_at_s is None:
         return None
     if running is None:
-        text = f"The {node} has every packet and said complete; no version answer is in the trace."
+        text = (
+            f"The {node} has every packet and reported complete; the trace holds no version answer."
+        )
         return _Found(Cause.COMPLETED, text)
     if _is_other(upgrade):
         return _other_version(upgrade)
     return _Found(
         Cause.COMPLETED,
-        f"The {node} has every packet, said complete, and is running version {running}.",
+        f"The {node} has every packet, reported complete, and is running version {running}.",
     )
 
 
 def _is_other(upgrade: ObservedUpgrade) -> bool:
-    """True when the one version inside the image is not the one that answers."""
+    """True when the image holds exactly one version and the device answers another."""
     known = upgrade.image_versions
     return len(known) == 1 and upgrade.running_version not in known
 
 
 def _other_version(upgrade: ObservedUpgrade) -> _Found:
     (sent,) = upgrade.image_versions
-    said = "said complete" if upgrade.completed_at_s is not None else "did not say complete"
+    end = "reported complete" if upgrade.completed_at_s is not None else "did not report complete"
     return _Found(
         Cause.OTHER_VERSION,
-        f"The {upgrade.target.node.name} {said}; it answers version {upgrade.running_version}, "
+        f"The {upgrade.target.node.name} {end}; it answers version {upgrade.running_version}, "
         f"the packets hold version {sent}.",
     )
 
 
-# -- what spoils everything -----------------------------------------------------------------------
+# -- causes of the whole bus -----------------------------------------------------------------------
 
 
 def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
     node = upgrade.target.node.name
     if upgrade.intrusions and not upgrade.is_one_tool:
-        said = "; ".join(upgrade.intrusions[:3])
-        text = f"On the tool's own CAN id there came what this upgrade does not explain: {said}."
+        unexplained = "; ".join(upgrade.intrusions[:3])
+        text = f"This upgrade does not explain messages on the tool's own CAN id: {unexplained}."
         return _Found(Cause.SECOND_TOOL, text)
     is_cut_in = upgrade.interleaving.found and upgrade.damage_from_tool
     if is_cut_in and not upgrade.is_one_tool:
@@ -116,17 +118,17 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
     if upgrade.boot_changes or upgrade.extra_acks >= _EXTRA_ACKS:
         text = f"{upgrade.extra_acks} packets that were sent once had two ACKs."
         if upgrade.boot_changes:
-            heard = ", ".join(f"{name} ({count})" for name, count in upgrade.boot_versions.items())
-            text = f"On the id of the {node} bootloaders announce different versions: {heard}."
+            each = ", ".join(f"{name} ({n})" for name, n in upgrade.boot_versions.items())
+            text = f"On the id of the {node} bootloaders announce different versions: {each}."
         return _Found(Cause.TWO_DEVICES, text)
     names = upgrade.boot_names
     is_other = names and (upgrade.target.boot_name not in names or upgrade.is_boot_odd)
     if is_other and upgrade.phase is not Phase.TRANSFER and not upgrade.ends:
         own = f"{upgrade.target.boot_name} {BOOT_VERSION_FORM}"
-        text = f"The bootloader announces {', '.join(upgrade.boot_versions)}; a {node} says {own}."
+        text = f"The bootloader announces {', '.join(upgrade.boot_versions)}; not {own}."
         return _Found(Cause.WRONG_DEVICE, text)
     if upgrade.early_complete and not upgrade.ends:
-        text = f"The {node} said complete before the tool had sent the end of the transfer."
+        text = f"The {node} reported complete before the tool had sent the end of the transfer."
         return _Found(Cause.COMPLETE_TOO_EARLY, text)
     if upgrade.shutdown_at_s is not None:
         after_s = upgrade.shutdown_at_s - upgrade.begin_s
@@ -134,7 +136,7 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
         text += "which was not completed."
         return _Found(Cause.SHUTDOWN, text)
     if upgrade.errors_now >= _ERRORS:
-        text = f"{upgrade.errors_now:,} error frames came since the last thing that went well."
+        text = f"{upgrade.errors_now:,} error frames came since the last progress."
         return _Found(Cause.BUS_TROUBLE, text)
     return None
 
@@ -145,8 +147,8 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
 def _before_update(upgrade: ObservedUpgrade, until_s: float) -> _Found:
     node = upgrade.target.node.name
     if upgrade.is_announced:
-        said = ", ".join(upgrade.boot_versions)
-        text = f"The bootloader announced {said}, and the tool sent no update command."
+        announced = ", ".join(upgrade.boot_versions)
+        text = f"The bootloader announced {announced}, and the tool sent no update command."
         return _stopped(text, until_s - upgrade.tool_at_s)
     if upgrade.feedbacks:
         text = f"The application of the {node} confirmed the reset, and no boot version followed."
@@ -203,7 +205,7 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
         if _is_other(upgrade):
             return _other_version(upgrade)
         if upgrade.image_versions:
-            text = f"The {node} did not say complete; the new application answers its version, "
+            text = f"The {node} did not report complete; the new application answers its version, "
             return _Found(Cause.CONFIRMED_BY_VERSION, f"{text}{upgrade.running_version}.")
     if upgrade.end_naks:
         text = f"The {node} has every packet and answered the end of the transfer with NAK, "
@@ -213,13 +215,13 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
     if upgrade.boots_after_end:
         text += f" The bootloader announced itself {_times(upgrade.boots_after_end)} after it."
     if upgrade.running_version is not None:
-        text += f" An application answers, version {upgrade.running_version}; the packets name "
-        text += "none to compare it with."
+        text += f" An application answers, version {upgrade.running_version}; the packets hold "
+        text += "no version to compare it with."
     return _Found(Cause.UNCONFIRMED, text)
 
 
 def _stopped(text: str, silent_s: float) -> _Found:
-    """The verdict where the tool had to send next: it stopped, or the recording did."""
+    """The verdict when the tool should have sent next: it stopped, or the recording did."""
     if silent_s >= _SILENT_S:
         return _Found(Cause.TOOL_STOPPED, f"{text} The trace goes on for {silent_s:.2f} s.")
     return _Found(Cause.RECORDING_ENDS, text)
@@ -230,7 +232,7 @@ def _pieces(count: int) -> str:
 
 
 def _short(silent_s: float) -> str:
-    """What to add where the trace ends before a wait is over."""
+    """Addition for a trace that ends before a wait is over."""
     if silent_s >= _SILENT_S:
         return f" The trace goes on for {silent_s:.2f} s."
     return " The trace ends here: either the tool gave up, or the recording was stopped."
@@ -240,17 +242,17 @@ def _times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
-# -- what else was remarkable ---------------------------------------------------------------------
+# -- further remarks -------------------------------------------------------------------------------
 
 
 def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
-    """What is worth saying beside the verdict; what the verdict says is left out."""
+    """Remarks beside the verdict, without repeating it."""
     found = []
     names = upgrade.boot_names
     if upgrade.restarts and cause is not Cause.DEVICE_RESTARTED:
         found.append(f"the device restarted in the transfer {_times(upgrade.restarts)}")
     if upgrade.early_complete and cause is not Cause.COMPLETE_TOO_EARLY:
-        found.append("the device said complete before the end of the transfer was sent")
+        found.append("the device reported complete before the end of the transfer was sent")
     if upgrade.boot_changes and cause is not Cause.TWO_DEVICES:
         found.append(f"different boot versions: {', '.join(upgrade.boot_versions)}")
     if upgrade.extra_acks and cause is not Cause.TWO_DEVICES:

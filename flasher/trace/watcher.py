@@ -1,8 +1,8 @@
-"""Watching a bus without taking part: an engine that sends nothing, and what has been seen so far.
+"""Passive bus watching: an engine that sends nothing, and the latest messages.
 
-`Watcher` is driven like every other engine, so a live bus, the mock and a test are watched by the
-same code; `replay` does it with the frames of a file. `Board` remembers the latest message of each
-kind, which of its fields changed, and how often it comes.
+`Watcher` is driven like every other engine, so a live bus, the mock and a test share the same code;
+`replay` feeds it the frames of a file. `Board` keeps the latest message of each kind, which of its
+fields changed, and its rate.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from flasher.protocol.spec import Dialect
 from flasher.trace.decoder import BusEvent, Decoder, Kind
 
 RATE_WINDOW_S: Final = 5.0
-"""Rates are counted over this time."""
+"""Period over which rates are counted."""
 CHANGE_SHOWN_S: Final = 1.0
-"""A changed field stays marked for this time, or until it is seen unchanged later."""
+"""A changed field stays marked this long, or until it repeats unchanged later."""
 _RATE_SAMPLES: Final = 10_000
-"""Times held for one rate at the most: more than a bus carries in the window."""
+"""Times kept for one rate: more than a bus carries in the window."""
 _AFTER_LAST_S: Final = 1.0
-"""A message whose rest does not come for so long after the last frame is cut short."""
+"""A message incomplete this long after the last frame is cut short."""
 _AT_ONCE: Final = float("-inf")
 
 
 @dataclass(frozen=True)
 class RawFrame:
-    """A frame as it came, before what it says."""
+    """A received frame, not decoded."""
 
     at: float
     frame: Frame
@@ -44,10 +44,9 @@ class Pulse:
 
 @dataclass(frozen=True)
 class Filter:
-    """What to show; an empty part lets everything through.
+    """Selects events; an empty part accepts everything.
 
-    `nodes` match senders and receivers, `words` titles (any of them, as a part of the title,
-    in either case).
+    `nodes` match senders and receivers, `words` match parts of titles, in either case.
     """
 
     nodes: frozenset[str] = frozenset()
@@ -69,8 +68,8 @@ EVERYTHING: Final = Filter()
 class Watcher:
     """The engine. Its events are `BusEvent`, `RawFrame` with `raw`, `Pulse` with `pulse_s`.
 
-    It is done after `count` things that the filter accepts, or after `duration_s` seconds from its
-    first `tick`; without them it goes on until it is cancelled.
+    Ends after `count` accepted events, or `duration_s` seconds after its first `tick`; otherwise it
+    runs until it is cancelled.
     """
 
     def __init__(
@@ -156,9 +155,9 @@ def replay(
     on_event: Callable[[object], None],
     cancelled: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Show recorded frames to a watcher as if they came now, without waiting.
+    """Feed recorded frames to a watcher at their times, without waiting.
 
-    A time that lies before the one of the frame before it counts as the same.
+    A time before the previous frame's counts as the same.
     """
     now = _AT_ONCE
     for at, frame in frames:
@@ -176,12 +175,12 @@ def replay(
 
 
 def _pass_time(watcher: Watcher, until: float) -> None:
-    """Tick the watcher for all that is due before `until`."""
+    """Tick the watcher for everything due before `until`."""
     while (due := watcher.deadline()) is not None and due < until:
         watcher.tick(until if due == _AT_ONCE else due)
 
 
-# -- what has been seen so far --------------------------------------------------------------------
+# -- the latest messages -------------------------------------------------------------------------
 
 
 @dataclass
@@ -192,15 +191,15 @@ class MessageHistory:
     count: int = 0
     first_at: float = 0.0
     changed_at: dict[str, float] = field(default_factory=dict)
-    """When each field last had another value than before."""
+    """When each field last changed."""
     times: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_SAMPLES))
 
     def changed(self, now: float) -> set[str]:
-        """Names of the fields that changed a moment ago."""
+        """Names of the fields that changed recently."""
         return {name for name, at in self.changed_at.items() if now - at <= CHANGE_SHOWN_S}
 
     def rate_hz(self, now: float) -> float | None:
-        """Messages a second, counted over the last seconds; None before there are two."""
+        """Messages per second, over the last seconds; None before the second one."""
         while self.times and now - self.times[0] > RATE_WINDOW_S:
             self.times.popleft()
         if self.count < 2:
@@ -213,10 +212,10 @@ Key = tuple[int, str, int]
 
 
 class Board:
-    """The latest of everything, in the order of CAN ids and commands.
+    """The latest events, in the order of CAN ids and commands.
 
-    What is not a message of the documents has one line for each kind and id, whatever it holds, and
-    foreign frames have one line in all: a babbling bus does not fill the memory.
+    Anything but a message of the documents has one line for each kind and id, and foreign frames
+    share one line: a babbling bus cannot fill the memory.
     """
 
     def __init__(self) -> None:
@@ -226,7 +225,7 @@ class Board:
         return len(self._lines)
 
     def add(self, seen: BusEvent) -> frozenset[str]:
-        """Take note; returns the names of the fields that differ from the last time."""
+        """Add an event; returns the names of the fields that changed."""
         key = _key(seen)
         line = self._lines.get(key)
         if line is None:
@@ -246,7 +245,6 @@ class Board:
         return changed
 
     def lines(self) -> Iterator[MessageHistory]:
-        """Every line, in order."""
         for key in sorted(self._lines):
             yield self._lines[key]
 
@@ -255,5 +253,5 @@ def _key(seen: BusEvent) -> Key:
     if seen.kind is Kind.MESSAGE and seen.command is not None:
         return seen.can_id, "", seen.command
     if seen.kind in (Kind.FOREIGN, Kind.ERROR_FRAME):
-        return 1 << 32, seen.kind.value, 0  # behind everything else
+        return 1 << 32, seen.kind.value, 0  # after everything else
     return seen.can_id, seen.kind.value, 0

@@ -63,8 +63,8 @@ def test_joined_frames_are_not_called_an_empty_trace(
     flasher("export", "trace", trace, "--joined", "-o", joined)
     assert "CAN FD frames alone" in flasher("export", "csv", joined).err
     story = flasher("explain", joined).out
-    assert "There is no classic CAN frame in it." in story
-    assert "CAN FD frames alone" in " ".join(story.split())
+    assert "The trace holds no classic CAN frame." in story
+    assert "only CAN FD frames" in " ".join(story.split())
 
 
 def test_a_trace_without_a_wanted_message_is_no_empty_one(
@@ -174,4 +174,4 @@ def test_the_folder_of_a_bundle_stands_for_its_trace(
     (bundle / "trace.blf").unlink()
     ran = flasher("export", "trace", bundle, "-o", tmp_path / "out.log")
     assert ran.code == ExitCode.USAGE
-    assert "is a folder, but no bundle" in ran.err
+    assert "is a folder, but not a bundle" in ran.err

@@ -463,7 +463,7 @@ TRACES = tuple(
             "minus.log",
             content(several(FRAME, "(-inf) can0 752#00")),
             0,
-            "behind frame 1: a frame has the time -inf",
+            "after frame 1: a frame has the time -inf",
         ),
         ("nan.log", content(several("(nan) can0 752#00", FRAME)), USAGE, "the time nan"),
         ("year.log", content(several("(1e17) can0 752#00")), USAGE, "the time 1e+17"),

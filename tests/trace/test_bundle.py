@@ -126,7 +126,7 @@ def test_a_bundle_is_explained_with_what_was_reported_then(tmp_path: Path) -> No
 def test_a_report_that_is_none_is_wrong_usage(report: str, tmp_path: Path) -> None:
     path = write_bundle(tmp_path, recorded(Tape().reset()), {})
     (path / "report.json").write_text(report)
-    with pytest.raises(UsageError, match="no report of a bundle"):
+    with pytest.raises(UsageError, match="not the report of a bundle"):
         explain_path(path)
 
 
@@ -138,5 +138,5 @@ def test_a_report_with_other_things_in_it_is_coped_with(report: str, tmp_path: P
 
 
 def test_a_folder_that_is_no_bundle_is_wrong_usage(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no bundle"):
+    with pytest.raises(UsageError, match="not a bundle"):
         explain_path(tmp_path)

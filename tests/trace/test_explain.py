@@ -416,5 +416,5 @@ def test_a_file_that_was_cut_off_is_explained_up_to_there(tmp_path: Path) -> Non
     path.write_bytes(whole[: whole.index(b"752#", len(whole) // 2)])
     story = explain_path(path)
     assert story.verdict.cause is Cause.RECORDING_ENDS
-    assert story.damage.startswith("behind frame ")
+    assert story.damage.startswith("after frame ")
     assert explain_path(Tape().to_boot().save(tmp_path / "whole.log")).damage == ""

@@ -140,7 +140,7 @@ WHOLE = section() + interface() + packet()
         (section() + interface() + packet(PACKET[:-1]), "is cut off"),
         (WHOLE + struct.pack("<LL", 7, 11), "a size of 11 bytes"),
         (WHOLE + struct.pack("<LL", 7, 0xFFFFFFFC), "a size of 4,294,967,"),
-        (struct.pack("<LLL", 0x0A0D0D0A, 28, 0x01020304), "its order of bytes"),
+        (struct.pack("<LLL", 0x0A0D0D0A, 28, 0x01020304), "no byte order"),
         (b"this is no capture, whatever its name says", "does not begin as a capture"),
         (pcap("<", 0xA1B2C3D4)[:-20], "ends within a packet"),
         (pcap("<", 0xA1B2C3D4)[:20], "does not begin as a capture"),
@@ -164,7 +164,7 @@ def test_a_right_capture_of_something_else_is_not_blamed_for_its_suffix(
     path: Path, data: bytes, remedy: str
 ) -> None:
     path.write_bytes(data)
-    with pytest.raises(UsageError, match="is no trace of one CAN bus") as caught:
+    with pytest.raises(UsageError, match="is not a trace of one CAN bus") as caught:
         list(read_trace(path))
     assert remedy in caught.value.remedy
 
@@ -175,7 +175,7 @@ def test_what_stands_before_a_cut_is_read(path: Path) -> None:
     with pytest.raises(UsageError, match="is not a trace") as caught:
         found.extend(frame for _, frame in read_trace(path))
     assert found == [FRAME]
-    assert caught.value.where == "behind frame 1"
+    assert caught.value.where == "after frame 1"
 
 
 FRAMES = [

@@ -131,7 +131,7 @@ def test_frames_in_front_of_a_cut_are_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is not a trace") as caught:
         found.extend(frame for _, frame in read_trace(path))
     assert "ends within an object" in caught.value.cause
-    assert "behind frame" in caught.value.where
+    assert "after frame" in caught.value.where
 
 
 @pytest.mark.parametrize("mode", ["wal", "delete"])

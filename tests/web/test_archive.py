@@ -41,7 +41,7 @@ def test_it_lists_bundles_with_their_reason_and_backups(kept: Archive) -> None:
 def test_a_bundle_whose_report_is_damaged_is_listed_with_that(kept: Archive) -> None:
     (bundle,) = kept.bundles.iterdir()
     (bundle / "report.json").write_text("[")
-    assert "is no report of a bundle" in _asked(kept, "/kept").body.decode()
+    assert "is not the report of a bundle" in _asked(kept, "/kept").body.decode()
 
 
 def test_nothing_kept_yet_is_said(tmp_path: Path) -> None:
