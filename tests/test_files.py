@@ -41,7 +41,7 @@ def test_a_file_that_changes_while_it_is_read_is_not_used(
     path = tmp_path / "app.bin"
     path.write_bytes(b"12345678")
     with (
-        pytest.raises(ImageError, match="changed meanwhile"),
+        pytest.raises(ImageError, match="changed while"),
         opened(path, None, error=ImageError),
     ):
         change(path)
@@ -52,7 +52,7 @@ def test_a_recording_may_grow_and_not_shrink(tmp_path: Path) -> None:
     path.write_bytes(b"12345678")
     with opened(path, 8, may_grow=True):
         append(path)
-    with pytest.raises(UsageError, match="changed meanwhile"), opened(path, 12, may_grow=True):
+    with pytest.raises(UsageError, match="changed while"), opened(path, 12, may_grow=True):
         shorten(path)
 
 
