@@ -80,7 +80,7 @@ class TimesView(NamedTuple):
     """All measurements of one name."""
 
     times: Times
-    histograms: dict[str, chart.Histogram]
+    histograms: dict[str, chart.HistogramChart]
     """One drawing for each width; empty without a histogram."""
 
 

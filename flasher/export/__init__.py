@@ -1,1 +1,1 @@
-"""The protocol in engineers' own tools: a dissector for Wireshark, a DBC, decoded signals."""
+"""Exports for engineers' tools: a Wireshark dissector, a DBC, decoded signals."""

@@ -1,4 +1,4 @@
-"""A trace in another format; with remarks on its frames, where the format has them."""
+"""Converts a trace to another format, with remarks on frames if the format has them."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from flasher.trace.source import explain_path, frames_until_damage, trace_file
 from flasher.trace.story import Step, Story
 
 _Place = tuple[int | None, float]
-"""CAN id (None: any) and seconds since the first frame, exactly as the story has them."""
+"""CAN id (None: any) and seconds since the first frame, exactly as in the story."""
 _ANY: Final = None
 
 
 @dataclass(frozen=True)
 class Converted:
-    """What was written."""
+    """Result of a conversion."""
 
     frames: int
     remarks: int
-    """Frames with a remark."""
+    """Number of frames with a remark."""
     damage: str
-    """Where and why the trace could not be read on; empty where it was read to its end."""
+    """Where and why reading stopped; empty at the end of the trace."""
 
 
 def convert(trace: Path, to: Path, *, called: Path) -> Converted:
-    """Write a trace in the format of the suffix of `to`; in messages it is `called` so. Raises
-    UsageError, and OSError when the disk is full.
+    """Write a trace in the format of `to`'s suffix; messages name it `called`. Raises UsageError,
+    and OSError when the disk is full.
     """
     remarks: dict[_Place, list[str]] = {}
     writer: Writer
@@ -52,7 +52,7 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
         for at, frame in frames_until_damage(trace_file(trace), damage):
             now = max(now, at)
             start = now if start is None else start
-            # Each is said once: frames that were accepted together have the same time.
+            # Each is written once: frames accepted together have the same time.
             places = ((frame.can_id, now - start), (_ANY, now - start))
             remark = "\n".join(text for place in places for text in remarks.pop(place, ()))
             message = message_of(frame, sent=False, at_s=at)
@@ -84,7 +84,7 @@ def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
 
 
 def _remarks(story: Story) -> dict[_Place, list[str]]:
-    """What went wrong, at the frame that showed it; and how each upgrade ended, at its last one."""
+    """Trouble, at the frame that showed it, and the end of each upgrade, at its last frame."""
     found: dict[_Place, list[str]] = defaultdict(list)
     upgrades = story.upgrades
     for line in (*story.steps, *(line for upgrade in upgrades for line in upgrade.steps)):

@@ -1,10 +1,9 @@
-"""A DBC for the messages as far as one can say them.
+"""DBC export of the messages.
 
-A DBC describes single frames, and knows nothing of messages that take several. So it describes
-messages put together, each as one CAN FD frame on the id of its frames (`joined_frames` makes them
-of a trace): the first 64 bytes, from the header on, with the command as multiplexer. What it cannot
-say is left out: texts, bytes without a meaning of their own, what lies behind byte 64, and the CRC,
-which has another place in each message.
+A DBC describes single frames and has no messages of several frames. So it describes each message as
+one CAN FD frame on the same id (`joined_frames` makes them from a trace): the first 64 bytes, from
+the header on, with the command as multiplexer. A DBC has no place for texts, bytes without a
+meaning of their own, bytes after byte 64, and the CRC, whose position varies.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from flasher.python_can import can
 from flasher.trace.decoder import ROUTES, TITLES
 
 FD_SIZE: Final = 64
-"""Bytes of each frame: programs refuse a frame that is shorter than the DBC says."""
+"""Bytes of each frame: programs refuse frames shorter than the DBC states."""
 _DATA_AT: Final = PREFIX_SIZE + COMMAND_SIZE
 _NAME_MAX: Final = 32
-"""Characters of a name; longer ones stand in an attribute, as Vector's tools write them."""
+"""Characters of a name; longer ones go into an attribute, as Vector's tools write them."""
 _LONG_NAME: Final = "SystemSignalLongSymbol"
 _COMMAND: Final = "command"
 _NODE_OF_ALL: Final = "Vector__XXX"
@@ -38,7 +37,7 @@ _FRAME_FORMATS: Final = (
     "StandardCAN", "ExtendedCAN", *(["reserved"] * 12), "StandardCAN_FD", "ExtendedCAN_FD",
 )  # fmt: skip
 _COMMENT: Final = (
-    "Messages of the Welling drive system, each put together to one CAN FD frame (flasher export "
+    "Messages of the Welling drive system, each joined to one CAN FD frame (flasher export "
     "trace --joined): its first 64 bytes, from the header 55 AA on. Left out is what a DBC cannot "
     "say: texts, plain bytes, everything behind byte 64, and the CRC. Frames of a message as they "
     "are on the bus are not described."
@@ -48,7 +47,7 @@ _COMMENT: Final = (
 @dataclass(frozen=True)
 class _Signal:
     name: str
-    """Its whole name; there is none twice in a message."""
+    """Its full name, unique in a message."""
     mux: int
     start_bit: int
     bits: int
@@ -116,7 +115,7 @@ def _messages() -> dict[int, tuple[list[_Signal], dict[int, str]]]:
 
 
 def _signals(command: int, prefix: str, layout: Iterable[tuple[str, Codec]]) -> Iterator[_Signal]:
-    """What of the fields lies in the first 64 bytes and is a number or a flag."""
+    """Numbers and flags in the first 64 bytes."""
     at = _DATA_AT
     for name, codec in layout:
         size, bit, whole = codec.size_bytes, 8 * at, f"{prefix}_{name}"
@@ -153,7 +152,7 @@ def _declared(signal: _Signal, names: dict[str, str]) -> str:
 
 
 def _short_names(names: Iterable[str]) -> dict[str, str]:
-    """A name of at most 32 characters for each."""
+    """A unique name of at most 32 characters for each."""
     short: dict[str, str] = {}
     numbers = count()
     for name in names:
@@ -171,8 +170,8 @@ def _choices(values: Iterable[tuple[int, str]]) -> str:
 
 
 def joined_frames(frames: Iterable[tuple[float, Frame]]) -> Iterator[can.Message]:
-    """Each intact message as one CAN FD frame, at the time of its last frame: the first 64 bytes,
-    filled up with zeros. Everything else is left out.
+    """Yield each intact message as one CAN FD frame at the time of its last frame: the first 64
+    bytes, zero-padded.
     """
     streams = {
         can_id: Reassembler(can_id, DEFAULT_TIMINGS.inter_frame_timeout_s) for can_id in ROUTES

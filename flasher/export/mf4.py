@@ -1,4 +1,4 @@
-"""Decoded signals as a measurement file (ASAM MDF 4), for plotting. Needs the extra `mf4`."""
+"""Writes decoded signals to a measurement file (ASAM MDF 4). Needs the extra `mf4`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy
 from asammdf import MDF, Signal
 
 from flasher.export.names import key
-from flasher.export.signals import Row
+from flasher.export.signals import SignalRow
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import FlagsField, flag_names
@@ -27,15 +27,15 @@ class _Channel:
 
 @dataclass
 class _Group:
-    """The messages of one title, which have one time axis."""
+    """The messages of one title, which share a time axis."""
 
     times_s: list[float] = field(default_factory=list)
     channels: dict[str, _Channel] = field(default_factory=dict)
 
 
-def write_mf4(rows: Iterable[Row], to: Path) -> int:
-    """Write the numbers and flags of all messages, a channel each; returns how many channels there
-    are. Raises OSError.
+def write_mf4(rows: Iterable[SignalRow], to: Path) -> int:
+    """Write the numbers and flags of all messages, a channel each; returns the number of channels.
+    Raises OSError.
     """
     groups: dict[str, _Group] = {}
     start_s = 0.0
@@ -63,7 +63,7 @@ def write_mf4(rows: Iterable[Row], to: Path) -> int:
 
 
 def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
-    """Name, unit and value of what can be plotted."""
+    """Name, unit and value of everything that can be plotted."""
     prefix, command = key(event.title), event.command or 0
     item = BY_KEY.get((event.can_id, command))
     codecs = dict(

@@ -1,5 +1,5 @@
-"""One name for each value of a message, the same in every tool: `running_information.voltage_mv` is
-the filter `welling.running_information.voltage_mv` in Wireshark, a column and a signal elsewhere.
+"""Value names shared by all exports: `running_information.voltage_mv` is the filter
+`welling.running_information.voltage_mv` in Wireshark, a column and a signal elsewhere.
 """
 
 from __future__ import annotations
@@ -11,5 +11,5 @@ _NO_WORD: Final = re.compile(r"[^a-z0-9]+")
 
 
 def key(title: str) -> str:
-    """The title of a message, or the name of a bit, as a part of such a name."""
+    """A message title or the name of a bit as a part of such a name."""
     return _NO_WORD.sub("_", title.lower()).strip("_")

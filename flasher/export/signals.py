@@ -1,4 +1,4 @@
-"""Traces as rows of values, one row a message: for tables, notebooks and plots."""
+"""Traces as rows of values, one per message, for tables, notebooks and plots."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Value = str | int | None
 FIXED_COLUMNS: Final = (
     "time_s", "stamp_s", "frame", "id", "sender", "receiver", "kind", "message",
 )  # fmt: skip
-"""The columns that every row has; those of fields follow."""
+"""Columns of every row; those of fields follow."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """One message, or one stretch of damage."""
+class SignalRow:
+    """One message, or one stretch of damaged bytes."""
 
     time_s: float
-    """Of its last frame, since the first frame of the trace."""
+    """Time of its last frame, since the first frame of the trace."""
     stamp_s: float
-    """The same as the trace has it: since 1970, or since some start."""
+    """The same as stored in the trace: since 1970, or since some start."""
     frame: int
-    """Number of the frame at which it was known, from 1, as Wireshark counts."""
+    """Number of the frame that completed it, from 1, as Wireshark counts."""
     event: BusEvent
 
     def values(self) -> dict[str, Any]:
-        """Everything, by the names of the columns; a list has a column for each of its values."""
+        """All values by column name; a list has a column for each of its values."""
         event = self.event
         fixed = (
             self.time_s, self.stamp_s, self.frame, f"{event.can_id:03X}", event.sender,
@@ -67,10 +67,9 @@ def rows(
     *,
     wanted: Callable[[str], bool] = lambda _title: True,
     damage: list[str] | None = None,
-) -> Iterator[Row]:
-    """The messages of a trace whose titles are `wanted`, in the order in which they ended. Where
-    the file cannot be read on is noted in `damage`, if that is given. Raises UsageError for a file
-    that is no trace.
+) -> Iterator[SignalRow]:
+    """The messages of a trace whose titles are `wanted`, ordered by their ends. `damage`, if given,
+    receives where reading stopped. Raises UsageError for a file that is not a trace.
     """
     decoder = TimedDecoder()
     first_s: float | None = None
@@ -87,15 +86,15 @@ def rows(
         for timed in decoder.feed(frame, now, bits_of(frame)):
             event = timed.event
             if event.kind is not Kind.FOREIGN and wanted(event.title):
-                yield Row(timed.end_s - first_s, timed.end_s, number, event)
+                yield SignalRow(timed.end_s - first_s, timed.end_s, number, event)
     if first_s is not None:
         for timed in decoder.finish(now):
             if wanted(timed.event.title):
-                yield Row(timed.end_s - first_s, timed.end_s, number, timed.event)
+                yield SignalRow(timed.end_s - first_s, timed.end_s, number, timed.event)
 
 
-def csv_text(rows: Sequence[Row]) -> str:
-    """A table with a column for each field that is in the rows."""
+def csv_text(rows: Sequence[SignalRow]) -> str:
+    """A table with a column for each field of the rows."""
     file = io.StringIO()
     lines = [row.values() for row in rows]
     columns = dict.fromkeys((*FIXED_COLUMNS, *(name for line in lines for name in line)))
@@ -115,9 +114,9 @@ def _cell(value: Value | float) -> str:
 def trace_rows(trace: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
     """The messages of a trace as rows for a table: `pandas.DataFrame(trace_rows(path))`.
 
-    Columns are time_s (since the first frame), stamp_s (as the file has it), frame (its number, as
-    in Wireshark), id, sender, receiver, kind, message, and one for each field, with its unit in the
-    name: running_information.voltage_mv. Raises UsageError for a file that is no trace, or where it
-    cannot be read on.
+    Columns are time_s (since the first frame), stamp_s (as in the file), frame (its number, as in
+    Wireshark), id, sender, receiver, kind, message, and one for each field, with its unit in the
+    name: running_information.voltage_mv. Raises UsageError for a file that is not a trace, or is
+    damaged.
     """
     return (row.values() for row in rows(trace))

@@ -1,9 +1,9 @@
-"""The dissector for Wireshark: `welling.lua`, with the tables of this program put into it.
+"""Generator of the Wireshark dissector `welling.lua`.
 
-Ids, messages, fields, limits of time and sentences come from where the program itself has them. The
-script holds the ways of working that cannot be tables: reassembly as in `flasher.protocol.wire`,
-the course of an upgrade as in `flasher.trace.observed_upgrade`. The tests compare what tshark makes
-of it with what this program decodes.
+Ids, messages, fields, time limits and sentences come from the program's own tables. The script
+implements only what tables cannot hold: reassembly as in `flasher.protocol.wire`, the course of an
+upgrade as in `flasher.trace.observed_upgrade`. The tests compare tshark's result with this
+program's decoder.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ _ANSWERS: Final[dict[type[messages.UpgradeMessage], tuple[type[messages.UpgradeM
     messages.Packet: (messages.Ack, messages.Nak),
     messages.EndOfTransfer: (messages.Complete, messages.Nak),
 }
-"""What a bootloader answers (4.1)."""
+"""Answers of a bootloader (4.1)."""
 _OWN_FILTERS: Final = {"number": "packet", "total": "packets"}
-"""Of the upgrade: what a packet, its ACK and its NAK have in common is one filter."""
+"""Upgrade fields that a packet, its ACK and its NAK share as one filter."""
 
 
 def dissector(version: str) -> str:
-    """The script, for any Wireshark from 4.0 on; `version` is that of this program."""
+    """The script, for Wireshark from 4.0 on; `version` is this program's."""
     script = (files("flasher.export") / _SCRIPT).read_text(encoding="utf-8")
     assert script.count(_MARK) == 1  # noqa: S101  the two files belong together
     return script.replace(_MARK, _lua({"version": version, **_tables()}))
@@ -120,7 +120,7 @@ def _item(item: Item) -> dict[str, Any]:
 
 
 def _row(row: type[messages.UpgradeMessage]) -> dict[str, Any]:
-    """A message of the upgrade: what its fields may be is a part of its form."""
+    """An upgrade message with the values that its fields allow."""
     title = TITLES[row]
     return {
         "command": row.COMMAND.value,
@@ -160,7 +160,7 @@ def _field(filter_name: str, name: str, codec: Codec) -> dict[str, Any]:
 
 
 def _kind(filter_name: str, codec: Codec) -> dict[str, Any]:
-    """How the bytes of a field become its value."""
+    """The decoder of a field's bytes in Lua."""
     match codec:
         case AddressField():
             return {"kind": "address"}
@@ -181,7 +181,7 @@ def _kind(filter_name: str, codec: Codec) -> dict[str, Any]:
             return {"kind": "reserved"}
         case BytesField():
             return {"kind": "bytes"}
-    raise TypeError(f"{filter_name} has a codec that Wireshark is not told of: {codec}")
+    raise TypeError(f"{filter_name} has a codec that the dissector lacks: {codec}")
 
 
 def _bit(codec: FlagsField, mask: int) -> dict[str, Any]:
@@ -193,7 +193,7 @@ def _bit(codec: FlagsField, mask: int) -> dict[str, Any]:
 
 
 def _lua(value: object, indent: str = "") -> str:
-    """A value as Lua writes it."""
+    """A value in Lua syntax."""
     deeper = f"{indent}  "
     match value:
         case bool():

@@ -1,1 +1,1 @@
-"""Pages for people: self-contained HTML with charts, made from what other packages found out."""
+"""Self-contained HTML pages with charts, and JUnit XML."""

@@ -1,9 +1,8 @@
-"""The one way from data to an HTML page: templates, escaping, and what every page has.
+"""HTML rendering: templates, escaping, and the parts common to all pages.
 
-A page is one file: its style is inside, it holds no script and asks for nothing from anywhere (its
-Content-Security-Policy forbids both). Every value goes through two gates: HTML escaping, and
-`visible`, which shows what could reorder, hide or pile up text. Text that a device sent can
-therefore be put anywhere in a template.
+A page is one file with its style inside, without scripts or external resources (its
+Content-Security-Policy forbids both). Every value passes HTML escaping and `visible`, which escapes
+characters that reorder, hide or pile up text. So text from a device is safe anywhere in a template.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from flasher.report import scale
 from flasher.wording import wording
 
 TEXT_LIMIT: Final = 400
-"""Characters of one text on a page; what is longer ends in an ellipsis."""
+"""Characters of one text on a page; longer ones end in an ellipsis."""
 _UNSAFE_CATEGORIES: Final = ("C", "M", "Zl", "Zp")
 """Unicode: control, format (text direction), surrogates, unassigned; combining marks; separators
 of lines and paragraphs."""
 PAGE_STYLE: Final = Path(__file__).parent / "templates" / "page.css"
-"""The style sheet of every page that is read."""
+"""The style sheet of all documents."""
 _ELLIPSIS: Final = "\N{HORIZONTAL ELLIPSIS}"
 
 
 class Status(Enum):
-    """How good a thing is. The value is its class in the style sheet; a page always adds a word."""
+    """Rating of a result. The value is its class in the style sheet; a page always adds a word."""
 
     GOOD = "good"
     WARNING = "warning"
@@ -38,7 +37,7 @@ class Status(Enum):
 
 
 def visible(text: str) -> str:
-    """`text` with characters escaped that have no shape of their own; newline and tab are kept."""
+    """Escape characters without a shape of their own; newline and tab are kept."""
     return "".join(
         char.encode("unicode_escape").decode()
         if unicodedata.category(char).startswith(_UNSAFE_CATEGORIES) and char not in "\n\t"
@@ -48,7 +47,7 @@ def visible(text: str) -> str:
 
 
 def shortened(text: str, limit: int = TEXT_LIMIT) -> str:
-    """`text`, cut to `limit` characters with an ellipsis."""
+    """Cut `text` to `limit` characters with an ellipsis."""
     return text if len(text) <= limit else text[: limit - 1].rstrip() + _ELLIPSIS
 
 
@@ -58,7 +57,7 @@ def counted(number: int) -> str:
 
 
 def percent(share: float) -> str:
-    """A share of 1 in percent: 87 %, 0.4 %, 0 %; more than all of a line is no figure."""
+    """A share of 1 in percent: 87 %, 0.4 %, 0 %; more than the whole line gives a text."""
     if share > 1.02:  # time stamps are wrong by less
         return "more than the line carries"
     value = min(share, 1) * 100
@@ -66,20 +65,20 @@ def percent(share: float) -> str:
 
 
 def render_page(template: str, **context: Any) -> str:
-    """The page that `template` (a file in `templates/`) makes of `context`.
+    """Render `template` (a file in `templates/`) with `context`.
 
-    Raises jinja2.UndefinedError for a name that the template needs and `context` does not have.
+    Raises jinja2.UndefinedError for a name missing from `context`.
     """
     return _ENVIRONMENT.get_template(template).render(**context)
 
 
 def _finalize(value: object) -> object:
-    """Last gate for every value that a template prints; markup of our own passes."""
+    """Escape every value that a template prints, except our own markup."""
     return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
 def environment(loader: BaseLoader) -> Environment:
-    """What makes pages of the templates that `loader` finds; raises what `render_page` does."""
+    """The template environment for `loader`; its templates raise what `render_page` does."""
     made = Environment(
         loader=loader,
         autoescape=True,

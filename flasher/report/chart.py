@@ -1,10 +1,9 @@
-"""Charts as numbers: where every dot, bar and tick lies. `templates/charts.html` draws them.
+"""Chart layout: positions of every dot, bar and tick; `templates/charts.html` draws them.
 
 Answer time over packet number, a histogram, and a distribution on one line.
 
-Pure layout. A chart is made for a width in CSS pixels, so that its text has its full size both
-on a phone and on a desk (`WIDTHS`). Long series are drawn as stretches, so that a chart has a
-bounded size however long the series is.
+Pure functions. A chart has a width in CSS pixels, so that its text has its full size on phones and
+desktops (`WIDTHS`). Long series are drawn as stretches, so that a chart has a bounded size.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from flasher.report.scale import Axis, Tick, duration_text, linear_ticks, slices
 from flasher.trace.figures import Distribution, Ranked
 
 WIDTHS: Final = {"wide": 880, "narrow": 340}
-"""Width of a drawing for each class of the style sheet; a page holds both and shows one."""
+"""Drawing width for each class of the style sheet; a page holds both and shows one."""
 _DOTS_PER_WIDTH: Final = 0.5
-"""More samples than this a pixel are drawn as stretches with minimum, median and maximum."""
+"""Beyond this many samples a pixel, stretches show minimum, median and maximum."""
 _STRETCH_WIDTH: Final = 6
 _LEFT: Final = 58
 _RIGHT: Final = 14
@@ -38,7 +37,7 @@ _BINS: Final = 20
 _SPREAD_HEIGHT: Final = 54
 
 
-class Frame(NamedTuple):
+class ChartArea(NamedTuple):
     """The drawing and the area inside its axes, in CSS pixels."""
 
     width: float
@@ -51,8 +50,8 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """One packet: its number, the time of its answer in seconds (None: no answer), how often it was
-    sent again, and how many NAKs came for it.
+    """One packet: its number, the time of its answer in seconds (None: no answer), its repetitions
+    and its NAKs.
     """
 
     number: int
@@ -62,7 +61,7 @@ class Sample:
 
 
 class MarkKind(Enum):
-    """What a mark under the plot stands for; the value is its word."""
+    """Meaning of a mark under the plot; the value is its word."""
 
     REPEATED = "repeated"
     NAK = "NAK"
@@ -75,7 +74,7 @@ class MarkKind(Enum):
 
 
 class Mark(NamedTuple):
-    """Something that happened to a packet, or to some of a stretch."""
+    """An event of one packet, or of some in a stretch."""
 
     x: float
     kind: MarkKind
@@ -113,19 +112,21 @@ class Stretch(NamedTuple):
 class LatencyChart:
     """Answer time over packet number."""
 
-    frame: Frame
+    frame: ChartArea
     x_ticks: tuple[Tick, ...]
     y_axis: Axis
     dots: tuple[Dot, ...]
     stretches: tuple[Stretch, ...]
     lanes: tuple[Lane, ...]
     per_stretch: int
-    """Packets in one stretch, at the most; 1 where each packet has its dot."""
+    """At most this many packets in one stretch; 1 where each packet has its dot."""
     description: str
 
 
 def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
-    """The chart of these packets, in order, `width` CSS pixels wide. Raises ValueError for none."""
+    """Lay out the chart of these packets, in order, `width` CSS pixels wide. Raises ValueError for
+    none.
+    """
     if not samples:
         raise ValueError("no packets")
     plot_width = width - _LEFT - _RIGHT
@@ -133,7 +134,7 @@ def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
     bottom = _TOP + _LATENCY_HEIGHT
     lanes_top = bottom + _LANE_GAP
     height = lanes_top + _LANE_HEIGHT * len(kinds) + _AXIS_HEIGHT
-    frame = Frame(width, height, _LEFT, _TOP, width - _RIGHT, bottom)
+    frame = ChartArea(width, height, _LEFT, _TOP, width - _RIGHT, bottom)
     known = [sample.seconds for sample in samples if sample.seconds is not None]
     y_axis = Axis.over(known, bottom, _TOP, from_zero=True, intervals=_Y_INTERVALS)
     groups = slices(len(samples), len(samples))
@@ -157,15 +158,15 @@ def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
     )
 
 
-def _places(count: int, frame: Frame) -> Callable[[float], float]:
-    """Where the sample with an index lies."""
+def _places(count: int, frame: ChartArea) -> Callable[[float], float]:
+    """Position of the sample with an index."""
     begin, end = frame.left + 4, frame.right - 4
     if count == 1:
         return lambda _: (begin + end) / 2
     return lambda index: round(begin + index * (end - begin) / (count - 1), 1)
 
 
-def _number_ticks(samples: Sequence[Sample], frame: Frame) -> Iterable[Tick]:
+def _number_ticks(samples: Sequence[Sample], frame: ChartArea) -> Iterable[Tick]:
     """Ticks at round packet numbers; where numbers are missing, at round counts of packets."""
     begin, end, intervals = frame.left + 4, frame.right - 4, _intervals_for(frame.width)
     first, last = samples[0].number, samples[-1].number
@@ -177,7 +178,7 @@ def _number_ticks(samples: Sequence[Sample], frame: Frame) -> Iterable[Tick]:
 
 
 def _intervals_for(width: float) -> int:
-    """Ticks that an axis of this width has room for, less one."""
+    """Number of tick intervals that fit an axis of this width."""
     return max(2, int(width // 90))
 
 
@@ -243,10 +244,10 @@ def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
     return said + "."
 
 
-# -- how times are spread -------------------------------------------------------------------------
+# -- distributions --------------------------------------------------------------------------------
 
 
-class Bar(NamedTuple):
+class HistogramBar(NamedTuple):
     """One bin of a histogram."""
 
     x: float
@@ -257,26 +258,26 @@ class Bar(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Histogram:
-    """How many values fall where; `x_axis` has the values, `y_ticks` the counts."""
+class HistogramChart:
+    """Value counts in bins; `x_axis` has the values, `y_ticks` the counts."""
 
-    frame: Frame
+    frame: ChartArea
     x_axis: Axis
     y_ticks: tuple[Tick, ...]
-    bars: tuple[Bar, ...]
+    bars: tuple[HistogramBar, ...]
     description: str
 
 
-def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> Histogram:
-    """How these times (in seconds; or how often each came) are spread, in bins of one width on
-    paper: on a logarithmic axis they grow with the values. `width` is in CSS pixels. Raises
-    ValueError for none.
+def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> HistogramChart:
+    """Lay out a histogram of times in seconds (or of value counts), `width` CSS pixels wide. Bins
+    have one width on paper: on a logarithmic axis they grow with the values. Raises ValueError for
+    no values.
     """
     times = Counter(values)
     if not times:
         raise ValueError("no values")
     bottom = _TOP + _HISTOGRAM_HEIGHT
-    frame = Frame(width, bottom + _AXIS_HEIGHT, _LEFT, _TOP, width - _RIGHT - 10, bottom)
+    frame = ChartArea(width, bottom + _AXIS_HEIGHT, _LEFT, _TOP, width - _RIGHT - 10, bottom)
     x_axis = Axis.over(times, frame.left, frame.right, intervals=_intervals_for(width))
     bin_width = (frame.right - frame.left) / _BINS
     counts = [0] * _BINS
@@ -294,13 +295,15 @@ def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> Hi
             begin = frame.left + index * bin_width
             edges = (_value_at(x_axis, index / _BINS), _value_at(x_axis, (index + 1) / _BINS))
             tip = f"{duration_text(edges[0])} to {duration_text(edges[1])}: {count:,}"
-            bars.append(Bar(round(begin + 1, 1), bottom - tall, round(bin_width - 2, 1), tall, tip))
+            bars.append(
+                HistogramBar(round(begin + 1, 1), bottom - tall, round(bin_width - 2, 1), tall, tip)
+            )
     ordered = Ranked(times)
     description = (
         f"{len(ordered):,} values from {duration_text(ordered[0])} to"
         f" {duration_text(ordered[-1])}, median {duration_text(ordered.median)}."
     )
-    return Histogram(frame, x_axis, y_ticks, tuple(bars), description)
+    return HistogramChart(frame, x_axis, y_ticks, tuple(bars), description)
 
 
 def _value_at(axis: Axis, share: float) -> float:
@@ -320,9 +323,9 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class Spread:
-    """A distribution on one line: from minimum to maximum, and what lies between."""
+    """A distribution on one line, from minimum to maximum."""
 
-    frame: Frame
+    frame: ChartArea
     x_axis: Axis
     figures: tuple[Figure, ...]
     """Minimum, median, p95, p99, maximum."""
@@ -330,7 +333,7 @@ class Spread:
 
 
 def spread(distribution: Distribution, width: float) -> Spread:
-    """How a distribution lies on an axis of its own, `width` CSS pixels wide."""
+    """Lay out a distribution on its own axis, `width` CSS pixels wide."""
     named = (
         ("minimum", distribution.minimum_s),
         ("median", distribution.median_s),
@@ -338,7 +341,7 @@ def spread(distribution: Distribution, width: float) -> Spread:
         ("99 %", distribution.p99_s),
         ("maximum", distribution.maximum_s),
     )
-    frame = Frame(width, _SPREAD_HEIGHT, 24, 6, width - 34, 26)
+    frame = ChartArea(width, _SPREAD_HEIGHT, 24, 6, width - 34, 26)
     values = [value for _, value in named]
     x_axis = Axis.over(
         values, frame.left, frame.right, from_zero=True, intervals=_intervals_for(width)

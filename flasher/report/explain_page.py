@@ -1,7 +1,7 @@
-"""The page of `flasher explain --html`: the story of a trace, drawn.
+"""HTML page of `flasher explain --html`: the story of a trace.
 
-`render` arranges; the templates print. What could grow with the trace (steps, packets with trouble,
-talkers, upgrades) is cut at a number that a person can still read, and the page says so.
+`render` arranges; the templates print. Everything that could grow with the trace (steps, packets
+with trouble, talkers, upgrades) is limited, and the page shows how much was left out.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from flasher.trace.story import (
 from flasher.wording import wording
 
 UPGRADES_SHOWN: Final = 8
-"""Upgrades of one trace that are drawn; the others have a line in a table."""
+"""Upgrades of one trace drawn in full; the others have a line in a table."""
 ATTEMPTS_DRAWN: Final = 3
-"""The last attempts that have a latency chart; with more than one upgrade only the last one."""
+"""Last attempts with a latency chart; with several upgrades only the last one."""
 PACKETS_SHOWN: Final = 200
-"""Packets with trouble that have a line, over all upgrades."""
+"""Packets with trouble that are listed, over all upgrades."""
 TALKERS_SHOWN: Final = 100
 REMARKS_SHOWN: Final = 40
 _LIFELINES: Final = 4
@@ -56,7 +56,7 @@ Drawings = dict[str, chart.LatencyChart]
 
 
 class PhaseRow(NamedTuple):
-    """A phase, and where it lies as shares of the upgrade."""
+    """A phase, with its position as shares of the upgrade."""
 
     name: str
     attempt: int
@@ -67,7 +67,7 @@ class PhaseRow(NamedTuple):
 
 
 class SpreadRow(NamedTuple):
-    """A distribution of the link report, with its drawings: None when there is nothing to draw."""
+    """A distribution of the link report, with its drawings; None without data."""
 
     name: str
     distribution: Distribution | None
@@ -82,7 +82,7 @@ class LatencyView(NamedTuple):
 
 
 class _Room(NamedTuple):
-    """What one upgrade may take of the page."""
+    """Limits for one upgrade on the page."""
 
     items: int
     attempts: int
@@ -90,7 +90,7 @@ class _Room(NamedTuple):
 
     @classmethod
     def for_upgrades(cls, count: int) -> _Room:
-        """The share of each of so many upgrades."""
+        """The limits for each of `count` upgrades."""
         if count <= 1:
             return cls(sequence.ITEMS_SHOWN, ATTEMPTS_DRAWN, PACKETS_SHOWN)
         items = max(_ITEMS_LEAST, sequence.ITEMS_SHOWN // count)
@@ -99,7 +99,7 @@ class _Room(NamedTuple):
 
 @dataclass(frozen=True)
 class UpgradeView:
-    """One upgrade as the page shows it."""
+    """Template data of one upgrade."""
 
     story: UpgradeStory
     status: Status
@@ -108,8 +108,8 @@ class UpgradeView:
     sequence: dict[str, list[sequence.Part]]
     latencies: tuple[LatencyView, ...]
     spreads: tuple[SpreadRow, ...]
-    histogram: dict[str, chart.Histogram] | None
-    """Of the answers to packets that were sent once; None when there are only a few."""
+    histogram: dict[str, chart.HistogramChart] | None
+    """Answer times of packets sent once; None for only a few."""
     troubled: tuple[PacketStory, ...]
     troubled_count: int
     remarks: tuple[str, ...]
@@ -117,11 +117,11 @@ class UpgradeView:
 
 def render(story: Story) -> str:
     """The whole page as HTML text."""
-    return render_page("explain.html", **told(story))
+    return render_page("explain.html", **story_context(story))
 
 
-def told(story: Story) -> dict[str, Any]:
-    """What the template of the page needs."""
+def story_context(story: Story) -> dict[str, Any]:
+    """Data for the page's template."""
     shown = story.upgrades[:UPGRADES_SHOWN]
     room = _Room.for_upgrades(len(shown))
     status = status_of(story.verdict.cause)
@@ -142,7 +142,7 @@ def told(story: Story) -> dict[str, Any]:
 
 
 def status_of(cause: Cause) -> Status:
-    """How good the end of an upgrade is."""
+    """Rate the end of an upgrade."""
     if cause.is_good:
         return Status.GOOD
     if not cause.is_upgrade:
@@ -151,7 +151,7 @@ def status_of(cause: Cause) -> Status:
 
 
 def _wall_text(seconds: float | None) -> str:
-    """Wall time in words; empty for none, or for one that no calendar holds."""
+    """Wall time as text; empty for none, or outside the calendar."""
     if seconds is None:
         return ""
     try:
@@ -200,7 +200,7 @@ def _share(value: float) -> float:
 
 
 def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyView]:
-    """A chart for each of the last attempts that sent packets."""
+    """A chart for each of the last attempts with packets."""
     by_attempt: dict[int, list[chart.Sample]] = {}
     for packet in packets:
         sample = chart.Sample(packet.number, packet.answer_s, packet.tries - 1, packet.naks)
@@ -210,7 +210,7 @@ def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyVie
         yield LatencyView(attempt, drawings)
 
 
-def _histogram(packets: Iterable[PacketStory]) -> dict[str, chart.Histogram] | None:
+def _histogram(packets: Iterable[PacketStory]) -> dict[str, chart.HistogramChart] | None:
     values = [one.answer_s for one in packets if one.tries == 1 and one.answer_s is not None]
     if len(values) < _HISTOGRAM_LEAST:
         return None
@@ -245,7 +245,7 @@ def _drawn(lines: Sequence[StoryLine], target: str, most: int) -> dict[str, list
 
 
 def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
-    """The tool, the target, then whoever is named most; the rest are the others."""
+    """The tool, the target, then the names used most; the rest are combined."""
     named = Counter(
         name
         for line in lines
@@ -262,10 +262,10 @@ def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
     return [*first, *others]
 
 
-def _item(line: StoryLine, participants: Sequence[str]) -> sequence.Item:
+def _item(line: StoryLine, participants: Sequence[str]) -> sequence.DiagramItem:
     if isinstance(line, PacketRun):
         some = f"packet {line.first}" if line.count == 1 else f"packets {line.first} to {line.last}"
-        return sequence.Item(
+        return sequence.DiagramItem(
             sequence.ItemKind.BLOCK,
             line.begin_s,
             f"{some} acknowledged",
@@ -273,7 +273,7 @@ def _item(line: StoryLine, participants: Sequence[str]) -> sequence.Item:
             end_s=line.end_s,
         )
     if not line.sender or line.kind not in (StepKind.MESSAGE, StepKind.DAMAGED):
-        return sequence.Item(
+        return sequence.DiagramItem(
             sequence.ItemKind.BLOCK,
             line.at_s,
             line.title,
@@ -281,7 +281,7 @@ def _item(line: StoryLine, participants: Sequence[str]) -> sequence.Item:
             is_trouble=line.is_trouble,
             end_s=None if line.kind is StepKind.GAP else line.at_s,
         )
-    return sequence.Item(
+    return sequence.DiagramItem(
         sequence.ItemKind.ARROW,
         line.at_s,
         line.title,

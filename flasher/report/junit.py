@@ -1,4 +1,4 @@
-"""JUnit XML, as CI servers read it (the schema that Jenkins publishes)."""
+"""JUnit XML writer, for CI servers (the schema that Jenkins publishes)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TEXT_LIMIT: Final = 2000
 
 
 class JUnitResult(Enum):
-    """How a test case ended; the value is its element."""
+    """Result of a test case; the value is its element."""
 
     PASSED = ""
     FAILURE = "failure"
@@ -25,7 +25,7 @@ class JUnitResult(Enum):
 
 @dataclass(frozen=True)
 class JUnitCase:
-    """One test case; `message`, `type` and `details` say why it did not pass."""
+    """One test case; `message`, `type` and `details` explain why it did not pass."""
 
     classname: str
     name: str
@@ -35,13 +35,13 @@ class JUnitCase:
     type: str = ""
     details: str = ""
     output: str = ""
-    """What the test case said, whatever its result."""
+    """Output of the test case, whatever its result."""
     timestamp: str = ""
 
 
 @dataclass(frozen=True)
 class JUnitSuite:
-    """Test cases that belong together."""
+    """A group of test cases."""
 
     name: str
     cases: Sequence[JUnitCase]
@@ -50,7 +50,7 @@ class JUnitSuite:
 
 
 def junit_xml(name: str, suites: Iterable[JUnitSuite], time_s: float | None = None) -> bytes:
-    """The file; `time_s` is how long all of it took, else the sum of the cases."""
+    """Render the suites; `time_s` is the total duration, by default the sum of the cases."""
     root = ET.Element("testsuites", name=_safe(name))
     root.extend(map(_suite, suites))
     # The schema has no "skipped" here.
@@ -105,5 +105,5 @@ def _case(case: JUnitCase) -> ET.Element:
 
 
 def _safe(text: str) -> str:
-    """What XML can hold: no control characters but line ends, and nothing without end."""
+    """Text that XML can hold: no control characters except line ends, limited in length."""
     return "\n".join(printable(line) for line in text[:TEXT_LIMIT].split("\n"))

@@ -1,7 +1,6 @@
-"""Axes: where the ticks of a chart go, what they are called, and where a value lies.
+"""Axes of charts: ticks, labels and positions.
 
-Small pure functions; lengths on paper are in the units of the drawing, values in whatever the
-caller measures.
+Pure functions; lengths on paper are in units of the drawing, values in units of the caller.
 """
 
 from __future__ import annotations
@@ -12,26 +11,26 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 LOG_RANGE: Final = 30.0
-"""A range of values wider than this factor is drawn on a logarithmic scale."""
+"""A range of values wider than this factor uses a logarithmic scale."""
 _STEPS: Final = (1, 2, 5, 10)
-"""Steps that people count in, times a power of ten."""
+"""Round steps, times a power of ten."""
 _ROUNDING: Final = 1e-9
 _UNITS: Final = (("s", 1.0), ("ms", 1e-3), ("\N{MICRO SIGN}s", 1e-6))
 _LEAST: Final = 1e-12
-"""Less than this is 0: no clock measures it."""
+"""Smaller values count as 0: no clock measures them."""
 _SAME: Final = 1e-6
-"""Values that differ by less than this share are one value: no tick could tell them apart."""
+"""Values closer than this share count as equal: no tick could separate them."""
 
 
 class Tick(NamedTuple):
-    """A mark of an axis: its value, and where it lies on paper."""
+    """A mark of an axis: its value and position."""
 
     value: float
     at: float
 
 
 def nice_step(span: float, intervals: int) -> float:
-    """The smallest step of 1, 2 or 5 times a power of ten that parts `span` into at most
+    """The smallest step of 1, 2 or 5 times a power of ten that divides `span` into at most
     `intervals`. Raises ValueError unless both are positive.
     """
     if span <= 0 or intervals <= 0:
@@ -45,7 +44,7 @@ def nice_step(span: float, intervals: int) -> float:
 
 
 def linear_ticks(low: float, high: float, intervals: int = 5) -> list[float]:
-    """Round values from at or below `low` to at or above `high`; two at the least."""
+    """At least two round values, from at or below `low` to at or above `high`."""
     if high - low <= max(_SAME * max(abs(low), abs(high)), _LEAST):
         high = low + (abs(low) if abs(low) > _LEAST else 1.0)
     step = nice_step(high - low, intervals)
@@ -55,8 +54,8 @@ def linear_ticks(low: float, high: float, intervals: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float, intervals: int = 9) -> list[float]:
-    """1, 2, 5 times the powers of ten that enclose `low` to `high`; where that makes more than
-    `intervals`, only the powers, and of many of these each second, third, ... one.
+    """1, 2, 5 times the powers of ten around `low` to `high`; beyond `intervals` only the powers,
+    or every second, third, ... of them.
 
     Raises ValueError unless 0 < low <= high.
     """
@@ -76,16 +75,14 @@ def log_ticks(low: float, high: float, intervals: int = 9) -> list[float]:
 
 
 def wants_log(values: Iterable[float]) -> bool:
-    """True when all values are above 0 and lie so far apart that a linear axis would hide the
-    small ones.
-    """
+    """True when all values are positive and a linear axis would hide the small ones."""
     kept = list(values)
     return bool(kept) and min(kept) > _LEAST and max(kept) / min(kept) > LOG_RANGE
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Puts values on a line from `begin` to `end` on paper; `end` may lie before `begin`."""
+    """Maps values to positions from `begin` to `end` on paper; `end` may be less than `begin`."""
 
     low: float
     high: float
@@ -104,8 +101,8 @@ class Axis:
         from_zero: bool = False,
         intervals: int = 5,
     ) -> Axis:
-        """An axis that holds `values`, logarithmic where the range needs it. `from_zero` begins a
-        linear one at 0. Without values it goes from 0 to 1.
+        """An axis for `values`, logarithmic if the range needs it. `from_zero` starts a linear one
+        at 0. Without values it goes from 0 to 1.
         """
         kept = list(values) or [0.0, 1.0]
         is_log = wants_log(kept)
@@ -119,7 +116,7 @@ class Axis:
         return cls(bare.low, bare.high, begin, end, is_log, ticks)
 
     def at(self, value: float) -> float:
-        """Where `value` lies on paper; outside of the axis, at its nearer end."""
+        """Position of `value`; values outside map to the nearer end."""
         value = min(max(value, self.low), self.high)
         if self.is_log:
             share = math.log(value / self.low) / math.log(self.high / self.low)
@@ -128,8 +125,8 @@ class Axis:
         return self.begin + share * (self.end - self.begin)
 
     def duration_label(self, seconds: float) -> str:
-        """A tick of a time axis in words: on a linear axis all with one unit, and as many decimals
-        as tell neighbours apart.
+        """Label of a tick of a time axis; on a linear axis all have one unit and enough decimals to
+        differ.
         """
         if self.is_log or len(self.ticks) < 2 or self.high < 0:
             return duration_text(seconds)
@@ -142,7 +139,9 @@ class Axis:
 
 
 def whole_ticks(first: int, last: int, begin: float, end: float, intervals: int = 6) -> list[Tick]:
-    """Ticks at whole numbers inside `first` to `last`, such as packet numbers; `first` always."""
+    """Ticks at whole numbers from `first` to `last`, such as packet numbers; always includes
+    `first`.
+    """
     if last <= first:
         return [Tick(first, (begin + end) / 2)]
     step = max(1, round(nice_step(last - first, intervals)))
@@ -154,7 +153,7 @@ def whole_ticks(first: int, last: int, begin: float, end: float, intervals: int 
 
 
 def slices(count: int, most: int) -> list[tuple[int, int]]:
-    """`count` things in order as at most `most` stretches of nearly one length: begin and end
+    """Divide `count` things into at most `most` stretches of similar length: begin and end
     (exclusive) of each.
     """
     parts = min(count, most)
@@ -162,7 +161,7 @@ def slices(count: int, most: int) -> list[tuple[int, int]]:
 
 
 def duration_text(seconds: float | None) -> str:
-    """A time with three figures and the unit that suits it: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
+    """A duration with three digits and a suitable unit: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
     if seconds is None:
         return "\N{EN DASH}"
     size = abs(seconds)
@@ -179,7 +178,7 @@ def duration_text(seconds: float | None) -> str:
 
 
 def _three(value: float) -> str:
-    """`value` with three figures, and no more zeros than that."""
+    """`value` with three digits, without trailing zeros."""
     digits = max(0, 2 - math.floor(math.log10(abs(value))))
     text = f"{value:.{digits}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text

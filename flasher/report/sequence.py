@@ -1,8 +1,8 @@
-"""A sequence diagram as numbers: lifelines, arrows and blocks. `templates/sequence.html` draws it.
+"""Sequence diagram layout: lifelines, arrows and blocks; `templates/sequence.html` draws it.
 
-Pure layout, for a width in CSS pixels: labels are broken into lines that fit. A long dialogue is
-first thinned (`thinned`), then cut into parts of a page's height, each with its own lifelines, so
-that a printer can break between them.
+Pure functions, for a width in CSS pixels: labels are broken into lines that fit. A long dialogue is
+first thinned (`thinned`), then divided into parts of a page's height, each with its own lifelines,
+so that a printer can break between them.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from flasher.report.base import shortened, visible
 from flasher.report.scale import duration_text
 
 ITEMS_SHOWN: Final = 240
-"""Items of one diagram at the most."""
+"""At most this many items in one diagram."""
 _MARGIN_STEPS: Final = 3
-"""Items kept on both sides of a trouble when a dialogue is thinned."""
+"""Items kept before and after trouble when a dialogue is thinned."""
 _PART_HEIGHT: Final = 760
 _TIME_WIDTH: Final = 62
 _LINE_HEIGHT: Final = 15
 _CHAR_WIDTH: Final = 6.7
-"""Mean width of a character at the size of the style sheet; a little more than it is."""
+"""Mean width of a character at the font size of the style sheet, rounded up."""
 _HEAD_HEIGHT: Final = 40
 _LABEL_LINES: Final = 4
 _LABEL_WIDTH_MIN: Final = 170
 _EDGE: Final = 8
 _QUIET_S: Final = 1.0
-"""A pause from this length on is said in words."""
+"""Pauses from this length on get a block."""
 _NAME_LIMIT: Final = 20
 _MARK: Final = "! "
-"""Before what is in trouble: not by colour alone."""
+"""Prefix of trouble, which colour alone must not mark."""
 
 
 class ItemKind(Enum):
-    """How an item is drawn."""
+    """Shape of an item."""
 
     ARROW = "arrow"
     BLOCK = "block"
@@ -45,9 +45,9 @@ class ItemKind(Enum):
 
 
 @dataclass(frozen=True)
-class Item:
-    """One thing that happened. An arrow goes from `sender` to `receiver`; a receiver that is no
-    participant stands for all of them.
+class DiagramItem:
+    """One event. An arrow goes from `sender` to `receiver`; a receiver that is not a participant
+    means all of them.
     """
 
     kind: ItemKind
@@ -58,20 +58,20 @@ class Item:
     receiver: str = ""
     is_trouble: bool = False
     end_s: float | None = None
-    """For what takes time: when it ended."""
+    """When an event with a duration ended."""
 
 
 class Lifeline(NamedTuple):
-    """A participant."""
+    """The vertical line of a participant."""
 
     name: str
     x: float
 
 
 @dataclass(frozen=True)
-class Row:
-    """One item on paper. `tips` are the ends of an arrow's heads; `title` is the part of the label
-    in bold, at the beginning of the first of its `lines`.
+class DiagramRow:
+    """A positioned item. `tips` are the ends of an arrow's heads; `title` is the bold part of the
+    label, at the beginning of its first line.
     """
 
     kind: ItemKind
@@ -89,18 +89,18 @@ class Row:
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of a diagram, complete in itself."""
+    """A page's height of a diagram, complete in itself."""
 
     width: float
     height: float
     lifelines: tuple[Lifeline, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[DiagramRow, ...]
     description: str
 
 
-def thinned(items: Sequence[Item], most: int = ITEMS_SHOWN) -> list[Item]:
-    """At most about `most` of the items: the beginning, the end, and what is around troubles. A
-    block says how many are left out where they are.
+def thinned(items: Sequence[DiagramItem], most: int = ITEMS_SHOWN) -> list[DiagramItem]:
+    """Reduce to about `most` items: the beginning, the end, and the surroundings of trouble. A
+    block replaces the others and counts them.
     """
     if len(items) <= most:
         return list(items)
@@ -110,7 +110,7 @@ def thinned(items: Sequence[Item], most: int = ITEMS_SHOWN) -> list[Item]:
         if item.is_trouble and len(kept) < most:
             near = range(max(0, index - _MARGIN_STEPS), min(len(items), index + _MARGIN_STEPS + 1))
             kept.update(near)
-    shown: list[Item] = []
+    shown: list[DiagramItem] = []
     previous = -1
     for index in sorted(kept):
         if index > previous + 1:
@@ -120,15 +120,16 @@ def thinned(items: Sequence[Item], most: int = ITEMS_SHOWN) -> list[Item]:
     return shown
 
 
-def _left_out(items: Sequence[Item]) -> Item:
+def _left_out(items: Sequence[DiagramItem]) -> DiagramItem:
     troubles = sum(item.is_trouble for item in items)
     text = f"{troubles:,} of them with trouble" if troubles else ""
     title = f"{len(items):,} {'step' if len(items) == 1 else 'steps'} not drawn"
-    return Item(ItemKind.BLOCK, items[0].at_s, title, text, is_trouble=bool(troubles))
+    return DiagramItem(ItemKind.BLOCK, items[0].at_s, title, text, is_trouble=bool(troubles))
 
 
-def diagram(items: Sequence[Item], participants: Sequence[str], width: float) -> list[Part]:
-    """The diagram in parts, from top to bottom, `width` CSS pixels wide; none without items.
+def diagram(items: Sequence[DiagramItem], participants: Sequence[str], width: float) -> list[Part]:
+    """Lay out the diagram in parts, from top to bottom, `width` CSS pixels wide; none without
+    items.
 
     Raises ValueError without participants.
     """
@@ -136,7 +137,7 @@ def diagram(items: Sequence[Item], participants: Sequence[str], width: float) ->
         raise ValueError("a sequence diagram needs participants")
     lifelines = _lifelines(participants, width)
     parts: list[Part] = []
-    rows: list[Row] = []
+    rows: list[DiagramRow] = []
     top = float(_HEAD_HEIGHT)
     for item in _with_pauses(items):
         row = _row(item, lifelines, top, width)
@@ -151,14 +152,14 @@ def diagram(items: Sequence[Item], participants: Sequence[str], width: float) ->
     return parts
 
 
-def _part(rows: Sequence[Row], lifelines: tuple[Lifeline, ...], width: float) -> Part:
+def _part(rows: Sequence[DiagramRow], lifelines: tuple[Lifeline, ...], width: float) -> Part:
     names = ", ".join(shortened(line.name, _NAME_LIMIT) for line in lifelines)
     said = f"{len(rows)} steps between {names}, from {rows[0].time or 'the start'} on."
     return Part(width, rows[-1].y + 2 * _EDGE, lifelines, tuple(rows), said)
 
 
 def _lifelines(participants: Sequence[str], width: float) -> tuple[Lifeline, ...]:
-    """The first one left, the last one right, the others evenly between."""
+    """Spread the participants evenly from left to right."""
     begin, end = _TIME_WIDTH + 34.0, width - 40.0
     if len(participants) == 1:
         return (Lifeline(participants[0], (begin + end) / 2),)
@@ -168,25 +169,25 @@ def _lifelines(participants: Sequence[str], width: float) -> tuple[Lifeline, ...
     )
 
 
-def _with_pauses(items: Iterable[Item]) -> Iterable[Item]:
-    """The items, and a block for each long silence before an arrow."""
+def _with_pauses(items: Iterable[DiagramItem]) -> Iterable[DiagramItem]:
+    """Insert a block for each long silence before an arrow."""
     previous_s: float | None = None
     for item in items:
-        # A block without an end stands for a pause itself, or for steps that are not drawn.
+        # A block without an end is a pause itself, or replaces steps that are not drawn.
         is_open = item.kind is ItemKind.BLOCK and item.end_s is None
         if previous_s is not None and not is_open and item.at_s - previous_s >= _QUIET_S:
             quiet = duration_text(item.at_s - previous_s)
-            yield Item(ItemKind.BLOCK, previous_s, f"{quiet} later")
+            yield DiagramItem(ItemKind.BLOCK, previous_s, f"{quiet} later")
         yield item
         previous_s = None if is_open else item.end_s or item.at_s
 
 
 def time_text(seconds: float) -> str:
-    """Time since the beginning, as the left column shows it."""
+    """Time since the beginning, for the left column."""
     return f"{seconds:.3f} s" if seconds < 1000 else f"{seconds:.1f} s"
 
 
-def _row(item: Item, lifelines: Sequence[Lifeline], top: float, width: float) -> Row:
+def _row(item: DiagramItem, lifelines: Sequence[Lifeline], top: float, width: float) -> DiagramRow:
     if item.kind is ItemKind.BLOCK:
         return _block(item, top, width)
     at = {line.name: line.x for line in lifelines}
@@ -202,19 +203,23 @@ def _row(item: Item, lifelines: Sequence[Lifeline], top: float, width: float) ->
     label_x = max(_TIME_WIDTH + _EDGE, min(low + _EDGE, width - needed - _EDGE))
     y = top + _LINE_HEIGHT * len(lines) + _EDGE
     time = time_text(item.at_s)
-    return Row(item.kind, time, top, y, begin_x, tips, label_x, title, lines, item.is_trouble)
+    return DiagramRow(
+        item.kind, time, top, y, begin_x, tips, label_x, title, lines, item.is_trouble
+    )
 
 
-def _block(item: Item, top: float, width: float) -> Row:
+def _block(item: DiagramItem, top: float, width: float) -> DiagramRow:
     left, right = float(_TIME_WIDTH + _EDGE), width - _EDGE
     title, lines = _label(item, right - left - 2 * _EDGE)
     y = top + _LINE_HEIGHT * len(lines) + _EDGE * 1.5
     time, label_x = time_text(item.at_s), (left + right) / 2
-    return Row(item.kind, time, top, y, left, (right,), label_x, title, lines, item.is_trouble)
+    return DiagramRow(
+        item.kind, time, top, y, left, (right,), label_x, title, lines, item.is_trouble
+    )
 
 
-def _label(item: Item, room: float) -> tuple[str, tuple[str, ...]]:
-    """What is in bold of the first line, and all lines: the title, then the text."""
+def _label(item: DiagramItem, room: float) -> tuple[str, tuple[str, ...]]:
+    """The bold part of the first line, and all lines: the title, then the text."""
     columns = max(8, int(room / _CHAR_WIDTH))
     title = visible(shortened((_MARK if item.is_trouble else "") + item.title))
     said = f"{title}: {item.text}" if item.text else title

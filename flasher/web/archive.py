@@ -19,7 +19,7 @@ from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.history import FlashHistory, matching
 from flasher.protocol.text import printable
 from flasher.report.base import visible
-from flasher.report.explain_page import told
+from flasher.report.explain_page import story_context
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
 from flasher.web.pages import Pages
@@ -114,7 +114,7 @@ class Archive:
             error.what = error.what.replace(printable(str(path)), printable(path.name))
             raise
         named = replace(story, source=visible(path.name))
-        return self._page(question, "explain.html", **told(named))
+        return self._page(question, "explain.html", **story_context(named))
 
     def bundle(self, question: Question) -> Answer:
         """A bundle as one file."""

@@ -21,7 +21,7 @@ from urllib.parse import urlencode
 from flasher.errors import FlasherError, UsageError
 from flasher.i18n import text
 from flasher.report.chart import WIDTHS, histogram
-from flasher.report.explain_page import status_of, told
+from flasher.report.explain_page import status_of, story_context
 from flasher.station import codes
 from flasher.station.certificate import (
     RUN_WORDS,
@@ -184,7 +184,7 @@ class Supervisor:
         found = self._story(details)
         if not isinstance(found, Story):
             raise NotFoundError(f"There is no story of run {question.run}.", cause=found)
-        return self._page(question, "explain.html", path="/units", **told(found))
+        return self._page(question, "explain.html", path="/units", **story_context(found))
 
     def _story(self, details: RunDetails) -> Story | str:
         for file in details.attachments:
@@ -224,7 +224,7 @@ class Supervisor:
             shown=shown,
             story=story if isinstance(story, Story) else None,
             no_story=story if isinstance(story, str) else "",
-            drawn=None if isinstance(story, str) else told(story),
+            drawn=None if isinstance(story, str) else story_context(story),
             story_status=status_of(story.verdict.cause) if isinstance(story, Story) else None,
             has_trace=lambda details: any(map(_is_trace, details.attachments)),
             limits_of=limits_of,

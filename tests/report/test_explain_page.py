@@ -59,11 +59,11 @@ def test_the_verdict_comes_first() -> None:
             "the battery switched itself off",
             "Wake the battery",
             "Phases",
-            "Who said what",
+            "Messages",
             "Answer time of each packet",
             "Link report",
             "Packets with trouble",
-            "Who else was heard",
+            "Other senders",
             "The bus",
             "How to read this page",
         )

@@ -16,7 +16,7 @@ from flasher.errors import UsageError
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
-    from flasher.export.signals import Row
+    from flasher.export.signals import SignalRow
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -
     )
 
 
-def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[Row], str]:
+def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[SignalRow], str]:
     """The messages with one of the words in their titles, and where the trace cannot be read on."""
     from flasher.cli.look.monitor import check_messages  # noqa: PLC0415  loads python-can
     from flasher.export.signals import rows  # noqa: PLC0415  loads python-can
