@@ -80,14 +80,14 @@ def test_memory_that_does_not_name_the_running_version_is_saved_with_a_warning(
     (tmp_path / "flasher.toml").write_text(AREA)
     run = flasher("backup", "-t", "bms", "-o", "b.zip", "--json", *MOCK)
     assert run.document["memory"]["names_running_version"] is False
-    assert "does not stand in this memory" in run.err
+    assert "is not in this memory" in run.err
 
 
 def test_memory_that_names_it_says_so(flasher: Flasher, battery: Battery, tmp_path: Path) -> None:
     (tmp_path / "flasher.toml").write_text(AREA)
     battery.memory = b"..V1r0r0_20220512.".ljust(1024, b"\xff")
     run = flasher("backup", "-t", "bms", "-o", "b.zip", *MOCK)
-    assert "names the version that runs" in run.out
+    assert "contains the version that runs" in run.out
     assert "warning" not in run.err
 
 

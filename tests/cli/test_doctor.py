@@ -19,7 +19,7 @@ from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.simulated import SimulatedLink
 from flasher.cli.look import doctor
 from flasher.cli.look.doctor import bus_words
-from flasher.cli.look.findings import Finding, Severity, Traffic
+from flasher.cli.look.findings import Finding, Severity, TrafficCounter
 from flasher.errors import ExitCode
 from flasher.protocol.bittime import fixed_bits
 from flasher.protocol.frame import Frame
@@ -114,7 +114,7 @@ def test_a_silent_bus_is_no_problem_by_itself(
 def test_a_second_tool_is_a_problem(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> None:
     run = listen(flasher, monkeypatch, saying((0x752, 0x3300, b"")))
     assert run.code == ExitCode.BUS
-    assert one(run, "another tool speaks as CDL")[0] == "problem"
+    assert one(run, "another tool sends as CDL")[0] == "problem"
     assert "another tool" in run.document["error"]["what"]
     assert "close the other tool" in run.err
 
@@ -184,7 +184,7 @@ def test_an_adapter_that_fails_meanwhile_is_a_finding(
 
 
 def test_the_load_counts_extended_frames_and_not_error_frames() -> None:
-    long_, error = Traffic(), Traffic()
+    long_, error = TrafficCounter(), TrafficCounter()
     long_(Frame(0x18DA0123, b"12345678", is_extended=True), sent=False, now=0.0)
     error(Frame(0x204, bytes(8), is_error=True), sent=False, now=0.0)
     assert long_.bits == fixed_bits(8) + 20
@@ -354,8 +354,8 @@ def test_settings_that_are_fine_are_noted_without_a_command(examine: Doctor) -> 
 @pytest.mark.parametrize(
     ("seen", "words", "fix"),
     [
-        (Unseen.MISSING, "there is no interface can0", "ip -brief link show type can"),
-        (replace(CAN0, is_can=False), "no CAN interface", "ip -brief link show type can"),
+        (Unseen.MISSING, "no interface can0 exists", "ip -brief link show type can"),
+        (replace(CAN0, is_can=False), "not a CAN interface", "ip -brief link show type can"),
         (
             replace(CAN0, is_up=False, has_carrier=None, bitrate_bps=None),
             "can0 is down",
@@ -452,7 +452,7 @@ def test_what_is_no_frame_is_counted(examine: Doctor, frames: int, severity: str
     bad = ValueError("invalid literal for int() with base 16")
     examine.inbox = [message(0x720, b"\x01")] * frames + [bad, bad]
     run = examine("-i", "slcan", "-c", "ttyACM0")
-    assert one(run, "2 times the adapter delivered what is no frame")[0] == severity
+    assert one(run, "2 times the adapter delivered unreadable frames")[0] == severity
     assert run.document["health"]["unreadable"] == 2
     assert not any("the bus was silent" in what for what in found(run))
 

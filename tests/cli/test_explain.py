@@ -124,7 +124,7 @@ def test_a_page_never_replaces_the_trace_that_it_is_made_from(
 def test_an_empty_trace_has_no_figures_of_a_bus(flasher: Flasher, tmp_path: Path) -> None:
     empty = tmp_path / "empty.log"
     empty.write_text("")
-    assert flasher("explain", empty).out.endswith("bus load: none, there is no frame\n")
+    assert flasher("explain", empty).out.endswith("bus load: none, the trace has no frames\n")
 
 
 def test_where_the_trace_of_a_bundle_breaks_off_the_tool_gave_up_and_not_the_recording(

@@ -305,7 +305,7 @@ def test_no_fault_is_cut_off(flasher: Flasher, tmp_path: Path, width: int) -> No
 
 def test_faults_that_have_no_room_are_counted() -> None:
     lines = drawn(board_of(traffic.faults(b"\xff" * 4)), width=80, height=9)
-    assert lines[0].strip() == "32 FAULTS: make the window higher"
+    assert lines[0].strip() == "32 FAULTS: enlarge the window"
     assert len(lines) <= 9
 
 
@@ -330,7 +330,7 @@ def test_what_the_dialect_does_not_have_is_marked(flasher: Flasher, tmp_path: Pa
 def test_what_has_no_room_is_counted() -> None:
     messages = [traffic.frames(0x752, 0x11, command << 8, b"") for command in range(0x30, 0x3A)]
     lines = drawn(board_of(*messages), width=120, height=10)
-    assert any("more: make the window higher" in line for line in lines)
+    assert any("more: enlarge the window" in line for line in lines)
     assert len(lines) <= 10
 
 

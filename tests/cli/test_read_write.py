@@ -90,7 +90,7 @@ def test_the_items_are_listed_without_a_bus(flasher: Flasher, command: str) -> N
 def test_there_is_nothing_for_devices_without_queries(
     flasher: Flasher, command: str, target: str
 ) -> None:
-    assert "nothing to" in flasher(command, "--list", "-t", target).out
+    assert f"no {command.rstrip('e')}able item" in flasher(command, "--list", "-t", target).out
     assert flasher(command, "model", "-t", target, *MOCK).code == ExitCode.USAGE
 
 

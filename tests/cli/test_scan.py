@@ -107,4 +107,4 @@ def test_bytes_that_make_no_message_are_counted(
     on_the_bus(monkeypatch, talker)
     run = flasher("scan", *MOCK)
     assert run.code == ExitCode.OK
-    assert "bytes that made no message" in run.out
+    assert "bytes outside any message" in run.out

@@ -217,7 +217,7 @@ def test_a_user_is_told_of_damaged_lines(adapter: Lawicel) -> None:
     assert run.returncode == ExitCode.OK
     link = json.loads(run.stdout)["link"]
     assert link["unreadable"] > 1
-    assert f"{link['unreadable']} times the adapter delivered what is no frame" in run.stderr
+    assert f"{link['unreadable']} times the adapter delivered unreadable frames" in run.stderr
 
 
 def test_a_user_is_told_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) -> None:

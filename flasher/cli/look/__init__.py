@@ -1,1 +1,1 @@
-"""Commands that look at devices, at the bus, and at what was recorded of it."""
+"""Commands that read devices, watch the bus and work on recorded traces."""

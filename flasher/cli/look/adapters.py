@@ -1,4 +1,4 @@
-"""`flasher adapters`: what is plugged into this computer, with the arguments that use it."""
+"""`flasher adapters`: the adapters of this computer, with the arguments that select each."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ examples:
   flasher adapters --network            listens for socketcand servers too, 4 s
   flasher adapters --json | jq -r '.adapters[].arguments | join(" ")'
 
-Opens no adapter and no serial port. Where one adapter alone is found, commands that look use it
-without being told, and flash and write do so once they have heard the device on it.
+Opens no adapter and no serial port. Where one adapter alone is found, commands that only look use
+it by themselves; flash and write do so after receiving the device on it.
 """
 
 
@@ -40,37 +40,37 @@ class FoundAdapter:
 
     interface: str
     channel: str
-    """Empty where its back end does not tell."""
+    """Empty where its back end does not report it."""
     arguments: list[str]
-    """What chooses it on the command line."""
+    """The options that select it."""
     serial_number: str | None
     usb_path: str | None
     is_up: bool | None
-    """Of a SocketCAN interface; null of others."""
+    """Of a SocketCAN interface; null for others."""
     bitrate_bps: int | None
-    """What the kernel has set; null where it does not tell."""
+    """As set in the kernel; null where unknown."""
     description: str
 
 
 @dataclass(frozen=True)
 class NotSeen:
-    """A back end whose adapters are not among those found, if there are any."""
+    """A back end that cannot list its adapters."""
 
     interface: str
     why: Literal["package_missing", "not_loaded", "cannot_tell", "no_answer", "failed", "not_asked"]
     """`not_loaded`: its driver is missing, or it is for another operating system."""
     text: str
     fix: str
-    """The command that helps; empty where none does."""
+    """A command that helps; may be empty."""
 
 
 @dataclass(frozen=True)
 class AdaptersDocument:
-    """What is plugged in."""
+    """The adapters of this computer, and the back ends that cannot list theirs."""
 
     adapters: list[FoundAdapter]
     serial_ports: list[FoundAdapter] | None
-    """Each may be an slcan adapter; null where the package is missing that lists them."""
+    """Each may be an slcan adapter; null where the package that lists them is missing."""
     not_seen: list[NotSeen]
 
 
@@ -83,8 +83,8 @@ DOCUMENTS: Final = (AdaptersDocument,)
     help="listen for socketcand servers on the network too",
 )  # fmt: skip
 def adapters(output: Output, *, network: bool) -> int:
-    """List what is plugged into this computer, each with the arguments that use it, and say what
-    cannot be seen.
+    """List the adapters of this computer, each with the arguments that select it, and the back ends
+    that cannot list theirs.
     """
     detected = detected_adapters(on_network=network)
     serial = ports()
@@ -95,11 +95,11 @@ def adapters(output: Output, *, network: bool) -> int:
         output.result("no adapter found")
     if serial:
         output.result("")
-        output.result("serial ports on the USB; with an slcan adapter behind it, one is used by")
+        output.result("USB serial ports; one with an slcan adapter is used by")
         output.table(_rows(serial))
     output.result("")
     output.result("not seen, even when plugged in:")
-    alike: dict[str, list[str]] = {}  # back ends with the same reason stand together
+    alike: dict[str, list[str]] = {}  # one line for back ends with the same reason
     for each in unseen:
         reason = f"{each.text}: {each.fix}" if each.fix else each.text
         alike.setdefault(reason, []).append(each.interface)
@@ -133,11 +133,11 @@ def _document(found: DetectedAdapter) -> FoundAdapter:
     )
 
 
-# -- what cannot be seen ---------------------------------------------------------------------------
+# -- back ends that list nothing -------------------------------------------------------------------
 
 
 def _unseen(detected: DetectionResult, *, on_network: bool, lists_ports: bool) -> Iterable[NotSeen]:
-    """The back ends of which nothing is known, each with the reason."""
+    """Back ends that cannot list their adapters, each with the reason."""
     from flasher.bus.opening import needed_extra  # noqa: PLC0415  loads python-can
 
     found = {each.interface for each in detected.found}

@@ -1,4 +1,4 @@
-"""`flasher backup`: the memory of a device, and everything that it tells, in one file."""
+"""`flasher backup`: save the memory of a device, and all its answers, in one file."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _EXAMPLES: Final = """\
 examples:
   flasher backup -t bms -o battery.zip --image running.hex -i socketcan -c can0
   flasher backup -t bms -o battery.zip --profile bench.toml
-  flasher backup -t bms -o battery.zip --no-memory       what it tells, without its memory
+  flasher backup -t bms -o battery.zip --no-memory       its answers, without its memory
   flasher backup -t bms -o battery.zip --mock
 
-The documents let a tool read memory by address, and give no addresses. So the application's are
-those of application_area in the profile (flasher.toml), or those of an image like the one that
-runs; nothing is guessed, since an address that does not exist may crash a device.
+The documents let a tool read memory by address, and give no addresses. They come from
+application_area in the profile (flasher.toml), or from an image like the one that runs; none is
+guessed, since an address that does not exist may crash a device.
 
 FILE is a zip archive, written whole or not at all: memory.hex (Intel HEX; the CRC of each message
 was right) and backup.json (identity, state, faults, history, strings).
@@ -57,20 +57,20 @@ was right) and backup.json (identity, state, faults, history, strings).
 
 @dataclass(frozen=True)
 class MemoryInBackup:
-    """Memory that was read, `end` exclusive."""
+    """Memory that was read; `end` is exclusive."""
 
     start: int
     end: int
     sha256: str
     range_from: str
-    """Where the addresses come from."""
+    """Source of the addresses."""
     names_running_version: bool | None
-    """True when the version that the device answers stands in it; null when it answers none."""
+    """True when it contains the version that the device answered; null without an answer."""
 
 
 @dataclass(frozen=True)
 class BackupDocument:
-    """What is in a backup, and what is not."""
+    """Contents of a backup, and its omissions."""
 
     target: str
     file: str
@@ -78,21 +78,21 @@ class BackupDocument:
     sha256: str
     """Of the file."""
     taken_at: str
-    """With the offset of local time."""
+    """Local time with its UTC offset."""
     memory: MemoryInBackup | None
     items: list[str]
-    """What the device answered."""
+    """Questions that the device answered."""
     not_in_it: dict[str, str]
-    """What is missing, each with the reason."""
+    """Omissions, each with the reason."""
 
 
 @dataclass(frozen=True)
 class DataInBackup:
-    """`backup.json`."""
+    """Contents of `backup.json`."""
 
     format: int
     flasher: str
-    """The version that wrote it."""
+    """Version of flasher that wrote it."""
     taken_at: str
     connection: str
     memory: MemoryInBackup | None
@@ -105,12 +105,12 @@ DOCUMENTS: Final = (BackupDocument,)
 
 @dataclass(frozen=True)
 class Backup:
-    """What was read of a device, ready to be written."""
+    """Data read from a device, ready to be written to a file."""
 
     document: BackupDocument
     archive: bytes
     running_version: str
-    """What it answers; empty where it answers none."""
+    """As answered; empty without an answer."""
 
 
 DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, text("the device model"))
@@ -148,8 +148,8 @@ def backup(
     force: bool,
     profile: str | None,
 ) -> int:
-    """Save the application's memory of a device, and everything that it tells, to a file. Nothing
-    is written to the device. The documents let a tool read the BMS only.
+    """Save the application's memory of a device, and all its answers, to a file. Nothing is written
+    to the device. The documents let a tool read the BMS only.
     """
     if READ_MEMORY.receiver is not target.node:
         raise UsageError(
@@ -175,14 +175,16 @@ def backup(
     output.table(document.not_in_it.items(), indent=2)
     if memory is not None and memory.names_running_version is False:
         output.error_line(
-            f"warning: the version that runs, {made.running_version}, does not stand in this "
-            "memory: these may not be the addresses of the application"
+            f"warning: the version that runs, {made.running_version}, is not in this memory: "
+            "these may not be the addresses of the application"
         )
     return output.document(document)
 
 
 def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:
-    """Where the application lies. Raises UsageError where nobody says so."""
+    """The address range of the application. Raises UsageError where no option or profile gives
+    it.
+    """
     if image is not None:
         found = area_of_image(load(image))
         if found is None:
@@ -209,7 +211,7 @@ def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> A
 def backup_of(
     found: DeviceInfo, area: Area | None, data: bytes, connection: str, file: Path
 ) -> Backup:
-    """What is written into `file`. Raises NoAnswerError for a device that is not there."""
+    """Build the backup. Raises NoAnswerError for a device that did not answer."""
     if not found.is_there:
         raise silence(found)
     running = "" if found.version is None else printable(str(found.version.firmware_version))
@@ -266,6 +268,6 @@ def _lines(document: BackupDocument) -> Iterator[str]:
         yield f"    sha256     {memory.sha256}"
         yield f"               addresses of {printable(memory.range_from)}"
         if memory.names_running_version:
-            yield "               it names the version that runs"
+            yield "               it contains the version that runs"
     yield f"  {_DATA}  {', '.join(name.replace('-', ' ') for name in document.items)}"
     yield "and has not"

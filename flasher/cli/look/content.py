@@ -1,5 +1,6 @@
-"""Contents of messages, and what was heard of a node, in words and as JSON. What a field's value
-looks like is told by `flasher.trace.decoder`, the same for a query's answer and for live traffic.
+"""Formats contents of messages, and the traffic of a node, as text and as JSON.
+`flasher.trace.decoder` formats the values of fields, for a query's answer and for live traffic
+alike.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from flasher.protocol.fields import Content
 from flasher.trace.decoder import NOT_IN_DIALECT, content_fields
 
 LABEL_WIDTH: Final = 33
-"""Of the labels at least, so that the values of several tables stand below each other."""
+"""Minimum width of labels, so that the values of several tables are aligned."""
 _SHOWN_AT_MOST: Final = 40
-"""Kinds of message listed: a babbling node must not fill the screen."""
+"""Limit of kinds listed: a babbling node must not fill the screen."""
 
 
 def rows_lines(rows: list[tuple[str, str]]) -> list[str]:
@@ -26,19 +27,19 @@ def rows_lines(rows: list[tuple[str, str]]) -> list[str]:
 
 
 def content_rows(content: Content, field: str = "") -> Iterator[tuple[str, str]]:
-    """Label and value with unit of every field, or of one by its name, safe to show."""
+    """Label and value with unit of every field, or of one by its name, escaped for a terminal."""
     for shown in content_fields(content):
         if field in ("", shown.name):
             yield shown.label, f"{shown.text} {shown.unit}".rstrip()
 
 
 def content_lines(content: Content, field: str = "") -> list[str]:
-    """The fields of a content, or one of them, one a line."""
+    """The fields of a content, or one of them, one per line."""
     return rows_lines(list(content_rows(content, field)))
 
 
 def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
-    """What one node sent, one kind of message a line, with its last content on request."""
+    """Traffic of one node, one line per kind of message, optionally with its last content."""
     rows = [("bootloader", heard.boot_version)] if heard.boot_version else []
     for title, times in sorted(heard.messages.items())[:_SHOWN_AT_MOST]:
         mark = f" {NOT_IN_DIALECT}" if title in heard.not_in_dialect else ""
@@ -49,12 +50,11 @@ def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
     if left_out > 0:
         rows.append((f"and {counted(left_out, 'kind')} of message more", ""))
     if heard.damaged:
-        rows.append(("bytes that made no message", f"{heard.damaged} times"))
+        rows.append(("bytes outside any message", f"{heard.damaged} times"))
     return rows_lines(rows or [(f"{counted(heard.frames, 'frame')} that made no message", "")])
 
 
 def heard_document(heard: NodeTraffic) -> HeardDocument:
-    """The same as JSON."""
     return HeardDocument(
         frames=heard.frames,
         messages=dict(sorted(heard.messages.items())),

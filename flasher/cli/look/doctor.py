@@ -1,4 +1,4 @@
-"""`flasher doctor`: adapter, interface, bus and traffic, and the exact command for what is wrong.
+"""`flasher doctor`: diagnose adapter, interface, bus and traffic, with a command for each fault.
 
 It never sends a frame: at a wrong bit rate that would disturb a live bus.
 """
@@ -21,7 +21,7 @@ from flasher.cli.adapters import only
 from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
 from flasher.cli.look import findings
-from flasher.cli.look.findings import Finding, Listened, Severity, Traffic
+from flasher.cli.look.findings import Finding, ListenResult, Severity, TrafficCounter
 from flasher.cli.options import Bus, bus_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -39,17 +39,17 @@ from flasher.protocol.spec import BMS
 from flasher.protocol.text import printable
 
 LISTEN_S: Final = 1.0
-"""Unless --listen says otherwise: most nodes of a running system speak within it."""
+"""Default of --listen: most nodes of a running system send within it."""
 
 _EXAMPLES: Final = """\
 examples:
-  flasher doctor                                   which adapters are there
-  flasher doctor -i socketcan -c can0              this one: interface, bus, traffic
+  flasher doctor                                   list the adapters
+  flasher doctor -i socketcan -c can0              check one: interface, bus, traffic
   flasher doctor -i pcan -c PCAN_USBBUS1 --listen 5 --json
-  flasher doctor --mock                            what it looks like on a healthy bus
+  flasher doctor --mock                            the output for a healthy bus
 
-Never sends a frame, and listens without acknowledging where the adapter can be told so. So it does
-not try other bit rates, and cannot see a device that speaks only when asked: flasher scan asks.
+Never sends a frame, and listens without acknowledging where the adapter can. So it does not try
+other bit rates, and cannot detect a device that sends only when asked: flasher scan asks.
 """
 
 
@@ -63,19 +63,19 @@ class AdapterDocument:
 
 @dataclass(frozen=True)
 class HealthDocument:
-    """What the adapter tells about its controller."""
+    """State of the controller, as its adapter reports it."""
 
     state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
     error_frames: int
     unreadable: int
-    """How often the adapter delivered what is no frame."""
+    """Number of unreadable frames from the adapter."""
 
 
 @dataclass(frozen=True)
 class TrafficDocument:
-    """What was heard."""
+    """Traffic received while listening."""
 
     listened_s: float
     listen_only: bool
@@ -90,7 +90,7 @@ class TrafficDocument:
 
 @dataclass(frozen=True)
 class DoctorDocument:
-    """The findings, and the figures behind them."""
+    """The findings, and the figures that they follow from."""
 
     findings: list[Finding]
     adapters: list[AdapterDocument]
@@ -112,7 +112,7 @@ _WORDS: Final = {
     Severity.WARNING: ("WARNING", "yellow"),
     Severity.PROBLEM: ("PROBLEM", "red"),
 }
-"""What is printed for each, and its colour."""
+"""Label and colour of each."""
 
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.INTERRUPTED))
@@ -122,7 +122,7 @@ _WORDS: Final = {
 )  # fmt: skip
 @bus_options()
 def doctor(output: Output, bus: Bus, *, listen: float) -> int:
-    """Look at the adapters, the chosen one, its bus and the traffic."""
+    """Check the adapters, the selected one, its bus and the traffic."""
     examination = Examination(bus, listen, output)
     with stop_on_signal() as stopped:
         if bus.mock:
@@ -143,7 +143,7 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
 
 
 def lines(findings: Sequence[Finding], *, is_coloured: bool) -> list[str]:
-    """The findings as a person reads them, a line each, with their commands below."""
+    """The findings as text, one per line, each followed by its commands."""
     shown = []
     for finding in findings:
         name, colour = _WORDS[finding.severity]
@@ -179,11 +179,11 @@ def _document(examination: Examination) -> DoctorDocument:
     )
 
 
-# -- how it looks ----------------------------------------------------------------------------------
+# -- the checks ------------------------------------------------------------------------------------
 
 
 class Examination:
-    """What was looked at, and what was found."""
+    """Runs the checks and collects their findings."""
 
     def __init__(self, bus: Bus, listen_s: float, output: Output) -> None:
         self._bus = bus
@@ -192,25 +192,25 @@ class Examination:
         self.dialect = bus.dialect
         self.bitrate_bps = self.dialect.bitrate_bps
         self.detected = DetectionResult()
-        self.listened: Listened | None = None
+        self.listened: ListenResult | None = None
         self.findings: list[Finding] = []
-        """In the order in which they are told."""
+        """In the order of printing."""
 
     def look_at_mock(self, stopped: Callable[[], bool]) -> None:
-        """The built-in bicycle in place of an adapter."""
+        """Check the built-in bicycle in place of an adapter."""
         speed = self._bus.mock_speed
         with api.connect_mock(BMS, self.dialect, speed=speed, system=True) as mock:
             self._note(findings.opened(mock.name, is_silent=False))
             self._listen(mock.link, mock.clock, "--mock", stopped)
 
     def look_at_adapters(self, stopped: Callable[[], bool]) -> None:
-        """The adapters that are there, the chosen one, and its bus."""
+        """Check the adapters of this computer, the selected one, and its bus."""
         from flasher.bus.opening import bus_config  # noqa: PLC0415
         from flasher.python_can import can  # noqa: PLC0415  slow, and not needed for a mock
 
         self._note(*findings.setup(self._bus.fallback))
         config: dict[str, Any] | None = None
-        with contextlib.suppress(BusError):  # none is named: no other failure is one of the bus
+        with contextlib.suppress(BusError):  # no adapter is selected
             config = bus_config(self._bus.config, self._bus.fallback)
         asked = set(can.VALID_INTERFACES)
         if config is not None:
@@ -247,7 +247,7 @@ class Examination:
         if named is not None:
             self.bitrate_bps = named.bps
         self._note(*findings.package(interface))
-        if "bitrate" in given or "timing" in given:  # any other source is refused at the opening
+        if "bitrate" in given or "timing" in given:  # opening fails for any other source
             self._note(*findings.bit_rate(self.bitrate_bps, self.dialect))
         if interface == "socketcan" and not channel:
             self._note(findings.nameless())
@@ -260,8 +260,8 @@ class Examination:
             if seen is Unseen.MISSING:
                 return
             if isinstance(seen, Interface) and (
-                not (seen.is_up and seen.is_can)  # it would open, and carry nothing
-                or seen.bitrate_bps not in (None, self.bitrate_bps)  # it would not be opened
+                not (seen.is_up and seen.is_can)  # it would open, but transfer nothing
+                or seen.bitrate_bps not in (None, self.bitrate_bps)  # opening it would fail
             ):
                 return
             if isinstance(seen, Interface) and seen.state is ControllerState.BUS_OFF:
@@ -300,10 +300,10 @@ class Examination:
         channel: str = "",
         is_silent: bool = False,
     ) -> None:
-        """Listen, sending nothing, and note the health of the link and what was heard."""
+        """Listen without sending; note the health of the link and the traffic."""
         listen_s = self._listen_s
         survey = Survey(listen_s=listen_s, bitrate_bps=self.bitrate_bps, dialect=self.dialect)
-        traffic = Traffic()
+        traffic = TrafficCounter()
         where = str(link) if interface else "the built-in mock"
         self._output.progress(f"listening for {listen_s:g} s on {printable(where)} ...")
         try:
@@ -313,7 +313,7 @@ class Examination:
         _check_stopped(is_stopped=survey.cancelled)
         health = link.health()
         self._note(*findings.health(health, channel, is_socketcan=interface == "socketcan"))
-        self.listened = Listened(
+        self.listened = ListenResult(
             traffic, survey, health, listen_s, self.bitrate_bps, self.dialect, is_silent,
             bus_arguments,
         )  # fmt: skip
@@ -324,7 +324,7 @@ class Examination:
 
 
 def bus_words(interface: str, channel: str, given: Mapping[str, Any]) -> str:
-    """What chooses this bus on the command line, as a shell takes it."""
+    """The options that select this bus, quoted for a shell."""
     words = ["-i", interface, *(["-c", channel] if channel else [])]
     if "bitrate" in given:
         words += ["-b", str(given["bitrate"])]

@@ -1,4 +1,4 @@
-"""`flasher explain`: the story of a recorded trace, with a verdict."""
+"""`flasher explain`: explain a recorded trace, with a verdict."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _LAST: Final = "--last"
 _EXAMPLES: Final = """\
 examples:
   flasher explain upgrade.asc
-  flasher explain --last                                 what the latest failure has left
+  flasher explain --last                                 the bundle of the latest failure
   flasher explain upgrade.blf --html story.html          one page with diagrams
   flasher explain upgrade.log --json | jq .story.verdict
   flasher explain upgrade.log --all --packets            every message, every packet
 
-Exit code 0 whenever the trace can be read, whatever the verdict is.
+Exit code 0 whenever the trace can be read, regardless of the verdict.
 """
 
 
@@ -51,7 +51,7 @@ Exit code 0 whenever the trace can be read, whatever the verdict is.
     type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
     help="a recorded trace (.asc .blf .log ...), or the folder of a bundle",
 )  # fmt: skip
-@option(_LAST, is_flag=True, brief=True, help="the bundle that the latest failed command has left")
+@option(_LAST, is_flag=True, brief=True, help="read the bundle of the latest failed command")
 @option(
     "-b", "--bitrate", type=values.count, metavar="BPS",
     help="bit rate of the bus that was recorded (default: the dialect's)",
@@ -78,10 +78,10 @@ def explain(
     packets: bool,
     html: Path | None,
 ) -> int:
-    """Read a recorded trace, or the bundle that a failed command has left, and tell what happened:
-    the verdict and its likely cause, phases and messages with their times, how quickly both ends
-    answered, how full the bus was, who else was on it. No bus is opened. Goes by CAN ids, whoever
-    recorded it.
+    """Explain a recorded trace, or the bundle of a failed command: the verdict and its likely
+    cause, phases and messages with their times, the response times of both ends, the bus load and
+    other nodes on the bus. No bus is opened. Identifies nodes by CAN id, whichever program recorded
+    the trace.
     """
     from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE  # noqa: PLC0415  loads python-can
     from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
@@ -103,7 +103,7 @@ def explain(
 
 
 def _source(trace: Path | None, *, last: bool) -> Path:
-    """The trace or bundle to read. Raises UsageError where none is named, or both ways are."""
+    """The trace or bundle to read. Raises UsageError unless exactly one is given."""
     from flasher.trace.bundle import bundles  # noqa: PLC0415  loads python-can
 
     if last == (trace is not None):
@@ -127,7 +127,7 @@ def _source(trace: Path | None, *, last: bool) -> Path:
 
 
 def _unfinished(bundle: Path | None) -> UsageError | None:
-    """The error for a latest upgrade that has no end, which is later than the latest bundle."""
+    """The error for an upgrade without a recorded end, newer than the latest bundle."""
     with suppress(UsageError, ValueError):
         flashes, _ = FlashHistory().flashes()
         latest = flashes[-1] if flashes else None

@@ -1,4 +1,4 @@
-"""A story in words: what `flasher explain` prints. The verdict comes first."""
+"""Formats a story as the text that `flasher explain` prints, verdict first."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _times(name: str, figures: Distribution | None) -> str:
 
 def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
     if not bus.frames and not bus.error_frames:
-        yield "bus load: none, there is no frame"
+        yield "bus load: none, the trace has no frames"
         return
     load = "unknown" if bus.load is None else _share(bus.load, 1)
     peak = "" if bus.peak_load is None else f", {_share(bus.peak_load, 1)} in the busiest second"
@@ -160,8 +160,8 @@ def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
 
 
 def _share(share: float, digits: int) -> str:
-    """A share of what the line carries. Much more than all of it means that it was no such line;
-    a little more is what time stamps are wrong by.
+    """A percentage of the line's capacity. Far above 100 %, the trace was not recorded on such a
+    line; slightly above, its time stamps are inaccurate.
     """
     return f"{min(share, 1):.{digits}%}" if share <= 1.02 else "more than all"
 

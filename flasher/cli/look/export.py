@@ -1,4 +1,4 @@
-"""`flasher export`: the protocol and recorded traces in the form that other tools read."""
+"""`flasher export`: convert the protocol and recorded traces for other tools."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class ExportedTraceDocument:
     file: str
     frames: int
     remarks: int
-    """Frames that bear a remark."""
+    """Frames with a comment."""
     damage: str
-    """Where and why the trace could not be read on; empty where it was read to its end."""
+    """Where and why reading stopped; empty when the whole trace was read."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ExportedSignalsDocument:
     file: str
     messages: int
     damage: str
-    """Where and why the trace could not be read on; empty where it was read to its end."""
+    """Where and why reading stopped; empty when the whole trace was read."""
 
 
 DOCUMENTS: Final = (ExportedFileDocument, ExportedTraceDocument, ExportedSignalsDocument)
@@ -74,15 +74,15 @@ welling.expert.foreign_tool, welling.running_information.voltage_mv < 30000.
 """
 _TRACE_EXAMPLES: Final = """\
 examples:
-  flasher export trace upgrade.asc -o upgrade.pcapng     for Wireshark, with remarks
+  flasher export trace upgrade.asc -o upgrade.pcapng     for Wireshark, with comments
   flasher export trace upgrade.pcapng -o upgrade.log     for canplayer, log2asc and tshark
   flasher export trace capture.pcapng -o upgrade.blf     for CANalyzer
   flasher export trace upgrade.asc --joined -o joined.asc
                                                          for a program with the DBC
 
-In a .pcapng the frames at which something went wrong bear a remark (Wireshark: filter
-frame.comment), the last frame of each upgrade its verdict, and the file the verdict of all.
-The direction of frames is not kept. With --joined there are no remarks, and nothing but messages.
+In a .pcapng, frames with a fault have a comment (Wireshark: filter frame.comment), the last frame
+of each upgrade has its verdict, and the file has the verdict of all. The direction of frames is
+not stored. With --joined the file has messages only, without comments.
 """
 _DBC_EXAMPLES: Final = """\
 examples:
@@ -279,6 +279,6 @@ def _warn(output: Output, trace: Path, damage: str, *, made: int) -> None:
         output.error_line(f"warning: {shown} ends there: {damage}")
     elif not made and not any(True for _ in frames_until_damage(trace_file(trace), [])):
         output.error_line(
-            f"warning: there is no classic CAN frame in {shown}: nothing was recorded, it holds "
-            "CAN FD frames alone, as --joined makes them, or it is no trace of its suffix's format"
+            f"warning: no classic CAN frame in {shown}: nothing was recorded, it holds "
+            "only CAN FD frames, as --joined makes them, or its format does not match its suffix"
         )

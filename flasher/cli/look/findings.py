@@ -1,5 +1,5 @@
-"""What `flasher doctor` makes of what it sees: rules about python-can, adapters, interfaces, the
-bus and its traffic. Nobody is asked here.
+"""Rules of `flasher doctor`: findings about python-can, adapters, interfaces, the bus and its
+traffic. They only judge data that was collected before.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from flasher.trace.decoder import bits_of
 from flasher.wording import wording
 
 _SHOWN_AT_MOST: Final = 20
-"""Adapters listed."""
+"""Limit of adapters listed."""
 _EXAMPLES: Final = (
     "flasher doctor -i socketcan -c can0",
     "flasher doctor -i pcan -c PCAN_USBBUS1",
@@ -52,7 +52,7 @@ _MANY_ERRORS: Final = 0.1
 
 
 class Severity(Enum):
-    """How bad a finding is, the worst last."""
+    """Severity of a finding, the worst last."""
 
     OK = "ok"
     NOTE = "note"
@@ -62,11 +62,11 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at, in a sentence, and the commands that put it right."""
+    """One sentence about what was checked, with commands that repair it."""
 
     severity: Severity
     about: str
-    """What was looked at: "python-can", "adapters", "interface", "adapter", "bus", "traffic"."""
+    """Subject: "python-can", "adapters", "interface", "adapter", "bus", "traffic"."""
     what: str
     fix: tuple[str, ...] = ()
 
@@ -78,7 +78,7 @@ _ok, _note, _warning, _problem = (partial(Finding, severity) for severity in Sev
 
 
 def setup(fallback: Fallback | None) -> Iterator[Finding]:
-    """python-can's version, and what configures it besides the command line."""
+    """The version of python-can, and its configuration outside the command line."""
     from flasher.python_can import can  # noqa: PLC0415  slow
 
     yield _ok("python-can", f"python-can {can.__version__}")
@@ -98,7 +98,7 @@ def setup(fallback: Fallback | None) -> Iterator[Finding]:
 
 
 def package(interface: str) -> Iterator[Finding]:
-    """The Python package that the chosen interface needs, when it is missing."""
+    """Reports a missing Python package of the selected interface."""
     needed = needed_extra(interface)
     if needed is not None and importlib.util.find_spec(needed[1]) is None:
         extra, module = needed
@@ -107,7 +107,7 @@ def package(interface: str) -> Iterator[Finding]:
 
 
 def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
-    """A bit rate that was asked for against the one of the dialect."""
+    """Compares the requested bit rate with the one of the dialect."""
     if bitrate_bps != dialect.bitrate_bps:
         yield _warning(
             "adapter",
@@ -121,7 +121,7 @@ def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
 
 
 def adapter(detected: DetectionResult) -> Iterator[Finding]:
-    """The adapters that python-can sees, and the back ends that gave no answer."""
+    """The adapters that python-can detects, and the back ends that did not answer."""
     for found in detected.found[:_SHOWN_AT_MOST]:
         details = " ".join(f"{key}={value}" for key, value in found.details.items())
         shown = printable(f"{found.interface} {found.channel} {details}".strip())
@@ -129,7 +129,7 @@ def adapter(detected: DetectionResult) -> Iterator[Finding]:
     if not detected.found:
         yield _note(
             "adapters",
-            "no adapter is detected; not every back end can tell (slcan and gs_usb cannot)",
+            "no adapter is detected; some back ends cannot list theirs (slcan and gs_usb)",
             ("flasher adapters",),
         )
     if detected.hung:
@@ -147,14 +147,14 @@ def opened(name: str, *, is_silent: bool) -> Finding:
 
 
 def opening(error: BusError) -> Finding:
-    """Why the adapter cannot be opened."""
+    """Explains why opening the adapter failed."""
     cause = f" ({printable(error.cause)})" if error.cause else ""
     what = f"{printable(error.what).rstrip('.')}{cause}"
     return _problem("adapter", what, (printable(error.remedy),))
 
 
 def unchosen(detected: DetectionResult) -> Finding:
-    """No adapter was named, on the command line or elsewhere: how to choose one."""
+    """Explains how to select an adapter when none is."""
     ways = [f"flasher doctor {printable(each.arguments)}" for each in detected.found]
     return _problem(
         "adapter",
@@ -165,28 +165,28 @@ def unchosen(detected: DetectionResult) -> Finding:
 
 
 def nameless() -> Finding:
-    """SocketCAN without a channel listens to all interfaces, and can send to none."""
+    """SocketCAN without a channel receives from all interfaces, but cannot send."""
     what = "no channel is named: without one, SocketCAN can send nothing"
     return _problem("interface", what, (_LIST_INTERFACES, _EXAMPLES[0]))
 
 
 def interface(seen: Interface | Unseen, channel: str, bitrate_bps: int) -> Iterator[Finding]:
-    """A SocketCAN interface against what flasher needs of it."""
+    """Checks a SocketCAN interface for the settings that flasher needs."""
     name = printable(channel)
     if seen is Unseen.CANNOT_TELL:
-        yield _note("interface", f"{name}: this system tells nothing about it")
+        yield _note("interface", f"{name}: this system gives no information about it")
     elif seen is Unseen.MISSING and not kernel_has_can():
         what = "this system's kernel has no CAN; an adapter that python-can drives itself (slcan, "
         yield _problem("interface", f"{what}gs_usb, pcan) works without", ("flasher adapters",))
     elif seen is Unseen.MISSING:
-        yield _problem("interface", f"there is no interface {name}", find_commands(name))
+        yield _problem("interface", f"no interface {name} exists", find_commands(name))
     elif isinstance(seen, Interface):
         yield from _kind(seen, name, bitrate_bps)
 
 
 def _kind(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
     if not seen.is_can:
-        yield _problem("interface", f"{name} is no CAN interface", (_LIST_INTERFACES,))
+        yield _problem("interface", f"{name} is not a CAN interface", (_LIST_INTERFACES,))
         return
     is_virtual = seen.kind in VIRTUAL_KINDS
     if not seen.is_up:
@@ -264,17 +264,17 @@ def health(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[
     elif health.state is ControllerState.PASSIVE:
         silent = not health.frames_received
         severity = Severity.PROBLEM if silent else Severity.WARNING
-        why = "nobody acknowledges it, or the bit rate is wrong" if silent else "the bus is bad"
+        why = "no device acknowledges, or the bit rate is wrong" if silent else "the bus is bad"
         yield Finding(severity, "bus", f"{what}: {why}", ("check power, wiring, termination",))
     else:
-        yield _note("bus", "this back end does not tell the controller's state")
+        yield _note("bus", "this back end does not report the controller's state")
 
 
 # -- traffic ---------------------------------------------------------------------------------------
 
 
-class Traffic:
-    """A tap that counts (see flasher.driver)."""
+class TrafficCounter:
+    """Tap that counts frames (see flasher.driver)."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -292,10 +292,10 @@ class Traffic:
 
 
 @dataclass(frozen=True)
-class Listened:
-    """What was heard, for how long, and how."""
+class ListenResult:
+    """Traffic received while listening, with duration and settings."""
 
-    traffic: Traffic
+    traffic: TrafficCounter
     survey: Survey
     health: LinkHealth
     duration_s: float
@@ -304,16 +304,16 @@ class Listened:
     is_silent: bool
     """True when the adapter acknowledged nothing (listen-only)."""
     bus_arguments: str
-    """What chooses this bus on the command line."""
+    """The options that select this bus."""
 
     @property
     def frames_per_s(self) -> float:
-        """Frames of the wire a second."""
+        """Rate of frames on the wire."""
         return self.traffic.frames / self.duration_s if self.duration_s else 0.0
 
     @property
     def load(self) -> float:
-        """Share of the bus's time that the frames took, 0 to 1."""
+        """Bus load, 0 to 1."""
         return self.traffic.bits / self.bitrate_bps / self.duration_s if self.duration_s else 0.0
 
     @property
@@ -322,11 +322,11 @@ class Listened:
         return self.survey.foreign_frames - self.traffic.error_frames
 
 
-def traffic(heard: Listened) -> Iterator[Finding]:
-    """How the bus sounds, and who is on it."""
+def traffic(heard: ListenResult) -> Iterator[Finding]:
+    """Judges the quality of the traffic, and lists the nodes."""
     traffic, unreadable = heard.traffic, heard.health.unreadable
     if unreadable:
-        what = f"{counted(unreadable, 'time')} the adapter delivered what is no frame, "
+        what = f"{counted(unreadable, 'time')} the adapter delivered unreadable frames, "
         yield Finding(
             Severity.WARNING if traffic.frames else Severity.PROBLEM,
             "adapter",
@@ -367,10 +367,10 @@ def _reported(health: LinkHealth) -> str:
     return f", the last: {health.last_trouble.words}" if health.last_trouble else ""
 
 
-def _only_errors(heard: Listened) -> Finding:
+def _only_errors(heard: ListenResult) -> Finding:
     causes = f"the bus runs at another bit rate than {heard.bitrate_bps / 1000:g} kbit/s, or "
     causes += (
-        "one device is alone there and nobody acknowledges it while flasher only listens"
+        "one device is alone there, without an acknowledgement while flasher only listens"
         if heard.is_silent
         else "CAN-H and CAN-L are swapped, or termination is missing"
     )
@@ -383,22 +383,22 @@ def _only_errors(heard: Listened) -> Finding:
     )
 
 
-def _silence(heard: Listened) -> Finding:
+def _silence(heard: ListenResult) -> Finding:
     return _warning(
         "traffic",
         f"the bus was silent for {heard.duration_s:g} s. In this order: the system is off or "
-        "asleep (press its key); a device that is alone speaks only when asked (flasher scan asks "
+        "asleep (press its key); a device that is alone sends only when asked (flasher scan asks "
         "it); wiring or connector; another bit rate",
         (f"flasher scan {heard.bus_arguments}".rstrip(),),
     )
 
 
-def _nodes(heard: Listened) -> Iterator[Finding]:
+def _nodes(heard: ListenResult) -> Iterator[Finding]:
     survey = heard.survey
     if Node.CDL in survey.heard:
         yield _problem(
             "traffic",
-            "another tool speaks as CDL on this bus: two at once spoil an upgrade",
+            "another tool sends as CDL on this bus: two tools at once disturb an upgrade",
             ("wait if it upgrades a device; else close the other tool, or disconnect it",),
         )
     if survey.duplicates.evidence:

@@ -1,4 +1,4 @@
-"""`flasher help`: what stands behind an error code, a code of the station, or a command."""
+"""`flasher help`: explain an error code, a code of the station, or a command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flasher.errors import ErrorCode, ExitCode, UsageError, did_you_mean
 
 _EXAMPLES: Final = """\
 examples:
-  flasher help E402         an error code, as it stands behind a message
+  flasher help E402         an error code, as it ends a message
   flasher help DUPLICATE    a code of the station
   flasher help codes        all codes
   flasher help flash        the same as flasher flash --help
@@ -28,17 +28,17 @@ _ALL: Final = "codes"
 
 @dataclass(frozen=True)
 class CodeDocument:
-    """What stands behind a code."""
+    """A code with its explanation."""
 
     code: str
     title: str
     text: str
-    """Paragraphs, an empty line between two; empty in the list of all."""
+    """Paragraphs, separated by empty lines; empty in the list of all codes."""
 
 
 @dataclass(frozen=True)
 class CodesDocument:
-    """The codes that were asked for."""
+    """The requested codes."""
 
     codes: list[CodeDocument]
 
@@ -47,7 +47,7 @@ DOCUMENTS: Final = (CodesDocument,)
 
 
 def error_codes() -> dict[str, CodeDocument]:
-    """What flasher/error_codes.md tells of each code."""
+    """The codes of flasher/error_codes.md with their explanations."""
     page = files("flasher").joinpath("error_codes.md").read_text(encoding="utf-8")
     return {
         code: CodeDocument(code, title, text.strip().replace("**", ""))
@@ -70,7 +70,7 @@ def _codes(ctx: click.Context) -> Iterable[str]:
 )  # fmt: skip
 @click.pass_context
 def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
-    """Tell what stands behind a code, or show the help of a command."""
+    """Explain a code, or show the help of a command."""
     from flasher.station.codes import CODES  # noqa: PLC0415  needed for its codes alone
 
     program = ctx.find_root()
@@ -104,7 +104,7 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
         if why is None:
             known = [*errors, *CODES, *program.command.entries]
             raise UsageError(
-                f"There is no code and no command {what!a:.40}.",
+                f"Unknown code or command: {what!a:.40}.",
                 remedy=f"{did_you_mean(word, known)}See all codes with `flasher help codes`.",
             )
         one = replace(refused, text=why[1])

@@ -20,15 +20,15 @@ examples:
   flasher info -t bms --mock
   flasher info -t bms -i socketcan -c can0
   flasher info -t bms -i socketcan -c can0 --json > record.json
-  flasher info -t wmc -i socketcan -c can0       it cannot be asked: shows what it sends
+  flasher info -t wmc -i socketcan -c can0       has no queries: shows what it sends
 
-What the device does not answer is shown as such: an older one does not know every question.
+Missing answers are shown as such: an older device does not know every question.
 """
 
 
 @dataclass(frozen=True)
 class InfoDocument:
-    """What a device tells about itself."""
+    """Identity, versions, state and history of a device."""
 
     target: str
     dialect: str
@@ -37,11 +37,11 @@ class InfoDocument:
     items: dict[str, dict[str, FieldValue] | None]
     """Each item with its fields; null for one that was not answered."""
     unanswered: dict[str, str]
-    """Why, for each of those."""
+    """The reason for each null item."""
     faults: FieldValue
     heard: HeardDocument | None
     two_devices: str | None = None
-    """What speaks for a second device, as an answer that came twice."""
+    """Evidence of a second device, such as an answer that came twice."""
 
 
 DOCUMENTS: Final = (InfoDocument,)
@@ -69,7 +69,7 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
 
 
 def silence(found: DeviceInfo) -> NoAnswerError:
-    """The error for a device that is not there."""
+    """The error for a device that did not answer."""
     node = found.target.node.name
     if found.readings:
         return NoAnswerError(
@@ -81,7 +81,7 @@ def silence(found: DeviceInfo) -> NoAnswerError:
     return NoAnswerError(
         f"The {node} sent nothing in {INFO_LISTEN_ONLY_S:g} s, and the documents give no"
         " question to ask it.",
-        cause="it is off, or it has nothing to say: it speaks by itself only now and then",
+        cause="it is off, or silent: it sends by itself only now and then",
         remedy="Try again while it is switched on; flasher scan shows who else is there.",
         code=ErrorCode.NOBODY_HEARD,
     )
@@ -108,14 +108,13 @@ def _lines(found: DeviceInfo) -> list[str]:
         lines += rows_lines([(reading.title, reading.why) for reading in missing])
     heard = found.survey.heard[found.target.node]
     if heard.boot_version:
-        lines += ["", f"its bootloader announced itself meanwhile: {heard.boot_version}"]
+        lines += ["", f"its bootloader sent announcements meanwhile: {heard.boot_version}"]
     if heard.damaged:
-        lines += ["", f"bytes from it that made no message: {heard.damaged} times"]
+        lines += ["", f"bytes from it outside any message: {heard.damaged} times"]
     return lines
 
 
 def info_document(found: DeviceInfo) -> InfoDocument:
-    """What it told, as JSON."""
     faults = found.survey.faults
     heard = found.survey.heard.get(found.target.node)
     return InfoDocument(

@@ -1,4 +1,4 @@
-"""Memory of a device: read with a bar, and as a file holds it."""
+"""Reads memory with a progress bar, and converts it to Intel HEX."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MEMORY = "memory"
 
 
 def read_shown(device: Device, start: int, end: int, output: Output, record: Recording) -> bytes:
-    """Read memory while a bar shows how far it is. Raises as `Device.read_memory`."""
+    """Read memory with a progress bar. Raises as `Device.read_memory`."""
     done = 0
 
     def show(event: object) -> None:
@@ -37,7 +37,6 @@ def read_shown(device: Device, start: int, end: int, output: Output, record: Rec
 
 
 def intel_hex(start: int, data: bytes) -> bytes:
-    """The bytes from address `start` on as Intel HEX."""
     from intelhex import IntelHex  # noqa: PLC0415  only where it is asked for
 
     image = IntelHex()

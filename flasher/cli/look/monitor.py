@@ -1,4 +1,4 @@
-"""`flasher monitor`: what is said on the bus, live or out of a recorded trace."""
+"""`flasher monitor`: show decoded traffic, live or from a recorded trace."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 from flasher.cli import values
 from flasher.cli.adapters import choose_adapter
 from flasher.cli.framework import argument, command, option
-from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, TableView, View
+from flasher.cli.look.monitor_views import FrameLine, LineView, MonitorView, SeenLine, TableView
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
@@ -34,18 +34,18 @@ examples:
   flasher monitor upgrade.asc                            a recorded trace
   flasher monitor upgrade.blf --json | jq .message
 
-Nothing is sent. On a terminal it is a table of the latest of each message, elsewhere one line a
-message; `*` marks what changed since the same message before. Ctrl-C ends it with exit code 0.
+Nothing is sent. A terminal shows a table of the latest of each message, other outputs one line
+per message; `*` marks values that changed since the previous one. Ctrl-C ends it with exit code 0.
 """
 
 
 @dataclass(frozen=True)
 class MonitorDocument:
-    """How much was seen."""
+    """Counts of frames and messages."""
 
     frames: int
     messages: int
-    """Shown, after the filters."""
+    """Shown, after filtering."""
     troubles: int
 
 
@@ -71,17 +71,17 @@ LINES: Final = (SeenLine, FrameLine)
 )  # fmt: skip
 @option(
     "--errors", is_flag=True, panel="what to show (default: everything)",
-    help="only trouble: damaged, malformed and unknown messages, error frames, NAK, faults",
+    help="only faults: damaged, malformed and unknown messages, error frames, NAK, faults",
 )  # fmt: skip
 @option(
     "--lines", is_flag=True, panel="how to show it", brief=True,
-    help="one line a message, on a terminal too",
+    help="one line per message, even on a terminal",
 )  # fmt: skip
 @option(
     "--table", is_flag=True, panel="how to show it",
-    help="a table, elsewhere than on a terminal too: at the end",
+    help="a table at the end, where the output is not a terminal",
 )  # fmt: skip
-@option("--raw", is_flag=True, panel="how to show it", help="also every frame as it came (lines)")
+@option("--raw", is_flag=True, panel="how to show it", help="also every received frame (as lines)")
 @option(
     "--count", type=values.count, metavar="N", panel="how to show it", help="end after N messages"
 )  # fmt: skip
@@ -118,7 +118,7 @@ def monitor(
     terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     is_live = terminal and trace is None
     wants_table = (table or is_live) and not (lines or raw or output.json_wanted)
-    view: View = TableView(output, live=is_live) if wants_table else Lines(output)
+    view: MonitorView = TableView(output, live=is_live) if wants_table else LineView(output)
     watcher = Watcher(
         Filter(frozenset(nodes), messages, errors),
         raw=raw,
@@ -153,7 +153,7 @@ def monitor(
 
 
 def check_messages(wanted: Iterable[str]) -> None:
-    """Raises UsageError for words that are in no title."""
+    """Raises UsageError for words that no message title contains."""
     titles = message_titles() + tuple(map(wording, Kind))
     for words in wanted:
         if not any(words.lower() in title.lower() for title in titles):

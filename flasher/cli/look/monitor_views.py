@@ -1,8 +1,8 @@
-"""How `flasher monitor` shows what a watcher sees: line by line, as JSON lines, or in a table with
-the latest of every message, refreshed in place on a terminal.
+"""Views of `flasher monitor`: lines, JSON lines, or a table of the latest of every message,
+refreshed in place on a terminal.
 
-Column widths follow from the terminal's width alone, so nothing moves while values change. What the
-bus says enters the table as `Text`, which is never read as markup.
+Column widths follow from the terminal's width alone, so nothing moves while values change. Text
+from the bus enters the table as `Text`, which is never parsed as markup.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from flasher.trace.watcher import Board, MessageHistory, Pulse, RawFrame
 _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
 WIDE: Final = 116
-"""Terminals with fewer columns get a table without who, to whom, and the count."""
+"""Below this width the table omits sender, receiver and count."""
 _CHANGED: Final = "bold yellow"
 _TROUBLE: Final = "red"
 _VALUE_MAX: Final = 160
 _FRAME_LINES: Final = 7
-"""Lines around the rows: title, head, rule, two margins, what is left out, and the cursor."""
+"""Lines around the rows: title, head, rule, two margins, the omitted count, and the cursor."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class SeenLine:
 
 @dataclass(frozen=True)
 class FrameLine:
-    """A CAN frame as it came (--raw)."""
+    """A CAN frame as received (--raw)."""
 
     at_s: float
     kind: Literal["frame"]
@@ -73,11 +73,11 @@ class FrameLine:
     event: Literal["Frame"] = "Frame"
 
 
-class View:
-    """Takes the watcher's events; times are counted from the first of them."""
+class MonitorView:
+    """Shows a watcher's events; times count from the first event."""
 
     is_live = False
-    """True when it wants to be refreshed from time to time."""
+    """True for a view that needs `refresh` at intervals."""
 
     def __init__(self, output: Output) -> None:
         self.output = output
@@ -91,7 +91,7 @@ class View:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Nothing is held."""
+        """Releases nothing here."""
 
     def __call__(self, event: object) -> None:
         """Show one event."""
@@ -112,20 +112,20 @@ class View:
         return at - self._origin
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
-        """A message, a damage, a foreign frame."""
+        """Show a message, a damage or a foreign frame."""
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
-        """A frame, where frames are wanted."""
+        """Show a frame, if raw frames are shown."""
 
     def refresh(self, now: float) -> None:
-        """The time to refresh has come."""
+        """Refresh the display, called at intervals."""
 
 
-class Lines(View):
-    """One line, or one JSON document, for each."""
+class LineView(MonitorView):
+    """One line, or one JSON document, per event."""
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
-        # No fault is left out.
+        # Faults are never cut.
         width = None if seen.is_alarm or self.output.verbosity >= 1 else _VALUE_WIDTH
         said = ", ".join(
             shown.words(width, "*" if shown.name in changed else "") for shown in seen.fields
@@ -170,14 +170,14 @@ class Lines(View):
 # -- the table ------------------------------------------------------------------------------------
 
 
-class TableView(View):
-    """The board: refreshed in place, or printed once at the end."""
+class TableView(MonitorView):
+    """The table: refreshed in place, or printed once at the end."""
 
     def __init__(self, output: Output, *, live: bool) -> None:
         super().__init__(output)
         self.is_live = live
         self._console = Console(markup=False, highlight=False, emoji=False)
-        # No thread refreshes: the watcher's pulse does, between two frames. On a screen of its own
+        # The watcher refreshes between two frames, without a thread. On a separate screen
         # lines are written over each other, without erasing them first: nothing flickers.
         self._live = Live(console=self._console, screen=True, auto_refresh=False) if live else None
         self._view = BoardView(self._console)
@@ -209,17 +209,16 @@ class TableView(View):
 
 
 class BoardView:
-    """Draws a board as it fits the console: a row a field, or a row a message where that is too
-    long, and then as many as there is room for.
+    """Draws the board to fit the console: one row per field, or one row per message where that is
+    too long, limited to the height.
     """
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._too_long_for: ConsoleDimensions | None = None
-        """The size that a row a field was too long for: no going back and forth."""
+        """Size at which one row per field was too long: keeps the layout from alternating."""
 
     def draw(self, board: Board, now: float, title: str) -> RenderableType:
-        """The board at `now`."""
         size = self._console.size
         lines = list(board.lines())
         faults = _fault_lines(lines, size.width, size.height - _FRAME_LINES - 1)
@@ -239,14 +238,14 @@ class BoardView:
         self._too_long_for = size
         view = _by_message(lines[:room], now, title, wide=wide)
         if len(lines) > room:
-            more = f"{len(lines) - room} more: make the window higher, or use --node or --message"
+            more = f"{len(lines) - room} more: enlarge the window, or use --node or --message"
             view.caption = Text(more, style="dim", no_wrap=True, overflow="ellipsis")
         return view
 
 
 def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str]:
-    """All faults that are set, over the whole width, since the columns of a table cut them. Those
-    that have no room are counted.
+    """All active faults over the whole width, since the columns of a table cut them. Faults without
+    room are counted.
     """
     wrapped = [
         part
@@ -260,7 +259,7 @@ def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str
     shown_lines = wrapped[: max(room - 1, 0)]
     left = " ".join(wrapped[len(shown_lines) :]).count(",") + 1
     more = "more " if shown_lines else ""
-    return [*shown_lines, f"{left} {more}FAULTS: make the window higher"[:width]]
+    return [*shown_lines, f"{left} {more}FAULTS: enlarge the window"[:width]]
 
 
 def _by_field(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
@@ -291,7 +290,7 @@ def _by_message(lines: list[MessageHistory], now: float, title: str, *, wide: bo
         for shown in line.seen.fields:
             mark, style = ("*", _CHANGED) if shown.name in changed else ("", "")
             words.append(Text(shown.words(mark=mark), style=style))
-        if not line.seen.in_dialect:  # first: what stands behind may be cut
+        if not line.seen.in_dialect:  # first: text after it may be cut
             words.insert(0, Text(NOT_IN_DIALECT))
         fields = Text(", ").join(words)
         table.add_row(*_head(line, wide=wide), fields, *_tail(line, now, wide=wide))
@@ -353,9 +352,9 @@ def _tail(line: MessageHistory, now: float, *, wide: bool) -> list[Text]:
 
 
 def _cells(shown: Field, changed: set[str]) -> list[Text]:
-    """Label, value and unit; a change is told by a mark too, for screens without colours."""
+    """Label, value and unit; a mark also shows a change, for screens without colours."""
     text = shown.text
-    if len(text) > _VALUE_MAX:  # it folds: not over half the screen
+    if len(text) > _VALUE_MAX:  # it wraps: limited to half the screen
         text = f"{text[:_VALUE_MAX].rstrip()} ..."
     if shown.name not in changed:
         return [Text(shown.label), Text(text), Text(shown.unit)]

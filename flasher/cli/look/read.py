@@ -35,8 +35,8 @@ examples:
   flasher read serial-number -t bms --mock
   flasher read memory 0x8004000 0x8014000 -t bms -o application.hex -i socketcan -c can0
 
-END of a memory range is exclusive. The format of FILE goes by its suffix (.hex is Intel HEX, all
-else raw binary) or --format. FILE is written whole or not at all.
+END of a memory range is exclusive. The format of FILE follows from its suffix (.hex is Intel HEX,
+any other raw binary) or --format. FILE is written whole or not at all.
 """
 
 
@@ -48,7 +48,7 @@ class ItemDocument:
     item: str
     fields: dict[str, FieldValue]
     two_devices: str | None = None
-    """What speaks for a second device, as an answer that came twice."""
+    """Evidence of a second device, such as an answer that came twice."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ DOCUMENTS: Final = (ItemDocument, MemoryDocument, ReadableDocument)
 
 
 def _items(ctx: click.Context) -> list[str]:
-    """What a shell offers: what can be read of the target, where it is given."""
+    """Completes the items that can be read, of the target if it is given."""
     dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
     return [*readable(ctx.params.get("target") or BMS, dialect), MEMORY]
 
@@ -86,7 +86,7 @@ def _items(ctx: click.Context) -> list[str]:
     help="what to read; see --list",
 )  # fmt: skip
 @argument("start", required=False, help="for memory: the first address")
-@argument("end", required=False, help="for memory: the address behind the last")
+@argument("end", required=False, help="for memory: the address after the last")
 @target_option(required=False)
 @option("--list", "is_list", is_flag=True, panel="read", brief=True, help="list the items and stop")
 @option(
@@ -116,7 +116,7 @@ def read(
     if is_list:
         return _list(target, bus.dialect, output)
     if item is None:
-        raise UsageError("Nothing to read was named.", remedy="See flasher read --list.")
+        raise UsageError("Name an item to read.", remedy="See flasher read --list.")
     if item.lower() != MEMORY:
         if start or file or format:
             raise UsageError(
@@ -192,7 +192,7 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
         rows = [(name, ", ".join(labels.values())) for name, labels in items.items()]
         output.table([*rows, (MEMORY, "START END [-o FILE]")])
     else:
-        output.result(f"The documents give the tool nothing to read from the {target.node.name}.")
+        output.result(f"The documents give no readable item of the {target.node.name}.")
     return output.document(
         ReadableDocument(items={name: list(labels) for name, labels in items.items()})
     )

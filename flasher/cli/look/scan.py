@@ -1,4 +1,4 @@
-"""`flasher scan`: who is on the bus."""
+"""`flasher scan`: list the devices on the bus."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ examples:
   flasher scan -i socketcan -c can0
   flasher scan --dialect motinova -i pcan -c PCAN_USBBUS1      listens at 125 kbit/s
 
-Listens for a second, then asks the BMS, the only device that the documents let us ask. Who is not
-listed may still be there: most devices speak only now and then.
+Listens for a second, then asks the BMS, the only device with queries in the documents. A device
+that is not listed may still be there: most send only now and then.
 """
 
 
 @dataclass(frozen=True)
 class ScanDocument:
-    """Who is on the bus."""
+    """The devices on the bus."""
 
     bitrate_bps: int
     bitrate_source: str
-    """Where it comes from."""
+    """Source of the dialect."""
     bitrate_is_assumed: Literal[True]
-    """Frames do not tell it."""
+    """Not visible in frames."""
     dialect: str | None
     dialect_because: str
     nodes: dict[str, HeardDocument]
     foreign_frames: int
-    """Under ids of no node of the documents."""
+    """Frames with ids of no documented node."""
     two_devices: str | None = None
-    """What speaks for a second device of one kind, as an answer that came twice."""
+    """Evidence of a second device of one kind, such as an answer that came twice."""
 
 
 DOCUMENTS: Final = (ScanDocument,)
@@ -57,8 +57,8 @@ DOCUMENTS: Final = (ScanDocument,)
 @bus_options()
 @recording_options
 def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOptions) -> int:
-    """Find out who is on the bus, and which dialect is spoken. Sends one round of queries to the
-    battery, and nothing else: no bit rate is tried, since a wrong one disturbs a live bus.
+    """List the devices on the bus, and identify its dialect. Sends one round of queries to the
+    battery, and nothing else: other bit rates are not tried, since a wrong one disturbs a live bus.
     """
     bus = choose_adapter(bus, output)
     dialect, rate = bus.dialect, bus.bit_rate
@@ -91,7 +91,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
 
 
 def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str]:
-    """The dialect that is spoken and why, from the traffic or else the bit rate in use."""
+    """The dialect and its evidence: the traffic, or else the bit rate in use."""
     guessed, why = survey.guess_dialect()
     if guessed is not None:
         return guessed, why

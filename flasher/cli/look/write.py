@@ -37,7 +37,7 @@ code 10 when the write is not confirmed or reads back differently, 5 when the de
 
 @dataclass(frozen=True)
 class WrittenDocument:
-    """How a write ended."""
+    """Result of a write."""
 
     target: str
     item: str
@@ -48,14 +48,14 @@ class WrittenDocument:
 
 @dataclass(frozen=True)
 class NotWrittenDocument:
-    """The write was not agreed to."""
+    """The user declined the write."""
 
     written: Literal[False]
 
 
 @dataclass(frozen=True)
 class WritableItem:
-    """What an item is made of."""
+    """Fields of an item that can be written."""
 
     fields: list[str]
     manufacturer_only: bool
@@ -72,7 +72,7 @@ DOCUMENTS: Final = (WrittenDocument, NotWrittenDocument, WritableDocument)
 
 
 def _items(ctx: click.Context) -> list[str]:
-    """What a shell offers: what can be written to the target, where it is given."""
+    """Completes the items that can be written, of the target if it is given."""
     dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
     return list(writable(ctx.params.get("target") or BMS, dialect))
 
@@ -96,7 +96,7 @@ def _items(ctx: click.Context) -> list[str]:
 @option("-y", "--yes", is_flag=True, panel="write", brief=True, help="do not ask")
 @option(
     "--manufacturer", is_flag=True, panel="write",
-    help="write what the document reserves for the manufacturer",
+    help="write items that the document reserves for the manufacturer",
 )  # fmt: skip
 @bus_options()
 @recording_options
@@ -119,7 +119,7 @@ def write(
     if is_list:
         return _list(target, bus.dialect, output)
     if item is None:
-        raise UsageError("Nothing to write was named.", remedy="See flasher write --list.")
+        raise UsageError("Name an item to write.", remedy="See flasher write --list.")
     plan = plan_write(item, list(value), target, dialect=bus.dialect, manufacturer=manufacturer)
     if not yes and not can_ask():
         raise UsageError(
@@ -183,7 +183,7 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
         for name, entry in items.items()
     )
     if not items:
-        output.result(f"The documents give the tool nothing to write to the {target.node.name}.")
+        output.result(f"The documents give no writable item of the {target.node.name}.")
     document = {
         name: WritableItem(
             fields=[field for field, _ in entry.fields],

@@ -207,7 +207,7 @@ def link_lines(report: LinkReport) -> list[str]:
 def unreadable_line(count: int) -> str:
     """An adapter that damages what it delivers does not stop an upgrade, and slows it down."""
     times = "once" if count == 1 else f"{count:,} times"
-    return f"{times} the adapter delivered what is no frame; try another cable, port or adapter"
+    return f"{times} the adapter delivered unreadable frames; try another cable, port or adapter"
 
 
 def _running(result: Result) -> str:
