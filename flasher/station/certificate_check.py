@@ -61,7 +61,7 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
             text("The certificate was changed: what it carries is no run."),
-            remedy=text("Ask for the certificate anew."),
+            remedy=text("Request the certificate again."),
         ) from error
     if is_pdf:
         where = _difference_of_print(page, pages)

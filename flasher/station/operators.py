@@ -175,7 +175,7 @@ class Crew:
         """Raises Refused before the first badge."""
         if self.has_badges and self.person is None:
             raise Refused(
-                "NOBODY", text("Nobody has scanned a badge yet."), text("Scan your badge first.")
+                "NOBODY", text("No badge has been scanned yet."), text("Scan your badge first.")
             )
 
     def check_role(self, word: Word) -> Person | None:

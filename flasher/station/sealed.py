@@ -173,5 +173,5 @@ def sealed_in(document: str) -> Sealed:
     except (binascii.Error, zlib.error, ValueError, ValidationError, RecursionError) as error:
         raise UnprovenError(
             text("The certificate was changed: what it carries cannot be read."),
-            remedy=text("Ask for the certificate anew."),
+            remedy=text("Request the certificate again."),
         ) from error

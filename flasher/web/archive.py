@@ -1,6 +1,6 @@
-"""The archive pages: history of this computer, bundles, backups and the stories of traces.
+"""Archive pages: history of this computer, bundles, backups and the stories of traces.
 
-Processes of their own answer them (`flasher.web.query_processes`), so that no upgrade waits.
+Separate processes answer them (`flasher.web.query_processes`), so that no upgrade waits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flasher.web.query_processes import HTML, Answer, Question
 from flasher.web.translation import translator
 
 SHOWN_MAX: Final = 50
-"""Of flashes, and of files of one kind."""
+"""Limit for flashes, and for files of one kind."""
 _ZIP: Final = "application/zip"
 
 
@@ -38,13 +38,13 @@ class ArchivedFile(NamedTuple):
     at: datetime
     size_bytes: int
     what: str = ""
-    """Why a bundle was left."""
+    """Why a bundle was written."""
 
 
 @dataclass(frozen=True)
 class Archive:
-    """Answers the questions of the pages. `bundles`, `backups` and `traces` are folders; the last
-    one has what was dropped on the page.
+    """Answers queries of the pages. `bundles`, `backups` and `traces` are folders; the last one has
+    files dropped on the page.
     """
 
     bundles: Path
@@ -56,7 +56,7 @@ class Archive:
         return Pages()
 
     def answer(self, question: Question) -> Answer:
-        """The page or the file of a question; a page with what is wrong where there is none."""
+        """The page or file; an error page if there is none."""
         try:
             return PAGES[question.path](self, question)
         except FlasherError as error:
@@ -102,7 +102,7 @@ class Archive:
         )
 
     def story(self, question: Question) -> Answer:
-        """The story of a bundle, or of a trace that was dropped."""
+        """The story of a bundle, or of a dropped trace."""
         if "bundle" in question.fields:
             path = self._bundle(question.fields["bundle"])
         else:
@@ -134,7 +134,7 @@ class Archive:
         return _known({each.name: each for each in bundles(self.bundles)}, name)
 
     def _backups(self) -> list[Path]:
-        """The latest last."""
+        """Backups, the latest last."""
         found = [each for each in _files(self.backups) if each.suffix == ".zip"]
         return sorted(found, key=lambda each: each.stat().st_mtime_ns)
 
@@ -145,7 +145,7 @@ PAGES: Final[Mapping[str, Callable[[Archive, Question], Answer]]] = {
     "/kept/bundle": Archive.bundle,
     "/kept/backup": Archive.backup,
 }
-"""The paths of the pages, and who answers."""
+"""Routes of the pages, with their methods."""
 
 
 def _files(folder: Path) -> list[Path]:
@@ -168,7 +168,7 @@ def _bundle(path: Path) -> ArchivedFile:
 
 
 def _known(found: Mapping[str, Path], name: str) -> Path:
-    """Raises UsageError for a name that is not there: nothing else is read."""
+    """Raises UsageError for an unlisted name: nothing else is read."""
     path = found.get(name)
     if path is None:
         raise UsageError(

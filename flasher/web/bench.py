@@ -1,7 +1,7 @@
-"""The bench: one person upgrades one bike step by step, and one thing happens at a time.
+"""The bench: one user upgrades one bike step by step, one activity at a time.
 
-Pages give it orders; its whole state goes into a feed that every page follows, so that a page may
-be closed and opened again. `BenchBackend` works with the devices.
+Pages send orders; the whole state goes into a feed that every page follows, so that a page may be
+closed and opened again. `BenchBackend` works with the devices.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from flasher.web.bench_state import (
     Activity,
     Adapter,
     BenchState,
+    BusWatch,
     Done,
     Offer,
     Saved,
     SeenMessage,
-    Watched,
 )
 from flasher.web.feed import Feed
 
 TURN_S: Final = 0.2
-"""How often an idle bench shows that it is at work."""
+"""How often an idle bench reports that it runs."""
 SILENCE_LIMIT_S: Final = 5.0
-"""Opening an adapter may take seconds, in which nothing can be told."""
+"""Opening an adapter may take seconds without any report."""
 NOTES_KEPT: Final = 12
 WATCH_TURN_S: Final = 0.5
-"""Time between two looks at what is said on the bus: slow enough to read."""
+"""Refresh period of the bus view: slow enough to read."""
 SUBJECT: Final = "bench"
 _AGAIN: Final = text("Begin again with the adapter.")
 _RESCUE: Final = text("Then rescue this device.")
 T = TypeVar("T")
 Order = Callable[["Bench"], object]
-"""A step for the bench to carry out in its own thread."""
+"""A step for the bench's own thread."""
 _LOG: Final = logging.getLogger("flasher.web")
 
 
@@ -69,17 +69,17 @@ _LOG: Final = logging.getLogger("flasher.web")
 
 @dataclass
 class UpgradeEnding:
-    """The end of an upgrade: its result or error."""
+    """Result or error of an upgrade."""
 
     result: Result | None
     error: FlasherError | None
     bundle: Path | None
     warning: str = ""
-    """Why the history has nothing of it; empty where it has."""
+    """Why it is missing in the history; empty if it is there."""
 
 
 class BenchBackend(Protocol):
-    """What the bench works with. Methods raise FlasherError."""
+    """Interface to the devices. Methods raise FlasherError."""
 
     dialect: Dialect
 
@@ -92,10 +92,10 @@ class BenchBackend(Protocol):
     def dropped(self) -> Sequence[str]: ...
     def use_folder(self, path: str) -> None: ...
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
-        """Open it. With `asks` False nothing will be sent."""
+        """Open an adapter. With `asks` False nothing will be sent."""
 
     def model_area(self) -> Area | None:
-        """The memory of a device model; None of devices."""
+        """Memory area of a device model; None for real devices."""
 
     def back_up(
         self,
@@ -105,7 +105,7 @@ class BenchBackend(Protocol):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> Saved:
-        """Save what the battery tells, and the memory of an area, to a file of its own."""
+        """Save the battery's answers, and the memory of an area, to a new file."""
 
     def upgrade(
         self,
@@ -115,11 +115,11 @@ class BenchBackend(Protocol):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> UpgradeEnding:
-        """Carry out an upgrade, to its end, and keep what is to be kept of it."""
+        """Run an upgrade to its end, and store its records."""
 
 
 class Bench:
-    """`now` is a monotonic clock, and `date` the time of day."""
+    """`now` is a monotonic clock, `date` the time of day."""
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class Bench:
         self._date = date
         self._lock = threading.Lock()
         self._is_taken = False
-        """An order was given and is not carried out yet."""
+        """An order is pending or being carried out."""
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
         self._has_new_files = threading.Event()
@@ -144,7 +144,7 @@ class Bench:
     # -- any thread --------------------------------------------------------------------------------
 
     def order(self, order: Order) -> bool:
-        """Give it something to do; False while it does something else."""
+        """Submit an order; False while another one is running."""
         with self._lock:
             if self._is_taken:
                 return False
@@ -154,16 +154,16 @@ class Bench:
         return True
 
     def files_came(self) -> None:
-        """Something was dropped: look at it when there is time."""
+        """Files were dropped: look at them when idle."""
         self._has_new_files.set()
 
     def stop(self) -> None:
-        """End what it does, at the next message boundary."""
+        """End the current activity at the next message boundary."""
         self._stop.set()
 
     def close(self, *, ends_upgrade: bool = True) -> None:
-        """The program ends: nothing more is begun, and what is under way ends as by `stop`, but for
-        an upgrade that is to come to its own end.
+        """The program ends: start nothing more, and stop the current activity, except an upgrade
+        that is to finish.
         """
         self._is_closing = True
         if ends_upgrade or self.state.doing is not Activity.UPGRADING:
@@ -172,7 +172,7 @@ class Bench:
     # -- its own thread ----------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Carry out orders until it is closed."""
+        """Carry out orders until closed."""
         while not self._is_closing:
             self.feed.beat()
             try:
@@ -184,7 +184,7 @@ class Bench:
             self.write_planned(order)
 
     def write_planned(self, order: Order) -> None:
-        """Do it, and show how it goes."""
+        """Carry out a write, and show its progress."""
         self._set(trouble=None)
         try:
             order(self)
@@ -209,7 +209,7 @@ class Bench:
         self.feed.beat()
 
     def _cancelled(self) -> bool:
-        """Asked all the time by what takes long."""
+        """Polled by everything that takes long."""
         self.feed.beat()
         left_s = self.state.power_cycle_left_s
         if left_s(self._now()) != left_s(self.state.now_s):
@@ -219,10 +219,10 @@ class Bench:
             self._set(is_stopping=True)
         return is_asked
 
-    # -- the steps: orders to be carried out -------------------------------------------------------
+    # -- the steps: orders -------------------------------------------------------------------------
 
     def start_over(self, *, is_rescue: bool = False) -> None:
-        """Begin with the next bike, or with the rescue of one."""
+        """Reset for the next bike, or for a rescue."""
         self.state = BenchState(
             adapters=self.state.adapters,
             was_looked_for=True,
@@ -236,7 +236,7 @@ class Bench:
         self._set(adapters=tuple(self._place.adapters(self._cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
-        """Use this one, and look who answers on it."""
+        """Open this adapter and look for devices."""
         adapter = _known({each.name: each for each in self.state.adapters}, name)
         self._place.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
@@ -249,7 +249,7 @@ class Bench:
             self.look()
 
     def look(self) -> None:
-        """Ask the battery, and listen to the others: the documents give no question for them."""
+        """Query the battery, and listen to the others, which the documents give no query for."""
         self._set(doing=Activity.LOOKING, bike=None, done=None)
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
@@ -262,7 +262,7 @@ class Bench:
             return device.identify(cancelled=self._cancelled)
 
     def choose_target(self, name: str) -> None:
-        """Upgrade this device, and look which images fit; "" is none."""
+        """Select the device to upgrade, and check which images fit; "" is none."""
         if not name:
             self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
             return
@@ -270,7 +270,7 @@ class Bench:
         self.judge()
 
     def choose_image(self, name: str) -> None:
-        """Take this image; "" is none."""
+        """Select this image; "" is none."""
         if not name:
             self._set(done=None)
             self.judge()
@@ -283,7 +283,7 @@ class Bench:
         self.judge()
 
     def judge(self) -> None:
-        """Look which images fit."""
+        """Check which images fit."""
         self._set(doing=Activity.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
@@ -295,16 +295,14 @@ class Bench:
         self._set(offers=tuple(offers))
 
     def take_files(self) -> None:
-        """Look at files that were dropped on the page."""
+        """Check files dropped on the page."""
         self._has_new_files.clear()
         self._set(dropped=tuple(self._place.dropped()))
         if self.state.target is not None and self.state.offer is None:
             self.judge()
 
     def waive(self, name: str, waiver: str) -> None:
-        """Take this image all the same, although this check has refused it: only one that has
-        refused this very image can be waived.
-        """
+        """Accept the image despite this check, which must be the one that refused it."""
         done = self.state.done
         refused = {each.name: each.refusal for each in self.state.offers if each.refusal}
         if done is not None and done.error is not None:
@@ -320,7 +318,7 @@ class Bench:
         self._set(offer=next(fitting, None))
 
     def watch(self) -> None:
-        """Show what is said on the bus until it is stopped. Nothing is sent."""
+        """Show the traffic of the bus until stopped. Sends nothing."""
         board = Board()
         since_s = self._now()
         messages = troubles = 0
@@ -339,9 +337,9 @@ class Bench:
                     )
                     for line in board.lines()
                 )
-                self._set(watched=Watched(self._now() - since_s, messages, troubles, rows))
+                self._set(watched=BusWatch(self._now() - since_s, messages, troubles, rows))
 
-        self._set(doing=Activity.WATCHING, watched=Watched(0.0, 0, 0, ()))
+        self._set(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
         watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._place.dialect)
         with self._place.connect(self._adapter(), asks=False) as connection:
             drive(
@@ -350,8 +348,8 @@ class Bench:
             )  # fmt: skip
 
     def find_areas(self) -> None:
-        """Look which memory a backup may hold: nothing is guessed, since an address that does not
-        exist may crash a device. Images that cannot be for it do not count.
+        """Find memory areas for a backup, only from images that fit: reading an address that does
+        not exist may crash a device.
         """
         self._adapter()
         self._set(doing=Activity.JUDGING, areas=None)
@@ -367,7 +365,7 @@ class Bench:
         self._set(areas=None)
 
     def back_up(self, source: str) -> None:
-        """Save what the battery tells, and the memory of the area with this source; "" is none."""
+        """Save the battery's answers, and the memory of the area with this source; "" is none."""
         areas = {area.source: area for area in self.state.areas or ()}
         area = _known(areas, source) if source else None
 
@@ -418,14 +416,14 @@ class Bench:
         ).checked()
 
     def _check_sample(self, image: Image) -> None:
-        """Raises ImageError for a firmware sample on a real bus; the upgrade looks again."""
+        """Raises ImageError for a firmware sample on a real bus; the upgrade checks again."""
         adapter = self._adapter()
         if is_sample(image) and self._place.is_physical(adapter):
             raise sample_error(image, adapter.name)
 
     def _check_device(self, job: Job) -> None:
-        """Raises WrongDeviceError for an image that does not belong into the device that answered;
-        the upgrade asks it again.
+        """Raises WrongDeviceError for an image of another device than the one that answered; the
+        upgrade queries it again.
         """
         bike = self.state.bike
         if bike is None or self.state.is_rescue or job.plan.target is not bike.target:
@@ -439,8 +437,8 @@ class Bench:
                 raise error
 
     def upgrade(self, target: str, sha256: str) -> None:
-        """Upgrade, with the image of this digest: what was chosen where the button was pressed.
-        Raises UsageError when a page that was not up to date has ordered it.
+        """Upgrade with the image of this digest, as chosen when the button was pressed. Raises
+        UsageError for an order from an outdated page.
         """
         chosen, offer = self.state.target, self.state.offer
         if chosen is None or offer is None or (chosen.name, offer.sha256) != (target, sha256):
@@ -478,7 +476,7 @@ class Bench:
             self._set(done=replace(done, after=self._seen(adapter, done.target)))
 
     def _happened(self, event: object) -> None:
-        """In the middle of an upgrade."""
+        """Handle an event during an upgrade."""
         changes: dict[str, object] = {}
         match event:
             case events.PacketAcknowledged(number, _, _):
@@ -506,7 +504,7 @@ class Bench:
             self._set(**changes)
 
     def rescue_it(self) -> None:
-        """The same device, and the same image where the device has not refused it."""
+        """Select the same device, and the same image unless the device refused it."""
         done = self.state.done
         if done is None:
             raise UsageError("No upgrade has failed.", remedy="Begin with the adapter.")
@@ -523,14 +521,14 @@ class Bench:
 
 
 def _note_of(event: object) -> str:
-    """What is told of an event; checks have a place of their own."""
+    """The note for an event; checks are shown elsewhere."""
     line = progress_line(event)
     said = warning_text(event) or (line[0] if line and line[1] < 2 else "")
     return "" if isinstance(event, events.CheckMade) else said
 
 
 def _known(things: Mapping[str, T], name: str) -> T:
-    """Raises UsageError for what is not there any more."""
+    """Raises UsageError for an entry that no longer exists."""
     found = things.get(name)
     if found is None:
         raise UsageError(f"{printable(name)} is not there any more.", remedy="Look again.")

@@ -1,4 +1,4 @@
-"""The bench page: the bench's state as pieces of a page, and orders from its forms."""
+"""Bench page: the bench's state as page parts, and orders from its forms."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from flasher.web.pages import Pages, streamed
 from flasher.web.translation import Translator
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
-"""In bytes: the largest image as Intel HEX has less."""
+"""In bytes: more than the largest image as Intel HEX."""
 UPLOAD: Final = "/bench/upload"
 _FILES_MAX: Final = 200
-"""Files of a folder that are looked at."""
+"""Files of a folder that are checked."""
 _MANIFEST: Final = ".toml"
 
 
@@ -54,11 +54,11 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "rescue": (partial(Bench.start_over, is_rescue=True), ()),
     "rescue-it": (Bench.rescue_it, ()),
 }
-"""What a form may order, by the word that it sends, and what it says with it."""
+"""Orders of a form by its command, with their arguments."""
 
 
 class Shelf:
-    """Where images come from: a folder, and one for what is dropped on the page."""
+    """Sources of images: a folder, and one for files dropped on the page."""
 
     def __init__(
         self, folder: Path, dropped: Path, suffixes: Sequence[str], traces: Sequence[str]
@@ -71,7 +71,7 @@ class Shelf:
         self._trace_suffixes = tuple(f".{suffix}" for suffix in traces)
 
     def use(self, folder: str) -> None:
-        """Take images from this folder. Raises UsageError where it is none."""
+        """Take images from this folder. Raises UsageError if it does not exist."""
         path = Path(folder).expanduser()
         if not folder or not path.is_dir():
             raise UsageError(
@@ -81,7 +81,7 @@ class Shelf:
         self.folder = path.resolve()
 
     def files(self) -> list[Path]:
-        """Files that may be images; dropped ones first."""
+        """Possible images; dropped ones first."""
         found: list[Path] = []
         for folder in (self._dropped, self.folder):
             if folder.is_dir():
@@ -97,7 +97,7 @@ class Shelf:
         return sorted(visible(each.name) for each in self._dropped.iterdir() if each.is_file())
 
     def take(self, name: str, data: bytes) -> Path | None:
-        """Keep a dropped file; None for one that is neither image, manifest nor trace. Raises
+        """Store a dropped file; None unless it is an image, a manifest or a trace. Raises
         OSError.
         """
         plain = name.replace("\\", "/").rpartition("/")[2]
@@ -112,7 +112,7 @@ class Shelf:
 
 
 def upload_limit(usual: int) -> Callable[[str], int]:
-    """The limit of a path's body, for the guard."""
+    """Maximum body size of a path, for the guard."""
     return lambda path: UPLOAD_MAX if path == UPLOAD else usual
 
 
@@ -177,7 +177,7 @@ class BenchPage:
         return self._pages.parts(
             translate, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
-            left_s=left_s(state), failure_details=failure_details(state), waivers=WAIVERS,
+            left_s=left_s(state), battery_answers=battery_answers(state), waivers=WAIVERS,
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:
@@ -219,7 +219,7 @@ _SHORT: Final = (
     (VersionInformation, ("model", "serial_number", "hardware_version", "firmware_version")),
     (RunningInformation, ("state_of_charge_percent", "voltage_mv", "mean_current_ma")),
 )
-"""What tells a battery from another, and whether it can be upgraded now."""
+"""Identity of a battery, and whether it can be upgraded now."""
 
 
 def _rows(content: Content) -> dict[str, tuple[str, str]]:
@@ -231,7 +231,7 @@ def _rows(content: Content) -> dict[str, tuple[str, str]]:
 
 
 def _listed(shown: Field) -> str:
-    """The names of flags, each to be said in the language of the page; empty for other fields."""
+    """The names of flags, for translation one by one; empty for other fields."""
     names = shown.value if isinstance(shown.value, list) else []
     if not names or not all(isinstance(name, str) for name in names):
         return ""
@@ -240,7 +240,7 @@ def _listed(shown: Field) -> str:
 
 
 def facts(state: BenchState) -> list[tuple[str, str]]:
-    """What the battery says of itself, in short; its faults last."""
+    """Short description of the battery; its faults last."""
     if state.bike is None:
         return []
     answers = {type(each.answer): each.answer for each in state.bike.readings if each.answer}
@@ -255,7 +255,7 @@ def facts(state: BenchState) -> list[tuple[str, str]]:
 
 
 def identity(done: Done) -> list[tuple[str, str]]:
-    """What tells the upgraded device from others; empty where it cannot be asked."""
+    """Identity of the upgraded device; empty if it cannot be queried."""
     if done.before is None or done.before.target is not done.target:
         return []
     version = done.before.version
@@ -263,8 +263,8 @@ def identity(done: Done) -> list[tuple[str, str]]:
     return [rows[name] for name in ("model", "serial_number", "hardware_version") if name in rows]
 
 
-def failure_details(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Everything that the battery told, in the words of `flasher info`: a title with its rows."""
+def battery_answers(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]]:
+    """All answers of the battery, as in `flasher info`: a title with its rows."""
     bike = state.bike
     if bike is None:
         return []
@@ -277,7 +277,7 @@ def failure_details(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]
 
 
 def compared(done: Done) -> list[tuple[str, str, str]]:
-    """Every answer before and after: label, the one, the other; "" for none."""
+    """Every answer before and after: label, old, new; "" for none."""
     sides: list[dict[tuple[str, str], tuple[str, str]]] = []
     for seen in (done.before, done.after):
         side = {}
@@ -296,7 +296,7 @@ def compared(done: Done) -> list[tuple[str, str, str]]:
 
 
 def left_s(state: BenchState) -> float | None:
-    """Seconds that the transfer still takes, at the pace so far; None before there is one."""
+    """Estimated seconds until the transfer ends; None before the second packet."""
     if state.transfer_began_s is None or state.offer is None or state.packet < 2:
         return None
     took_s = state.now_s - state.transfer_began_s

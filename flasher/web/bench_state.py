@@ -1,4 +1,4 @@
-"""What the bench shows."""
+"""State of the bench."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flasher.trace.decoder import BusEvent
 
 
 class Activity(Enum):
-    """What the bench does now."""
+    """Current activity of the bench."""
 
     NOTHING = "nothing"
     ADAPTERS = "adapters"
@@ -32,17 +32,17 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Adapter:
-    """A way to a bike; `name` tells it from the others."""
+    """A connection to a bike, identified by `name`."""
 
     name: str
     note: str = ""
     was_last: bool = False
-    """The one that was used last."""
+    """The adapter used last."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """An image file, held against the target: it fits, or `refusal` says why not."""
+    """An image file checked for the target: it fits, or `refusal` gives the reason."""
 
     path: Path
     version: str = ""
@@ -53,18 +53,18 @@ class Offer:
     checks: tuple[events.CheckMade, ...] = ()
     refusal: FlasherError | None = None
     waived: tuple[str, ...] = ()
-    """Names of the checks that somebody has waived for it (flasher.host.waivers)."""
+    """Names of the checks waived for it (flasher.host.waivers)."""
 
     @property
     def name(self) -> str:
-        """As a page shows it."""
+        """Display name."""
         return visible(self.path.name)
 
 
 @dataclass(frozen=True)
 class Done:
-    """An upgrade that has ended. Transferred, completed and running are three claims, of which
-    None is: not known.
+    """A finished upgrade. Transferred, completed and running are three claims; None means
+    unknown.
     """
 
     at: datetime
@@ -74,14 +74,14 @@ class Done:
     checks: tuple[events.CheckMade, ...]
     before: DeviceInfo | None
     packet: int
-    """Packets that the device has acknowledged, in the best attempt."""
+    """Packets that the device acknowledged, in the best attempt."""
     result: Result | None
-    """None where the adapter failed, or somebody ended it at once."""
+    """None if the adapter failed, or a user ended it at once."""
     error: FlasherError | None
     bundle: Path | None
     after: DeviceInfo | None = None
     warning: str = ""
-    """Why the history has nothing of it; empty where it has."""
+    """Why it is missing in the history; empty if it is there."""
 
     @property
     def is_transferred(self) -> bool | None:
@@ -93,7 +93,7 @@ class Done:
 
     @property
     def is_running(self) -> bool | None:
-        """The application answered, and nothing speaks against its being the new one."""
+        """The application answered, and nothing contradicts that it is the new one."""
         result = self.result
         if result is None or result.running_version is None:
             return None
@@ -116,14 +116,14 @@ class SeenMessage:
 
     seen: BusEvent
     changed: frozenset[str]
-    """Names of the fields that changed a moment ago."""
+    """Names of the fields that changed recently."""
     count: int
     rate_hz: float | None
 
 
 @dataclass(frozen=True)
-class Watched:
-    """What is said on the bus, since somebody watches."""
+class BusWatch:
+    """Bus traffic since the start of watching."""
 
     since_s: float
     messages: int
@@ -133,25 +133,25 @@ class Watched:
 
 @dataclass(frozen=True)
 class Saved:
-    """A backup that was written."""
+    """A written backup."""
 
     path: Path
     size_bytes: int
     area: Area | None
-    """The memory in it."""
+    """Its memory area."""
     running_version: str
-    """What the device answers; empty where it answers none."""
+    """Version that the device answered; empty for none."""
     names_running_version: bool | None
-    """True when that stands in the memory; None where there is no memory, or no version."""
+    """True if the memory contains that version; None without memory or version."""
     items: tuple[str, ...]
-    """What the device has answered."""
+    """Answers of the device."""
     missing: Mapping[str, str]
-    """What is not in it, each with the reason."""
+    """Missing items, each with the reason."""
 
 
 @dataclass(frozen=True)
 class BenchState:
-    """Everything that a page shows."""
+    """Complete state of the page."""
 
     doing: Activity = Activity.NOTHING
     is_rescue: bool = False
@@ -159,49 +159,49 @@ class BenchState:
     was_looked_for: bool = False
     adapter: Adapter | None = None
     bike: DeviceInfo | None = None
-    """What was heard and what the battery answered, before the upgrade."""
+    """Devices found and the battery's answers, before the upgrade."""
     areas: tuple[Area, ...] | None = None
-    """Memory that a backup may hold, while that is to be chosen."""
+    """Memory areas offered for a backup, while one is to be chosen."""
     saved_bytes: int = 0
-    """Memory that was read for a backup so far."""
+    """Memory read for a backup so far."""
     saved: Saved | None = None
     """The last backup."""
-    watched: Watched | None = None
+    watched: BusWatch | None = None
     dropped: tuple[str, ...] = ()
-    """Names of files that were dropped on the page."""
+    """Names of files dropped on the page."""
     target: Target | None = None
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None
     waived: frozenset[tuple[str, str]] = frozenset()
-    """Images by their names, each with a check that was waived for this device."""
+    """Image names, each with a check waived for this device."""
     phase: events.Phase | None = None
     packet: int = 0
-    """Packets that the device has acknowledged in this attempt."""
+    """Packets that the device acknowledged in this attempt."""
     furthest: int = 0
     """The same, in the best attempt."""
     repetitions: int = 0
     transfer_began_s: float | None = None
     now_s: float = 0.0
-    """On the clock of the bench, as `transfer_began_s`."""
+    """On the clock of the bench, like `transfer_began_s`."""
     power_cycle_s: float | None = None
-    """The device has to be switched off and on; it is waited for so long."""
+    """How long to wait for the user to switch the device off and on."""
     power_cycle_since_s: float = 0.0
     """On the clock of the bench."""
     adapter_left_s: int | None = None
-    """The adapter is lost, and waited for so long."""
+    """How long to wait for the lost adapter."""
     checks: tuple[events.CheckMade, ...] = ()
     notes: tuple[str, ...] = ()
     is_stopping: bool = False
     done: Done | None = None
     trouble: FlasherError | None = None
-    """What ended the last step, but for an upgrade."""
+    """Error of the last step, except of an upgrade."""
 
     @property
     def is_idle(self) -> bool:
         return self.doing is Activity.NOTHING
 
     def power_cycle_left_s(self, now_s: float) -> int:
-        """Whole seconds that the device is still waited for."""
+        """Whole seconds left to wait for the device."""
         if self.power_cycle_s is None:
             return 0
         return max(0, round(self.power_cycle_s - (now_s - self.power_cycle_since_s)))

@@ -1,9 +1,9 @@
-"""States for pages that follow them: each message is the whole state of one subject.
+"""State feed for pages: each message is the whole state of one subject.
 
-A program's thread calls `put` and `beat`; pages follow in the server's event loop. A page that
-connects gets all states, then each change in its order. A state that was not sent yet is replaced
-by a newer one of its subject when only its progress changed, so no word that a subject shows is
-left out; a page that is too slow for that gets all states anew.
+A program's thread calls `put` and `beat`; pages follow in the server's event loop. A new page
+receives all states, then each change in order. A newer state replaces an unsent one of its subject
+when only its progress changed, so no shown word is skipped; a page too slow for that receives all
+states again.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 BEAT_S: Final = 0.5
-"""Time between two messages to a page at the most."""
+"""Longest time between two messages to a page."""
 GATHER_S: Final = 0.04
-"""Changes in this time are one message."""
+"""Changes within this time are one message."""
 PENDING_MAX: Final = 2000
-"""Changes that a page may be behind."""
+"""Unsent changes before a page receives all states."""
 
 
 @dataclass
@@ -32,7 +32,7 @@ class _Change:
 
 
 class _Follower:
-    """What one page has not got yet."""
+    """Unsent changes of one page."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.changes: deque[_Change] = deque()
@@ -43,7 +43,7 @@ class _Follower:
         self._loop = loop
 
     def put(self, change: _Change) -> None:
-        """Called with the feed's lock held."""
+        """Add a change. Call with the feed's lock held."""
         if self.is_behind:
             return
         last = self.last.get(change.subject)
@@ -63,17 +63,17 @@ class _Follower:
 
 @dataclass(frozen=True)
 class Batch:
-    """What a page gets at a time."""
+    """Changes sent to a page at a time."""
 
     changes: tuple[tuple[str, Any], ...]
     """Subjects with their whole states, in the order in which they changed."""
     is_all: bool = False
-    """These are all subjects: others are gone."""
+    """These are all subjects; others no longer exist."""
 
 
 class Feed:
-    """The states of all subjects. `now`: a monotonic clock; `silence_limit_s`: a program that calls
-    `beat` less often is not at work, and pages hear nothing until it does again.
+    """The states of all subjects. `now`: a monotonic clock; `silence_limit_s`: without a `beat` for
+    so long, pages receive nothing until the next one.
     """
 
     def __init__(self, now: Callable[[], float], *, silence_limit_s: float) -> None:
@@ -88,7 +88,7 @@ class Feed:
     # -- the program's side, any thread ------------------------------------------------------------
 
     def put(self, subject: str, state: Any, *, word: object) -> None:
-        """The state of a subject; `word`: what of it must not be left out when it changes."""
+        """Set the state of a subject; changes of `word` are never skipped."""
         with self._lock:
             known = self._states.get(subject)
             if known is not None and known.word == word and known.state == state:
@@ -99,11 +99,11 @@ class Feed:
         self._wake()
 
     def beat(self) -> None:
-        """The program is at work."""
+        """Note that the program is running."""
         self._beat_at = self._now()
 
     def close(self) -> None:
-        """No page is followed any more."""
+        """End all followers."""
         self._is_closed = True
         self._wake()
 
@@ -114,8 +114,8 @@ class Feed:
     # -- the pages' side, in the server's loop -----------------------------------------------------
 
     async def follow(self) -> AsyncIterator[Batch]:
-        """All states, then every change; an empty batch at the latest after `BEAT_S`, as long as
-        the program is at work.
+        """Yield all states, then every change; an empty batch after at most `BEAT_S` while the
+        program is running.
         """
         follower = _Follower(asyncio.get_running_loop())
         with self._lock:

@@ -1,9 +1,8 @@
-"""Who may use the pages, and what a browser may do with them.
+"""Access control of the pages, and their browser policies.
 
-Every request names this server as its host, so that no foreign name leads here (DNS rebinding).
-What changes something is a POST from a page of this server that knows the token of its session.
-Answers forbid scripts, styles and connections from anywhere else. Where people sign in
-(`flasher.web.login`), nothing but the page that asks is shown before.
+Every request must name this server as its host (DNS rebinding). Changes need a POST from a page of
+this server with the token of its session. Answers forbid scripts, styles and connections from
+elsewhere. Where sign-in is required (`flasher.web.login`), only its page is shown before.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from flasher.web.sign_ins import SignIn
 
 TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
 BODY_MAX: Final = 64 * 1024
-"""In bytes, of a request that is no upload."""
+"""In bytes, of a request that is not an upload."""
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "font-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -53,18 +52,19 @@ _OPEN: Final = ("/static/", LOGIN, SIGN_OUT, _ENTER, _CLOSED)
 """Paths that need no sign-in."""
 _ENTERED_S: Final = 14 * 24 * 3600
 _IS_IN: Final = "is_in"
-"""What the session of the browser has that an address let in."""
+"""Session key of a browser admitted by the entry address."""
 
 
-class Entry:
-    """Lets the browser in that first opens `path`, and nobody else after it."""
+class BrowserEntry:
+    """Admits only the first browser that opens `path`."""
 
     def __init__(self, pages: Pages) -> None:
         self._pages = pages
         self._key = secrets.token_urlsafe(32)
         self.path = f"{_ENTER}?key={self._key}"
         self.cookie = f"flasher-{secrets.token_hex(4)}"
-        """Cookies hold for all ports of a computer, and several servers may run on it."""
+        """Named by port: cookies apply to all ports of a computer, which may run several
+        servers."""
 
     @property
     def routes(self) -> list[BaseRoute]:
@@ -90,13 +90,13 @@ def application(
     hosts: Collection[str],
     secret: str,
     login: Login | None = None,
-    entry: Entry | None = None,
+    entry: BrowserEntry | None = None,
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
 ) -> ASGIApp:
-    """The pages behind the guard. `hosts`: names by which this server is addressed, without port;
-    `secret` signs the cookies; `login` knows who signed in, and `entry` lets one browser in:
-    without either everybody sees the pages; `uploads` gives the limit of a path's body in bytes.
+    """Wrap the pages in the guard. `hosts`: names of this server, without port; `secret` signs the
+    cookies; `login` checks sign-ins, and `entry` admits one browser: without either the pages are
+    open to all; `uploads` gives the maximum body size of a path in bytes.
     """
     own: list[BaseRoute] = [
         *([] if entry is None else entry.routes),
@@ -124,7 +124,7 @@ def application(
 
 
 class _Guard:
-    """The outermost layer: hosts, origins, sizes, headers."""
+    """Outermost layer: checks hosts, origins and sizes, sets headers."""
 
     def __init__(
         self, app: ASGIApp, hosts: Collection[str], limit_of: Callable[[str], int]
@@ -176,7 +176,7 @@ def _name_of(host: str) -> str:
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Ends a body that is larger than allowed, whatever its header said."""
+    """Stop reading a body larger than allowed, whatever its header states."""
     taken = 0
 
     async def receive_limited() -> Message:
@@ -189,11 +189,11 @@ def _limited(receive: Receive, limit: int) -> Receive:
 
 
 class _Sessions:
-    """Every session has a token, which a POST has to give. Who may not see a page is sent to where
-    people sign in, or told that another browser has the pages.
+    """Gives every session a token, which a POST must include. Redirects to the sign-in page, or
+    reports that another browser has the pages.
     """
 
-    def __init__(self, app: ASGIApp, *, login: Login | None, entry: Entry | None) -> None:
+    def __init__(self, app: ASGIApp, *, login: Login | None, entry: BrowserEntry | None) -> None:
         self._app = app
         self._login = login
         self._entry = entry
@@ -226,7 +226,7 @@ class _Sessions:
             await self._app(scope, receive, send)
 
     def _refused(self, path: str, session: Mapping[str, Any], sign_in: SignIn | None) -> str:
-        """Where who may not see this page is sent to; "" for who may."""
+        """Redirect target for users without access to the page; "" with access."""
         if self._entry is not None and not session.get(_IS_IN):
             return _CLOSED
         if self._login is not None and self._login.is_refused(path, sign_in):
@@ -234,7 +234,7 @@ class _Sessions:
         return ""
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """A stream, which ends with the sign-in that it needs."""
+        """A stream that ends with its sign-in."""
         session, path = scope["session"], scope["path"]
         with CancelScope() as streaming:
 

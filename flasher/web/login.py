@@ -1,8 +1,7 @@
-"""The pages by which people sign in and out, and the list of who is signed in.
+"""Sign-in and sign-out pages, and the list of active sign-ins.
 
-A PIN is checked in a thread of its own, one at a time. A try is counted before it is checked, few
-requests wait, and the others are refused at once: guesses cost neither memory nor the time of those
-who work.
+A PIN is checked in a separate thread, one at a time. A try is counted before its check, few
+requests wait, and others are refused at once: guesses cost neither memory nor the time of users.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ SIGN_OUT: Final = "/sign-out"
 SIGN_INS: Final = "/sign-ins"
 _END: Final = f"{SIGN_INS}/end"
 _KEYS: Final = "sign_ins"
-"""What the session has: the keys of the sign-ins of its browser."""
+"""Session key with the keys of the browser's sign-ins."""
 FORMS: Final = (LOGIN, SIGN_OUT, _END)
-"""Their fields have the token of the session."""
+"""Forms whose fields include the session's token."""
 _WAITING_MAX: Final = 4
-"""PINs that are checked or wait for it."""
+"""PINs checked or waiting."""
 _WAITING_OF_ONE_MAX: Final = 2
-"""Those of one address, so that one client does not take all places."""
+"""The same for one address, so that one client cannot take all places."""
 _QUERY_MAX: Final = 1000
-"""Characters of what a page was asked for that are kept while somebody signs in."""
+"""Characters of a page's query kept during sign-in."""
 _BADGE_MAX: Final = 300
 """Characters of a badge or a PIN."""
 
@@ -61,27 +60,27 @@ ROLE_WORDS: Final = {
 
 @dataclass(frozen=True)
 class Badges:
-    """The people who may open pages."""
+    """Users who may open pages."""
 
     people: Sequence[Person]
     needs_pin: bool
-    """True where a badge without a PIN opens nothing."""
+    """True if a badge requires a PIN."""
     is_supervised: Callable[[str], bool]
-    """True for the path of a page that is for supervisors."""
+    """True for the path of a supervisors' page."""
     are_for_all: bool
-    """True where the other pages need a badge too: any."""
+    """True if the other pages need a badge too, of any role."""
 
     def find(self, code: str) -> Person | None:
         return next((each for each in self.people if each.code == code), None)
 
     @property
     def any_hash(self) -> str:
-        """A hash to be compared where there is none, so that the time tells of no badge."""
+        """A hash to compare for unknown badges, so that timing does not reveal badges."""
         return next((each.pin for each in self.people if each.pin), "")
 
 
 class _RefusedError(Exception):
-    """Somebody is not let in."""
+    """The sign-in is refused."""
 
     def __init__(
         self, trouble: str, status: int = 403, *, wait_s: int = 0, badge: str = ""
@@ -91,11 +90,11 @@ class _RefusedError(Exception):
         self.status = status
         self.wait_s = wait_s
         self.badge = badge
-        """A badge that was scanned, and whose PIN is to be typed."""
+        """A scanned badge whose PIN is needed."""
 
 
 class _Places:
-    """Places for requests that wait; who finds none is refused at once."""
+    """A limited number of waiting requests; further ones are refused at once."""
 
     def __init__(self) -> None:
         self._taken: Counter[str] = Counter()
@@ -114,7 +113,7 @@ class _Places:
 
 
 class Login:
-    """Asks who is there, by the password of all or by a badge."""
+    """Signs users in by a shared password or by a badge."""
 
     def __init__(
         self,
@@ -149,11 +148,11 @@ class Login:
     # -- for the guard ----------------------------------------------------------------------------
 
     def find(self, session: dict[str, Any], *, is_use: bool = False) -> SignIn | None:
-        """Who is signed in; `is_use`: and looks at a page."""
+        """The active sign-in; `is_use`: a page is viewed."""
         return self.sign_ins.find(_keys(session), is_use=is_use)
 
     def is_refused(self, path: str, sign_in: SignIn | None) -> bool:
-        """True for a page that who is signed in, or nobody, may not see."""
+        """True for a page that this sign-in, or none, may not see."""
         badges = self._badges
         if badges is not None and (path.startswith(SIGN_INS) or badges.is_supervised(path)):
             return sign_in is None or not sign_in.is_supervisor
@@ -163,7 +162,7 @@ class Login:
         return asks_all and sign_in is None
 
     def want(self, session: dict[str, Any], scope: Scope) -> None:
-        """Keep what page somebody asked for who has to sign in first."""
+        """Remember the requested page during sign-in."""
         query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
         # One slash alone: two would begin the name of another computer.
         session["wanted"] = "/" + scope["path"].lstrip("/\\") + (f"?{query}" if query else "")
@@ -205,7 +204,7 @@ class Login:
         return RedirectResponse(request.session.pop("wanted", "/"), 303)
 
     async def _checked(self, address: str, fields: dict[str, str]) -> Person | None:
-        """Who that is; None for who knows the password. Raises _RefusedError."""
+        """The user; None for the password. Raises _RefusedError."""
         code, pin = (fields.get(name, "").strip()[:_BADGE_MAX] for name in ("badge", "pin"))
         # Beside the right password too, a wrong badge is a wrong try.
         if self._badges is not None and code:
@@ -218,7 +217,7 @@ class Login:
         return None
 
     async def _person(self, badges: Badges, address: str, code: str, pin: str) -> Person:
-        """The person of a badge, who knows its PIN. Raises _RefusedError."""
+        """The user of a badge, after checking the PIN. Raises _RefusedError."""
         person = badges.find(code)
         if person is not None and not (person.pin or badges.needs_pin):
             self._count(address, code)
@@ -242,7 +241,7 @@ class Login:
         return person
 
     def _count(self, address: str, badge: str | None) -> None:
-        """Count a try, before it is checked. Raises _RefusedError for one too many."""
+        """Count a try before its check. Raises _RefusedError for one too many."""
         wait_s = ceil(self._attempts.begin(address, badge, self._clock.monotonic_s()))
         if wait_s:
             trouble = text("Too many tries: wait {seconds} s.", seconds=wait_s)
@@ -276,7 +275,7 @@ class Login:
             self.sign_ins.sign_out(sign_in, everywhere="everywhere" in fields)
         return RedirectResponse("/", 303)
 
-    # -- who is there -----------------------------------------------------------------------------
+    # -- active sign-ins --------------------------------------------------------------------------
 
     async def _list(self, request: Request) -> Response:
         question = question_of(SIGN_INS, request, self._pages)
@@ -307,7 +306,7 @@ def _keys(session: Mapping[str, Any]) -> list[str]:
 
 
 async def _form(request: Request) -> dict[str, str] | None:
-    """The fields of a form; None of one that is not of a page of this session."""
+    """The fields of a form; None without this session's token."""
     found = parse_qs((await request.body()).decode("utf-8", "replace"), keep_blank_values=True)
     fields = {name: values[0] for name, values in found.items()}
     token: str = request.session["token"]

@@ -1,7 +1,7 @@
-"""The operator page: a tile a socket, a header, a footer, and what covers them when the line is
-stopped or the station says nothing.
+"""Operator page: a tile for each socket, a header, a footer, and an overlay when the line is
+stopped or the station is silent.
 
-`Screen` takes the station's events, in the station's thread; the page follows its `Feed`.
+`Screen` receives the station's events in the station's thread; the page follows its `Feed`.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from flasher.web.pages import Pages, streamed
 from flasher.web.translation import Translator
 
 TAIL_DIGITS: Final = 6
-"""Of a serial number, shown large: enough to tell the units on a bench apart."""
+"""Digits of a serial number shown large: enough to tell the units on a bench apart."""
 _PAGE_DIGITS: Final = 8
-"""Of the number by which a page is told from others."""
+"""Digits of a page's number."""
 SCAN_MAX: Final = 300
 """Characters of a scan from a page."""
 HEAD_EVERY_S: Final = 0.1
 SILENCE_LIMIT_S: Final = 1.5
-"""A station whose loop turns more slowly is not at work for the page."""
+"""A station whose loop is slower than this counts as silent."""
 _HEAD: Final = "head"
 LINE: Final = "/line"
-"""Where the page is, and below it what it asks for."""
+"""Path of the page and prefix of its requests."""
 
 WORDS: Final = {
     SocketState.STARTING: text("STARTING"),
@@ -55,12 +55,12 @@ WORDS: Final = {
     SocketState.ERROR: text("ERROR"),
     SocketState.STOPPED: text("STOPPED"),
 }
-"""What a tile says in large letters."""
+"""Large words of a tile."""
 
 
 @dataclass(frozen=True)
-class Lot:
-    """The lot that is made; `size` is how many units it has, 0 for not known."""
+class CurrentLot:
+    """The current lot; `size` is its number of units, 0 if unknown."""
 
     name: str
     size: int = 0
@@ -69,23 +69,23 @@ class Lot:
 
 @dataclass(frozen=True)
 class ScreenHeader:
-    """All that the page shows beside the sockets."""
+    """Page content besides the sockets."""
 
     station: str
     recipe: str
     part: str
     operator: str
-    lot: Lot
+    lot: CurrentLot
     virtual: str
     output: Output
     health: tuple[HealthCheck, ...]
     stopped: LineStopped | None
     spoken: Spoken
     is_secret: bool
-    """What is typed now must not be shown."""
+    """Typed characters must not be shown."""
 
     def to_json(self, translate: Translator, source: Source) -> dict[str, Any]:
-        """The head in a language, for the page's script in the session that is this source."""
+        """The header in a language, for the page of the session `source`."""
         stopped, lot, spoken = self.stopped, self.lot, self.spoken.to(source.name)
         name = lot.name or translate(text("no lot"))
         left = max(lot.size - lot.good, 0)
@@ -155,9 +155,7 @@ def _tile(row: Row, translate: Translator) -> dict[str, Any]:
 
 
 class Screen:
-    """What the page shows, from the events of a station. Its methods are called in the station's
-    thread.
-    """
+    """State of the page, from a station's events. Call its methods in the station's thread."""
 
     def __init__(self, tally: ShiftCounts, watch: HealthWatch) -> None:
         self.feed = Feed(time.perf_counter, silence_limit_s=SILENCE_LIMIT_S)
@@ -165,10 +163,10 @@ class Screen:
         self._watch = watch
         self._turned_at = float("-inf")
         self._passed: dict[str, RunEnded] = {}
-        """Runs that ended with PASS, whose units are in their sockets."""
+        """Runs that ended with PASS and whose units are still in their sockets."""
 
     def show(self, event: StationEvent, board: Board) -> None:
-        """The board after it has applied an event."""
+        """Update after the board has applied an event."""
         if isinstance(event, RunEnded):
             at = datetime.fromisoformat(event.at) if event.at else datetime.now(UTC)
             self._tally.add(EndedRun(at, event.serial, event.outcome, event.code))
@@ -179,14 +177,14 @@ class Screen:
         for name in (socket,) if socket in board.rows else tuple(board.rows):
             row = board.rows[name]
             state, passed = row.state, self._passed.get(name)
-            # PASS only when the run's end with PASS was told, which is after it is on disk.
+            # PASS only after the event of the run's end, which follows its writing to disk.
             if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
                 state = SocketState.SAVING
             word = (state, row.serial, row.code, row.note, row.step)
             self.feed.put(f"socket {name}", replace(row, state=state), word=word)
 
-    def turn(self, board: Board, *, operator: str, lot: Lot) -> None:
-        """Once in each turn of the station's loop."""
+    def turn(self, board: Board, *, operator: str, lot: CurrentLot) -> None:
+        """Call once in each turn of the station's loop."""
         self.feed.beat()
         now = time.perf_counter()
         if now - self._turned_at < HEAD_EVERY_S:
@@ -209,7 +207,7 @@ class Screen:
 
 
 class OperatorPage:
-    """The routes of the page. `submit` hands a scan to the station, with the browser's session as
+    """The routes of the page. `submit` passes a scan to the station, with the browser's session as
     its source.
     """
 
@@ -260,7 +258,7 @@ class OperatorPage:
 
 
 def _source_of(request: Request) -> Source:
-    """The session of a browser; its token stays secret."""
+    """Public id of a browser's session; its token stays secret."""
     token = str(request.session["token"]).encode()
     return Source(PAGE + hashlib.sha256(token).hexdigest()[:_PAGE_DIGITS])
 

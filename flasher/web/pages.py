@@ -1,5 +1,5 @@
-"""From data to a page: the templates of `flasher.report` and those of this package, with escaping,
-the language and the session's token.
+"""Page rendering: the templates of `flasher.report` and of this package, with escaping, language
+and session token.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _PART: Final = "part_"
 
 
 def streamed(messages: AsyncIterator[dict[str, Any]]) -> Response:
-    """Messages for a page's script, as server-sent events."""
+    """Server-sent events for a page's script."""
 
     async def lines() -> AsyncIterator[str]:
         yield "retry: 500\n\n"
@@ -32,8 +32,8 @@ def streamed(messages: AsyncIterator[dict[str, Any]]) -> Response:
 
 
 class Pages:
-    """Renders pages. `language`: of who did not choose one; None: what the browser asks for. With
-    `remembers_language` a language that was chosen holds for the other pages of the session.
+    """Renders pages. `language`: the default; None: the browser's. With `remembers_language` a
+    chosen language applies to later pages of the session.
     """
 
     def __init__(self, language: str | None = None, *, remembers_language: bool = False) -> None:
@@ -57,7 +57,7 @@ class Pages:
         return chosen(wanted or self._language, accepted)
 
     def parts(self, translate: Translator, template: str, **context: Any) -> dict[str, str]:
-        """The pieces of a page: what each macro `part_...` of a template gives, by its name."""
+        """Output of each macro `part_...` of a template, by name."""
         found = self._environment.get_template(template).make_module(
             {"_": translate, "lang": translate.code, **context}
         )
@@ -70,7 +70,7 @@ class Pages:
     def show(
         self, request: Request, template: str, *, status: int = 200, **context: Any
     ) -> Response:
-        """A page, in the language of its request."""
+        """Render a page in the language of its request."""
         token = request.session.get("token", "")
         context.setdefault("sign_in", request.scope.get("sign_in"))
         return HTMLResponse(
@@ -78,7 +78,7 @@ class Pages:
         )
 
     def text(self, template: str, translate: Translator, token: str, **context: Any) -> str:
-        """A page. Templates know `_` (the language), `token`, `languages` and `version`."""
+        """Render a page. Templates have `_` (translation), `token`, `languages` and `version`."""
         return self._environment.get_template(template).render(
             _=translate,
             lang=translate.code,

@@ -1,4 +1,4 @@
-"""A web server in a thread of its own, for the life of a program."""
+"""Web server in its own thread, for the life of a program."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
-"""Addresses that no other computer reaches."""
-# Nothing of the server is printed into a terminal that shows something else; a log takes it.
+"""Addresses that other computers cannot reach."""
+# The server prints nothing into the program's terminal; a log takes its messages.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 _END_LIMIT_S: Final = 1.0
-"""Streams that are still open are cut after this time."""
+"""Open streams are cut after this time."""
 
 
 _CONNECTIONS_MAX: Final = 200
 _OF_ONE_MAX: Final = 100
-"""Open connections of one client, so that it does not take those of all."""
+"""Open connections of one client, so that it cannot use them all."""
 
 
 class _Protocol(H11Protocol):
-    """Ends connections of a client that has too many."""
+    """Limits the connections of a client."""
 
     place = ""
 
@@ -45,7 +45,9 @@ class _Protocol(H11Protocol):
 
 
 def client_at(host: str) -> str:
-    """The client at an address: one has all addresses of this computer, or of an IPv6 network."""
+    """The client of an address: all addresses of this computer, or of an IPv6 network, are one
+    client.
+    """
     try:
         found = ip_address(host.partition("%")[0])
     except ValueError:
@@ -58,15 +60,15 @@ def client_at(host: str) -> str:
 
 
 class Tls(NamedTuple):
-    """Files of a certificate and its key (PEM)."""
+    """PEM files of a certificate and its key."""
 
     certificate: Path
     key: Path
 
 
 class Server:
-    """Serves an ASGI application while the block runs; `url` is its address, with the port that it
-    got. Raises UsageError for an address that cannot be used.
+    """Serves an ASGI application while the block runs; `url` is its address, with the actual port.
+    Raises UsageError for an unusable address.
     """
 
     def __init__(self, app: Any, host: str, port: int, tls: Tls | None = None) -> None:
@@ -83,7 +85,7 @@ class Server:
             h11_max_incomplete_event_size=16 * 1024,
             limit_concurrency=_CONNECTIONS_MAX,
             http=_Protocol,
-            # A header that names another address is believed from nobody: tries are counted by it.
+            # No proxy header is trusted: sign-in tries are counted by address.
             proxy_headers=False,
             ssl_certfile=None if tls is None else str(tls.certificate),
             ssl_keyfile=None if tls is None else str(tls.key),

@@ -1,5 +1,5 @@
-"""Who is signed in. The sign-ins are in the memory of the server alone: none outlives it, and an
-ended one never comes back. Cookies hold nothing but the keys by which they are found.
+"""Active sign-ins, in the server's memory only: none survives a restart, and an ended one never
+returns. Cookies hold only the keys of sign-ins.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from flasher.station.operators import Person, Role
 from flasher.station.records.model import AuditEvent, Clock
 
 SHIFT_S: Final = 8 * 3600.0
-"""Every sign-in ends after this time."""
+"""Maximum length of a sign-in."""
 IDLE_S: Final = 900.0
-"""A supervisor who looked at no page for so long has left the screen."""
+"""Maximum time without a page view, for a supervisor."""
 _OF_ONE_MAX: Final = 100
-"""Sign-ins of one person, or by the password: the oldest one ends."""
+"""Sign-ins of one person, or by the password; beyond, the oldest one ends."""
 _BY_PASSWORD: Final = "(password)"  # noqa: S105  what the audit trail has in place of a name
 
 Note = Callable[[AuditEvent, Mapping[str, str]], None]
-"""Takes what goes into the audit trail."""
+"""Writes to the audit trail."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment by both clocks: the one for people may be set, the other one may stand still while
-    the computer sleeps.
+    """A moment on two clocks: wall time may be set, the monotonic one may stop while the computer
+    sleeps.
     """
 
     utc: datetime
@@ -39,13 +39,13 @@ class Moment:
         return cls(clock.utc(), clock.monotonic_s())
 
     def until_s(self, later: Moment) -> float:
-        """The time from here to a later moment, by the clock that went further."""
+        """Time until a later moment, by the clock that advanced further."""
         return max(later.monotonic_s - self.monotonic_s, (later.utc - self.utc).total_seconds())
 
 
 @dataclass(frozen=True)
 class SignIn:
-    """Somebody at a browser. `name` and `role` are those of the badge; of the password: none."""
+    """A user at a browser. `name` and `role` come from the badge; empty for the password."""
 
     number: int
     name: str
@@ -59,12 +59,12 @@ class SignIn:
         return self.role is Role.SUPERVISOR
 
     def data(self, **more: str) -> dict[str, str]:
-        """What the audit trail has of it."""
+        """Its data in the audit trail."""
         name = self.name or _BY_PASSWORD
         return {"number": str(self.number), "name": name, "address": self.address, **more}
 
     def over(self, now: Moment) -> str:
-        """Why it has ended by itself; "" while it goes on."""
+        """Why it has expired; "" while it is active."""
         if self.begun.until_s(now) >= SHIFT_S:
             return f"{SHIFT_S / 3600:g} h"
         if self.is_supervisor and self.used.until_s(now) >= IDLE_S:
@@ -73,22 +73,19 @@ class SignIn:
 
 
 class SignIns:
-    """The sign-ins of a server. `note` is called for each that begins or ends. Used by one thread
-    alone.
-    """
+    """The sign-ins of a server. `note` is called for each begin and end. Not thread-safe."""
 
     def __init__(self, clock: Clock, note: Note) -> None:
         self._clock = clock
         self._note = note
         self._known: dict[str, SignIn] = {}
-        """By their keys, from the first that was begun to the last."""
+        """By key, in the order of their begin."""
         self._count = 0
 
     def begin(self, person: Person | None, address: str, keys: Iterable[str] = ()) -> list[str]:
-        """Sign somebody in, None: by the password, at a browser that has these keys; gives those
-        that it has from now on.
+        """Sign a person in (None: by password) at a browser with these keys; returns its new keys.
 
-        A supervisor who looks something up at a screen of the line leaves it as it was.
+        A supervisor's visit at a screen of the line does not end the operator's sign-in.
         """
         self._count += 1
         now = Moment.now(self._clock)
@@ -109,7 +106,7 @@ class SignIns:
         return [*kept, key]
 
     def find(self, keys: Iterable[str], *, is_use: bool) -> SignIn | None:
-        """The last of these that goes on; `is_use`: somebody looks at a page by it."""
+        """The last active one of these; `is_use`: a page is viewed."""
         self._end_old()
         found = next((key for key in reversed(list(keys)) if key in self._known), None)
         if found is None:
@@ -119,12 +116,12 @@ class SignIns:
         return self._known[found]
 
     def listed(self) -> list[SignIn]:
-        """All that go on, the oldest first."""
+        """All active ones, the oldest first."""
         self._end_old()
         return list(self._known.values())
 
     def sign_out(self, sign_in: SignIn, *, everywhere: bool = False) -> None:
-        """End a sign-in by its own wish; `everywhere`: also the others of the same person."""
+        """End a sign-in at its user's request; `everywhere`: all of that user."""
         self._forget(sign_in)
         self._note(AuditEvent.SIGN_OUT, sign_in.data())
         for other in self.listed() if everywhere and sign_in.name else ():
@@ -132,7 +129,7 @@ class SignIns:
                 self._end(other, by=sign_in.name)
 
     def end(self, number: str, by: SignIn) -> None:
-        """End the sign-in of somebody, by a supervisor. One that has ended is none."""
+        """End a sign-in at a supervisor's request, unless it has ended."""
         for each in self.listed():
             if str(each.number) == number:
                 self._end(each, by=by.name or _BY_PASSWORD)

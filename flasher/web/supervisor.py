@@ -1,6 +1,6 @@
-"""The pages of the supervisor: what the records say, from the form in the address to a page.
+"""Supervisor pages: queries of the records, from the form in the address to a page.
 
-Times are those of the clock on the wall where the server is; the pages name its zone.
+Times are the server's local time; the pages name its zone.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ from flasher.web.query_processes import Answer, Question
 from flasher.web.translation import Translator, translator
 
 USUAL_DAYS: Final = 30
-"""Figures are of the last so many days that have runs, unless the form says another time."""
+"""Days with runs that figures cover by default."""
 CAUSES_DRAWN: Final = 12
 _HOURS_UP_TO: Final = timedelta(days=2)
 _DAYS_UP_TO: Final = timedelta(days=62)
 _WEEKS_UP_TO: Final = timedelta(days=430)
 SPANS_MAX: Final = 400
 CHECK: Final = "/certificate"
-"""The page that takes a certificate."""
+"""Path of the page that checks a certificate."""
 _NAMES: Final = {
     "/runs": text("Runs"),
     "/units": text("Units"),
@@ -81,9 +81,9 @@ _NAMES: Final = {
     "/audit": text("Audit trail"),
     CHECK: text("Check a certificate"),
 }
-"""The menu."""
+"""Menu entries."""
 _SIGN_INS: Final = {"/sign-ins": text("Sign-ins")}
-"""What it has besides where people sign in."""
+"""Additional menu entry where users sign in."""
 BY_WORDS: Final = {
     By.SOCKET: text("socket"),
     By.RECIPE: text("recipe"),
@@ -91,7 +91,7 @@ BY_WORDS: Final = {
     By.SHIFT: text("shift"),
 }
 PART_SIZE: Final = 2000
-"""Rows of a file that are read at once."""
+"""Rows of a file read at once."""
 _CSV: Final = "text/csv; charset=utf-8"
 _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
     "/runs.csv": (_CSV, Report.to_csv),
@@ -101,7 +101,7 @@ _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
 
 
 class PartOfCauses(NamedTuple):
-    """A row of the table of causes. `share`: of it and those before it, of 1."""
+    """A row of the table of causes. `share`: cumulative, of 1."""
 
     code: str
     meaning: str
@@ -112,7 +112,7 @@ class PartOfCauses(NamedTuple):
 
 @dataclass(frozen=True)
 class Supervisor:
-    """Answers the questions of the pages. `shifts`: when each begins, in local time."""
+    """Answers queries of the pages. `shifts`: their begins, in local time."""
 
     store: Store
     shifts: Sequence[time] = DEFAULT_SHIFTS
@@ -127,7 +127,7 @@ class Supervisor:
         return Pages()
 
     def answer(self, question: Question) -> Answer:
-        """The page of a question; a page with what is wrong when there is none."""
+        """The page; an error page if there is none."""
         try:
             return PAGES[question.path](self, question)
         except NotFoundError as error:
@@ -173,13 +173,13 @@ class Supervisor:
         return Answer(make(report).encode("utf-8"), media_type, file_name=name)
 
     def run(self, question: Question) -> Answer:
-        """Its unit's page, at this run."""
+        """The page of the run's unit, at this run."""
         run = self.store.read.run(RunId(question.run)).run
         unit = {"serial": run.serial, "part": run.part, "before": str(run.run_id + 1)}
         return Answer(location=f"/units?{urlencode(unit)}")
 
     def trace(self, question: Question) -> Answer:
-        """What the bus trace of a run tells, in full."""
+        """The full story of a run's bus trace."""
         details = self.store.read.run(RunId(question.run))
         found = self._story(details)
         if not isinstance(found, Story):
@@ -239,7 +239,7 @@ class Supervisor:
         return self._page(question, "certificate.html", path="/units", **made)
 
     def file_of_certificate(self, question: Question) -> Answer:
-        """The certificate as a file, which can be checked."""
+        """The certificate as a file for later verification."""
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
         made = render_certificate(life, datetime.now(UTC), proven(self.store, life))
@@ -247,7 +247,7 @@ class Supervisor:
         return Answer(made.encode("utf-8"), file_name=f"{name}.html")
 
     def check(self, question: Question) -> Answer:
-        """Tell of a certificate whether it is signed, unchanged, and of these records."""
+        """Check that a certificate is signed, unchanged, and from these records."""
         found = error = None
         if question.body.strip():
             try:
@@ -290,7 +290,7 @@ class Supervisor:
     # -- figures ----------------------------------------------------------------------------------
 
     def _figured(self, question: Question) -> tuple[RunFilter, Span]:
-        """The filter of a page of figures, and the time that they are of."""
+        """The filter of a page of figures, and its period."""
         chosen = filter_of(question)
         # Whenever the period begins, its last run is the newest one, or it has none.
         last = None if chosen.until else self.overview.last_begin(replace(chosen, since=None))
@@ -348,7 +348,7 @@ class Supervisor:
     def _causes(
         self, chosen: RunFilter, span: Span, by: By, said: Translator
     ) -> tuple[list[str], list[PartOfCauses]]:
-        """The groups, and the codes from the most frequent one on."""
+        """The groups, and the codes by descending frequency."""
         shifts = list(shifts_of(span, self.shifts)) if by is By.SHIFT else []
         found = self.overview.causes(chosen, by, shifts)
         sizes: Counter[str] = sum(found.values(), Counter())
@@ -408,7 +408,7 @@ class Supervisor:
 
 
 def frame(question: Question, now: datetime) -> dict[str, Any]:
-    """What all pages of the supervisor show around what they are about."""
+    """The common frame of all supervisor pages."""
     return {
         "layout": "supervise.html",
         "menu": _NAMES if question.sign_in is None else _NAMES | _SIGN_INS,
@@ -422,7 +422,7 @@ def frame(question: Question, now: datetime) -> dict[str, Any]:
 
 
 def upload_limit(usual: int) -> Callable[[str], int]:
-    """The limit of a path's body in bytes, for the guard."""
+    """Maximum body size of a path in bytes, for the guard."""
     return lambda path: CERTIFICATE_MAX_SIZE if path == CHECK else usual
 
 
@@ -430,7 +430,7 @@ Place = tuple[str, Path, KeyLocations]
 
 
 def place_of(store: Store) -> Place:
-    """Where these records are: their URL, the folder of their files, what is kept outside."""
+    """Location of these records: their URL, the folder of their files, external files."""
     url = store.database.location.url.render_as_string(hide_password=False)
     return url, store.files.folder, store.signer.keeping
 
@@ -438,7 +438,7 @@ def place_of(store: Store) -> Place:
 def open_supervisor(
     url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
 ) -> Supervisor:
-    """Answers of the records of a place, which are only read. Raises what `Store.open` does."""
+    """Open the records of a place read-only. Raises what `Store.open` does."""
     store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
     return Supervisor(store, shifts)
 
@@ -446,7 +446,7 @@ def open_supervisor(
 def serve_supervisor(
     url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
 ) -> Supervisor:
-    """The same, and adds up the days for figures as long as this process lives."""
+    """The same, and keep daily figures updated while this process lives."""
     supervisor = open_supervisor(url, folder, keeping, shifts)
     rollup = Rollup(supervisor.store.database)
     Thread(
@@ -470,14 +470,14 @@ PAGES: Final[dict[str, Callable[[Supervisor, Question], Answer]]] = {
     "/times": Supervisor.times,
     "/audit": Supervisor.audit,
 }
-"""By their routes."""
+"""Methods by route."""
 
 
 # -- from the form ---------------------------------------------------------------------------------
 
 
 def filter_of(question: Question) -> RunFilter:
-    """The filter that a form says. Raises UsageError for a time that is none, or an outcome."""
+    """The filter of a form. Raises UsageError for an invalid time or outcome."""
     fields = question.fields
     outcome = fields.get("outcome")
     if outcome is not None and outcome not in set(RunState):
@@ -509,14 +509,14 @@ def _moment(question: Question, name: str) -> datetime | None:
 
 
 def _oldest(question: Question) -> PageCursor:
-    """Where a part of a file begins; the first one with the oldest row."""
+    """Begin of a part of a file; the first one starts at the oldest row."""
     return PageCursor(after=_cut(question).after or 0)
 
 
 def _part(
     question: Question, page: Page[Any], heads: Iterable[str], rows: Iterable[Iterable[object]]
 ) -> Answer:
-    """A part of a file for a spreadsheet; the first one has the heads."""
+    """A part of a spreadsheet file; the first one has the column names."""
     name = {"/images.csv": "units.csv"}.get(question.path, question.path.lstrip("/"))
     is_first = bool(page.rows) and "after" not in question.fields
     text = csv_text([*([heads] if is_first else []), *rows])
@@ -533,7 +533,7 @@ def _cut(question: Question) -> PageCursor:
 
 
 class _Addresses:
-    """Addresses of this server with the fields of the form that is shown."""
+    """Addresses of this server with the fields of the current form."""
 
     def __init__(self, question: Question) -> None:
         self._fields = {
@@ -552,7 +552,7 @@ class _Addresses:
         return f"{path}?{urlencode(fields)}" if fields else path
 
     def of(self, path: str, **fields: object) -> str:
-        """Another page, in the language of this one."""
+        """Another page in the same language."""
         lang = {"lang": self._fields["lang"]} if "lang" in self._fields else {}
         return f"{path}?{urlencode(fields | lang)}" if fields or lang else path
 
@@ -561,7 +561,7 @@ class _Addresses:
 
 
 def spans_of(whole: Span) -> Iterator[Span]:
-    """Hours, days, weeks or months of the clock on the wall, as many as can be looked at."""
+    """Hours, days, weeks or months of local time, as many as can be viewed."""
     length = whole.end - whole.begin
     begin = whole.begin.astimezone()
     midnight = datetime.combine(begin, time())
@@ -586,7 +586,7 @@ def spans_of(whole: Span) -> Iterator[Span]:
 
 
 def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
-    """From each start to the next one, up to the one that holds `end`."""
+    """From each start to the next, up to the one that contains `end`."""
     before: datetime | None = None
     for start in starts:
         if before is not None:
@@ -597,7 +597,7 @@ def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
 
 
 def shifts_of(whole: Span, shifts: Sequence[time]) -> Iterator[tuple[Span, str]]:
-    """The shifts of a time, each with when its like begins."""
+    """The shifts of a period, each with the begin of its kind."""
     day = datetime.combine(whole.begin.astimezone(), time()) - timedelta(days=1)
     days = (whole.end - whole.begin).days + 3
     starts = [
@@ -631,7 +631,7 @@ def _is_trace(file: AttachmentFile) -> bool:
 
 
 def _facts(data: dict[str, Any]) -> Iterator[str]:
-    """What an audit row says, without the digests that only a program reads."""
+    """The content of an audit row, without digests."""
     for name, value in data.items():
         if name == "digests" or value in ("", None):
             continue

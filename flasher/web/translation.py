@@ -1,4 +1,4 @@
-"""The languages of the pages: catalogues of Babel in `locale`, by their English sentences."""
+"""Translations of the pages: Babel catalogues in `locale`, by their English sentences."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from babel.messages.pofile import read_po
 from flasher.i18n import translate
 
 NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
-"""The languages by their codes, each by its own name. English needs no catalogue."""
+"""Native language names by code. English needs no catalogue."""
 
 
 class Translator:
-    """Says texts in one language. `code` is what a page's `lang` attribute has."""
+    """Translates into one language; `code` is for a page's `lang` attribute."""
 
     def __init__(self, code: str, translate: Callable[[str], str]) -> None:
         self.code = code
         self._translate = translate
 
     def __call__(self, text: str, **values: object) -> str:
-        """A text of a page or of the station in this language; `values` for a page's own."""
+        """Translate a text; `values` fill a page's own texts."""
         said = translate(text, self._translate)
         return said.format(**values) if values else said
 
 
 @cache
 def translator(code: str) -> Translator:
-    """The translator to the language of a code. Raises KeyError for one that there is not."""
+    """The translator for a code. Raises KeyError for an unknown one."""
     if code not in NAMES:
         raise KeyError(code)
     if code == "en":
@@ -47,7 +47,7 @@ def translator(code: str) -> Translator:
 
 
 def chosen(wanted: str | None, accepted: Iterable[str]) -> Translator:
-    """To the language that an address asks for, else to the first that the browser takes."""
+    """The translator that the address selects, else the browser's first supported language."""
     for code in (wanted or "", *accepted):
         if code.split("-")[0].lower() in NAMES:
             return translator(code.split("-")[0].lower())

@@ -1,4 +1,4 @@
-"""Bikes without hardware, to try the bench with: each has a fault, or none."""
+"""Virtual bikes for trying the bench, each with or without a fault."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 
 _ONE_FAULT: Final = 1 << 3
 _HAND_S: Final = 2.0
-"""Until somebody has taken the power away, and for how long."""
+"""Delay and duration of a user's power interruption."""
 _OTHER_HARDWARE: Final = "V0r0r1_20200101"
 _FOREIGN: Final = bytes.fromhex("55AA168700000000")
-"""The beginning of a message that only a tool sends."""
+"""Begin of a message that only a tool sends."""
 
 
 class BikeFault(Enum):
-    """What is wrong with a virtual bike; the value is its name."""
+    """Fault of a virtual bike; the value is its name."""
 
     NONE = "virtual bike"
     POWER = "virtual bike 2"
@@ -55,7 +55,7 @@ NOTES: Final = {
 
 
 class _BikeClock:
-    """Passes only while somebody is on the bus: a bike that nobody looks at does nothing."""
+    """Advances only while the bus is in use: an unwatched bike does nothing."""
 
     def __init__(self, speed: float) -> None:
         self.speed = speed
@@ -77,7 +77,7 @@ class _BikeClock:
 
 
 class VirtualBike:
-    """Three devices that can be upgraded, on a bus of their own. `speed` 0 takes no time."""
+    """Three upgradable devices on their own bus. With `speed` 0 they take no time."""
 
     def __init__(self, fault: BikeFault, dialect: Dialect, *, speed: float = 1.0) -> None:
         self._fault = fault
@@ -111,7 +111,7 @@ class VirtualBike:
 
     @contextmanager
     def connect(self) -> Iterator[Connection]:
-        """Its bus, with the adapter plugged in."""
+        """Plug the adapter in and return the bus."""
         self._bus.plug()
         if isinstance(self._clock, _BikeClock):
             self._clock.resume()
@@ -124,7 +124,7 @@ class VirtualBike:
                 self._clock.rest()
 
     def begin(self, job: Job) -> None:
-        """An upgrade begins; its fault is going to happen."""
+        """Start an upgrade, which triggers the fault."""
         self._job = job
         device = self._devices.get(job.plan.target)
         if device is not None and self._fault is BikeFault.POWER and not job.options.at_power_up:

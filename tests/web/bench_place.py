@@ -22,7 +22,7 @@ from flasher.web.archive import Archive
 from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
-from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.guard import BODY_MAX, BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.server import Server
@@ -94,7 +94,7 @@ class BenchPlace:
         async def ask(question: Question) -> Answer:
             return await asyncio.to_thread(kept.answer, question)
 
-        entry = Entry(pages)
+        entry = BrowserEntry(pages)
         page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
         app = application(
             [*page.routes, *answer_routes(pages, ask, KEPT)], hosts={"127.0.0.1"},

@@ -23,7 +23,7 @@ from flasher.station.records.model import RunId, RunKind, RunState
 from flasher.station.shift_counts import ShiftCounts
 from flasher.station.socket import Source
 from flasher.web.guard import application
-from flasher.web.operator import Lot, OperatorPage, Screen
+from flasher.web.operator import CurrentLot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.server import Server
 
@@ -43,7 +43,7 @@ class LineScreen:
             ShiftCounts(), HealthWatch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0)
         )
         self.operator = "Jo"
-        self.lot = Lot("L17", 500, 12)
+        self.lot = CurrentLot("L17", 500, 12)
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._turn, daemon=True)

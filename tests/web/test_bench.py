@@ -31,7 +31,7 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.bench import Bench, Order
-from flasher.web.bench_page import failure_details
+from flasher.web.bench_page import battery_answers
 from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.translation import translator
 from flasher.web.virtual_bike import BikeFault
@@ -527,12 +527,12 @@ def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_wr
 
 def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
     state = place.do(order(Bench.use_adapter, BikeFault.NONE.value))
-    found = dict(failure_details(state))
+    found = dict(battery_answers(state))
     assert found["faults"] == [("faults", "none received")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
     ((_, faults),) = dict(
-        failure_details(place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value)))
+        battery_answers(place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value)))
     )["faults"]
     assert faults == "over discharge protection"
     assert translator("de")(faults) == "Schutz: Tiefentladung"

@@ -10,7 +10,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from flasher.web.guard import BODY_MAX, TOKEN_HEADER, Entry, application
+from flasher.web.guard import BODY_MAX, TOKEN_HEADER, BrowserEntry, application
 from flasher.web.pages import Pages
 
 _URL = "http://127.0.0.1:8740"
@@ -25,7 +25,7 @@ async def _write(request: Request) -> Response:
     return PlainTextResponse(str(len(await request.body())))
 
 
-def _client(entry: Entry | None = None) -> TestClient:
+def _client(entry: BrowserEntry | None = None) -> TestClient:
     app = application(
         [Route("/", _page), Route("/do", _write, methods=["POST"]), Route("/x/events", _page)],
         hosts={"127.0.0.1"},
@@ -127,7 +127,7 @@ def test_only_the_files_of_the_pages_are_served(client: TestClient, path: str) -
 
 
 def test_the_address_lets_one_browser_in_and_is_void_then() -> None:
-    entry = Entry(Pages())
+    entry = BrowserEntry(Pages())
     first = _client(entry=entry)
     assert first.get("/").headers["location"] == "/closed"
     assert first.get("/x/events").status_code == 401
@@ -143,7 +143,7 @@ def test_the_address_lets_one_browser_in_and_is_void_then() -> None:
 
 @pytest.mark.parametrize("key", ["", "?key=", "?key=guessed", "?key=%00"])
 def test_a_guessed_key_lets_nobody_in_and_does_not_void_the_address(key: str) -> None:
-    entry = Entry(Pages())
+    entry = BrowserEntry(Pages())
     client = _client(entry=entry)
     assert client.get(f"/enter{key}").headers["location"] == "/closed"
     assert client.get("/").headers["location"] == "/closed"

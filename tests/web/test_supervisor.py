@@ -262,7 +262,7 @@ def test_a_run_leads_to_its_unit_with_its_trace_explained(client: TestClient) ->
     assert answer.status_code == 200
     assert "W2605003" in answer.text
     assert "V1r0r4_20220512" in answer.text
-    assert 'aria-label="Who said what"' in answer.text
+    assert 'aria-label="Messages of the upgrade"' in answer.text
     story = client.get(
         _links(answer.text)["the whole story: phases, answer times, packets with trouble"]
     )

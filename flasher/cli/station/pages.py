@@ -42,7 +42,7 @@ from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
 from flasher.station.station import Station
 from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Badges, Login
-from flasher.web.operator import LINE, Lot, OperatorPage, Screen
+from flasher.web.operator import LINE, CurrentLot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server, Tls
@@ -86,7 +86,7 @@ class OperatorView:
             runs = self._station.store.read.table(RunFilter(lot=line.lot, part=rule.part))
             self._good = {run.serial: run.state is RunState.PASS for run in runs}
         self._lot = line.lot
-        lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
+        lot = CurrentLot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
         operator = line.operator or text("nobody: scan a badge")
         if not board.has_badges:
             operator = text("{name} (no badges)", name=line.operator)

@@ -49,7 +49,7 @@ from flasher.web.archive import Archive
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Activity, Adapter, Saved
-from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.guard import BODY_MAX, BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server
@@ -317,7 +317,7 @@ def serve(
     """
     ctx = click.get_current_context()
     pages = Pages(remembers_language=True)
-    entry = Entry(pages)
+    entry = BrowserEntry(pages)
     with (
         ExitStack() as stack,
         TemporaryDirectory(prefix="flasher-images-") as dropped,
