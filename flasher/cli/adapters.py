@@ -1,4 +1,4 @@
-"""Which adapters this computer has, in words, and which one a command uses that names none."""
+"""Detects the adapters of this computer, and chooses one for a command that names none."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from flasher.protocol.spec import Dialect
 from flasher.protocol.text import printable
 
 _NAMES: Final = ("device_name", "description")
-"""Where back ends and serial ports say what an adapter is called."""
+"""Keys under which back ends and serial ports give an adapter's name."""
 
 
 def detected_adapters(*, on_network: bool = False) -> DetectionResult:
-    """What is plugged in; servers on the network only when they are asked for. Takes 5 s at the
-    most. Raises InterruptedByUserError.
+    """Detect adapters, including servers on the network if `on_network`. Takes at most 5 s. Raises
+    InterruptedByUserError.
     """
     with stop_on_signal() as stopped:
         return detected_until(stopped, on_network=on_network)
 
 
 def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> DetectionResult:
-    """The same; `stopped` says when the user has enough."""
+    """Detect adapters until `stopped` returns True."""
     asked = set(interface_names()) - (frozenset() if on_network else SLOW)
     with Detection(sorted(asked)) as detection:
         found = detection.collect(stopped)
@@ -59,13 +59,13 @@ def ports() -> list[DetectedAdapter] | None:
 
 
 def interface_of(found: DetectedAdapter) -> Interface | None:
-    """What the kernel says of a SocketCAN interface; None of any other adapter."""
+    """State of a SocketCAN interface in the kernel; None for any other adapter."""
     seen = read_interface(found.channel) if found.interface == SOCKETCAN else None
     return seen if isinstance(seen, Interface) else None
 
 
 def described(found: DetectedAdapter, dialect: Dialect) -> str:
-    """An adapter in words: its state where the kernel tells it, its name, its serial number."""
+    """Text for an adapter: its state if known, its name, its serial number."""
     words = []
     seen = interface_of(found)
     if seen is not None and seen.is_up:
@@ -83,13 +83,13 @@ def described(found: DetectedAdapter, dialect: Dialect) -> str:
     return printable(", ".join(words))
 
 
-# -- the one that a command uses -------------------------------------------------------------------
+# -- the adapter of a command ----------------------------------------------------------------------
 
 
 def choose_adapter(bus: Bus, output: Output) -> Bus:
-    """The bus with an adapter: the only one found where nothing names one, which is said.
+    """The bus with an adapter: the only one detected if nothing names one, with a message.
 
-    Raises UsageError when several are found, BusError when none is.
+    Raises UsageError for several adapters, BusError for none.
     """
     if bus.mock or bus.is_named:
         return bus
@@ -102,7 +102,7 @@ def choose_adapter(bus: Bus, output: Output) -> Bus:
 
 
 def only(found: DetectedAdapter, bus: Bus, output: Output) -> Bus:
-    """The bus with the only adapter found."""
+    """The bus with the only detected adapter."""
     output.progress(f"no adapter is named: using the only one found, {printable(found.arguments)}")
     return replace(using(found, bus), found=found)
 
@@ -119,9 +119,9 @@ def using(found: DetectedAdapter, bus: Bus) -> Bus:
 
 
 def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOptions]) -> None:
-    """Before a device is changed through an adapter that nobody named: it has to be heard there.
+    """Make sure that the device is on an adapter that was chosen automatically, before changing it.
 
-    Raises NoAnswerError, having sent nothing but a question for its version.
+    Raises NoAnswerError, having sent at most a query for its version.
     """
     if bus.found is None:
         return
@@ -129,9 +129,9 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOp
     output.progress(f"listening for the {node} ...")
     if not device.is_present(**watch):
         error = NoAnswerError(
-            f"The {node} was not heard, and nobody named the adapter: nothing was changed.",
+            f"The {node} did not answer, and no option names the adapter: nothing was changed.",
             where=f"the only adapter found, {printable(device.connection.name)}",
-            cause="it is off or asleep, it speaks only when it is switched on, or it is on another "
+            cause="it is off or asleep, it sends only at power-up, or it is on another "
             "bus than that of this adapter",
             remedy="Wake it with its key. Where you know that it is on this bus, name the adapter.",
             code=ErrorCode.NOBODY_HEARD,

@@ -1,4 +1,4 @@
-"""A bar on stderr, where that is a terminal."""
+"""Progress bar on stderr, if that is a terminal."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from flasher.cli.output import Output
 
 
 class Bar:
-    """Only on a terminal, and not after -q. What is said meanwhile stands above it. A terminal that
-    goes away ends the bar, and nothing else.
+    """Shown only on a terminal, and not after -q. Messages meanwhile are printed above it. A lost
+    terminal ends the bar, and nothing else.
     """
 
     def __init__(self, output: Output, **look: Any) -> None:
@@ -29,7 +29,7 @@ class Bar:
         self.close()
 
     def move_to(self, done: float, total: float, *, note: str = "") -> None:
-        """So much of the total is done; the first call opens the bar."""
+        """Set the progress; the first call opens the bar."""
         if not self._is_wanted:
             return
         with self._guarded():
@@ -45,13 +45,13 @@ class Bar:
         return self._bar is not None
 
     def describe(self, text: str) -> None:
-        """What is being done, beside the bar."""
+        """Set the text beside the bar."""
         if self._bar is not None:
             with self._guarded():
                 self._bar.set_description_str(text)
 
     def close(self) -> None:
-        """Leave it as it is. Another one may begin."""
+        """Leave it on the screen. Another one may begin."""
         if self._bar is not None:
             with self._guarded():
                 self._bar.close()

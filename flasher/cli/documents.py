@@ -1,4 +1,4 @@
-"""What `--json` prints: types of documents, and how their values become JSON.
+"""Types of the documents that `--json` prints, and their conversion to JSON.
 
 A type that a command prints is printed as it is, or with the keys that it names
 (`flasher.validation.json_keys`). Only a view that differs from it is a document, a frozen dataclass
@@ -51,13 +51,13 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def as_json(document: object) -> Any:
-    """A document, an event or a part of one as JSON holds it."""
+    """A document, an event or a part of one as plain JSON values."""
     kind: Any = type(document)
     return adapter(kind).dump_python(document, mode="json")
 
 
 def document_of(kind: type[Kind], source: object, /, **others: Any) -> Kind:
-    """A document of a type: what `source` has by the same names, and the `others`."""
+    """Build a document from the attributes of `source` with the same names, and `others`."""
     names = {each.name for each in dataclasses.fields(cast("Any", kind))} - others.keys()
     return kind(**{name: getattr(source, name) for name in names}, **others)
 
@@ -86,14 +86,14 @@ def to_json(event: object) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Envelope:
-    """What the document of a command has, which is the last line; lines before it have `schema` and
+    """Envelope of a command's document, the last line; lines before it have `schema` and
     `event`.
     """
 
     schema: int
     """Version of this schema."""
     command: str | None
-    """The command that ran; null when none was named."""
+    """The command that ran; null without one."""
     ok: bool
     """True when the exit code is 0."""
     exit_code: ExitCode
@@ -101,18 +101,18 @@ class Envelope:
 
 @dataclass(frozen=True)
 class ErrorDocument:
-    """What went wrong. Texts may be empty, but for `kind` and `what`."""
+    """An error. Texts may be empty, except for `kind` and `what`."""
 
     kind: str
     """Name of the class in flasher.errors; FlasherError for a bug in flasher."""
     code: ErrorCode
-    """In short; `flasher help CODE` tells more."""
+    """Short code; `flasher help CODE` explains it."""
     what: str
     where: str
     cause: str
     remedy: str
     command: str
-    """The command that repairs what was left."""
+    """A command that repairs the device."""
     faults: tuple[Fault, ...]
     """Everything that is wrong with a file, where the error is about one."""
 
@@ -122,7 +122,7 @@ class ErrorDocument:
 
 @dataclass(frozen=True)
 class ImageDocument:
-    """What is in the file, and of it the bytes to be sent."""
+    """Contents of the file, and the bytes to be sent."""
 
     source: str
     format: str
@@ -142,7 +142,7 @@ class ImageDocument:
 
 @dataclass(frozen=True)
 class PlanDocument:
-    """What would be sent to whom, and how long that takes on the bus."""
+    """The bytes to be sent, their target, and the time on the bus."""
 
     target: str
     request_id: int
@@ -161,15 +161,15 @@ class PlanDocument:
 
 @dataclass(frozen=True)
 class HeardDocument:
-    """What was heard of one node."""
+    """Traffic received from one node."""
 
     frames: int
     messages: dict[str, int]
-    """How often each kind of message came."""
+    """Count of each kind of message."""
     last: dict[str, dict[str, FieldValue]]
     """The fields of the latest message of each kind."""
     damaged: int
-    """How often bytes came that made no message."""
+    """Count of byte sequences outside any message."""
     boot_version: str | None
     not_in_dialect: list[str]
     """Kinds of message that the document of --dialect does not have."""

@@ -1,4 +1,4 @@
-"""Packages that only some commands need."""
+"""Optional packages that only some commands need."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PACKAGES: Final = {
     "station": ("alembic", "argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("babel", "itsdangerous", "pygal", "starlette", "uvicorn"),
 }
-"""By the extra that brings them."""
+"""By extra."""
 
 
 def need(what: str, extra: str) -> None:
@@ -29,6 +29,6 @@ def need(what: str, extra: str) -> None:
 
 
 def how_to_install(extra: str) -> str:
-    """What brings the packages of an extra to the Python that runs this program."""
+    """The command that installs the packages of an extra into the running Python."""
     words = [sys.executable, "-m", "pip", "install", "-c", ".ci/constraints.txt", f".[{extra}]"]
     return f"In the checkout: {shlex.join(words)}"

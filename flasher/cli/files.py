@@ -1,4 +1,4 @@
-"""How commands write a file: whole or not at all."""
+"""Writes files atomically: complete or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flasher.files import make_private
 from flasher.protocol.text import printable
 
 _LINKS_MAX: Final = 40
-"""Links in a row that the operating system follows."""
+"""Limit of chained links, as in the operating system."""
 
 
 def check_writable(
@@ -24,9 +24,9 @@ def check_writable(
     *,
     is_appended_to: bool = False,
 ) -> None:
-    """Check before the work that a file can be written, where one is wanted, and that it is none of
-    the `others` (see `check_not_read`). Raises UsageError with the `option` that named the file.
-    Unless it `is_appended_to` it will be replaced: its folder has to be writable.
+    """Check before the work that the file, if any, can be written, and is none of the `others` (see
+    `check_not_read`). Raises UsageError with the `option` that named the file. Unless it
+    `is_appended_to` it will be replaced: its folder has to be writable.
     """
     if path is None:
         return
@@ -40,7 +40,7 @@ def check_writable(
 
 
 def check_new(path: Path, option: str, *, force: bool) -> None:
-    """`check_writable` for a file that is replaced by `force` alone. Raises UsageError."""
+    """`check_writable` for a file that only `force` may replace. Raises UsageError."""
     check_writable(path, option)
     if path.exists() and not force:
         raise UsageError(
@@ -57,7 +57,7 @@ def _can_be_replaced(path: Path) -> bool:
         path = path.resolve(strict=False)
         is_special = path.exists() and not path.is_file()
     except (OSError, RuntimeError):
-        return True  # writing it will tell why not
+        return True  # writing it reports the reason
     return is_special or os.access(path.parent, os.W_OK)
 
 
@@ -75,15 +75,15 @@ def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> N
             raise UsageError(
                 f"{printable(str(path))} is a file of the command itself.",
                 where=option,
-                remedy="Name another file: this one would be written over.",
+                remedy="Name another file: this one would be overwritten.",
                 code=ErrorCode.FILE_NOT_WRITTEN,
             )
 
 
 def write_whole(path: Path, data: bytes, option: str, *, is_private: bool = False) -> None:
-    """Write a file whole or not at all; one that `is_private` only its owner may read. A link is
-    followed, unless another user created it; a pipe or device is written into, not replaced. Raises
-    UsageError with the `option` that named it.
+    """Write a file atomically; if `is_private`, only its owner may read it. A link is followed,
+    unless another user created it; a pipe or device is written to, not replaced. Raises UsageError
+    with the `option` that named it.
     """
     try:
         # Inside: a link that leads to itself cannot be resolved.
@@ -101,10 +101,9 @@ def write_whole(path: Path, data: bytes, option: str, *, is_private: bool = Fals
 
 @contextlib.contextmanager
 def writing(path: Path, option: str) -> Iterator[Path]:
-    """A name beside `path`, with its suffixes, for what is written piece by piece: it takes the
-    place of `path` when the block ends well, else it is removed. Its owner alone may read it.
-    Raises UsageError with the
-    `option` that named the file.
+    """A temporary name beside `path`, with its suffixes, for data written in pieces: it replaces
+    `path` when the block succeeds, else it is removed. Only its owner may read it. Raises
+    UsageError with the `option` that named the file.
     """
     check_writable(path, option)
     if path.exists() and not path.is_file():
@@ -114,7 +113,7 @@ def writing(path: Path, option: str) -> Iterator[Path]:
         _check_links(path, option)
         make_private(part)
         yield part
-        make_private(part, is_appended_to=True)  # whoever wrote it may have made it anew
+        make_private(part, is_appended_to=True)  # the writer may have recreated it
         part.replace(path.resolve(strict=False))
     except OSError as error:
         raise _not_written(path, option, error.strerror or type(error).__name__) from error
@@ -131,12 +130,12 @@ def _check_links(path: Path, option: str) -> None:
         if not path.is_symlink():
             return
         if hasattr(os, "geteuid") and path.lstat().st_uid not in (0, os.geteuid()):
-            raise _not_written(path, option, "it is a link that another user laid")
+            raise _not_written(path, option, "it is a link of another user")
         path = path.parent / path.readlink()
 
 
 def _replace(path: Path, data: bytes, *, is_private: bool) -> None:
-    # A name that nobody knows before, and "x": what is laid there already is never followed.
+    # An unpredictable name, and "x": a link placed there before is never followed.
     part = path.with_name(f".flasher-{token_hex(8)}.part")
     try:
         with part.open("xb") as file:
@@ -144,7 +143,7 @@ def _replace(path: Path, data: bytes, *, is_private: bool) -> None:
                 make_private(part)
             file.write(data)
         part.replace(path)
-    except BaseException:  # an interrupt too leaves nothing half written
+    except BaseException:  # an interrupt leaves no partial file either
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise

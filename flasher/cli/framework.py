@@ -41,18 +41,18 @@ Decorator = Callable[[Any], Any]
 
 
 class Session:
-    """One run of the program: what it says, and what the output options ask for."""
+    """One run of the program, with its output options."""
 
     def __init__(self, output: Output, logs: Logs, words: Sequence[str]) -> None:
         self.output = output
         self.command_line = [without_password(word) for word in words]
-        """As typed, but for passwords."""
+        """As typed, without passwords."""
         self._logs = logs
         self._verbosity = 0
         self._log_file: str | None = None
 
     def take(self, name: str, value: Any) -> None:
-        """An output option, before the command or behind it."""
+        """Set an output option, given before or after the command."""
         match name:
             case "verbose":
                 self._verbosity += len(value)
@@ -66,8 +66,8 @@ class Session:
                 self._log_file = value
 
     def begin(self) -> None:
-        """A command is going to run. Raises UsageError for output options that do not go
-        together, and for a log file that cannot be written.
+        """Start a command. Raises UsageError for output options that exclude each other, and for a
+        log file that cannot be written.
         """
         output = self.output
         output.verbosity = self._verbosity
@@ -91,7 +91,7 @@ def _session(ctx: click.Context) -> Session:
 
 
 class _Parameter(rich_click.RichParameter):
-    """A parameter that notes its text as typed."""
+    """A parameter that records its text as typed."""
 
     def consume_value(self, ctx: click.Context, opts: Mapping[str, Any]) -> tuple[Any, Any]:
         value, source = super().consume_value(ctx, opts)
@@ -101,7 +101,7 @@ class _Parameter(rich_click.RichParameter):
 
 
 class Option(_Parameter, rich_click.RichOption):
-    """An option; `brief` ones are in the short help too."""
+    """An option; `brief` ones also appear in the short help."""
 
     def __init__(self, *args: Any, brief: bool = False, **more: Any) -> None:
         more.setdefault("show_default", more.get("default") is not None)
@@ -110,7 +110,7 @@ class Option(_Parameter, rich_click.RichOption):
         self.brief = brief or self.required
 
     def get_error_hint(self, ctx: click.Context | None) -> str:
-        """As people write it."""
+        """The option as users type it."""
         return "/".join(self.opts)
 
 
@@ -133,8 +133,8 @@ def argument(name: str, **more: Any) -> Decorator:
 
 def option_set(name: str, gather: type[Any], *options: Decorator) -> Decorator:
     """Options that belong together: the command receives `gather(...)` of them as one argument.
-    `gather` is a dataclass with a field for each of `options` and for those that fields are
-    annotated with: `limit: Annotated[int, option("--limit", ...)]`.
+    `gather` is a dataclass with a field for each of `options`, and for each option in an
+    annotation: `limit: Annotated[int, option("--limit", ...)]`.
     """
     own = [each.name for each in fields(gather)]
     hints = get_type_hints(gather, include_extras=True)
@@ -153,18 +153,18 @@ def option_set(name: str, gather: type[Any], *options: Decorator) -> Decorator:
     return decorate
 
 
-# -- what was typed --------------------------------------------------------------------------------
+# -- the typed command line ------------------------------------------------------------------------
 
 
 def command_line() -> list[str]:
-    """The words that the running command was called with, without passwords."""
+    """The arguments of the running command, without passwords."""
     ctx = click.get_current_context(silent=True)
     return sys.argv[1:] if ctx is None else _session(ctx).command_line
 
 
 def typed_values(*, but: str) -> list[str]:
-    """The texts that the running command was called with, which may name files: all values `but`
-    those of one option.
+    """The typed values of the running command, which may name files: all `but` those of one
+    option.
     """
     ctx = click.get_current_context(silent=True)
     found: list[str] = []
@@ -182,10 +182,11 @@ def rebuild_command_line(
     without: Callable[[str], bool] = lambda _option: False,
     replaced: Mapping[str, str] | None = None,
 ) -> list[str]:
-    """The words that run `command` with what was typed for the command of `ctx`, passwords hidden.
+    """A command line that runs `command` with the arguments of the command of `ctx`, passwords
+    hidden.
 
-    `without` tells which options are left out, by their long names; `replaced` has other values for
-    arguments, by their names.
+    `without` selects options to omit, by their long names; `replaced` maps names of arguments to
+    other values.
     """
     typed = {**_typed(ctx), **(replaced or {})}
     positional: list[str] = []
@@ -246,11 +247,11 @@ def _output_option(*names: str, callback: Callable[..., None] = _take, **more: A
 
 
 def _output_options() -> list[click.Parameter]:
-    """Every command has them."""
+    """Options of every command."""
     return [
         _output_option(
             "-v", "--verbose", multiple=True,
-            help="say more, and show the log on stderr; twice for everything",
+            help="print more, and show the log on stderr; twice for everything",
         ),
         _output_option("-q", "--quiet", multiple=True, help="say less"),
         _output_option(
@@ -261,7 +262,7 @@ def _output_options() -> list[click.Parameter]:
         ),
         _output_option(
             LOG_FILE, metavar="FILE", type=FilePath(),
-            help="append everything to this log, with times, whatever -v and -q say",
+            help="append everything to this log, with times, regardless of -v and -q",
         ),
         _output_option(
             "-h", "brief_help", callback=_show, is_eager=True, brief=True,
@@ -269,7 +270,7 @@ def _output_options() -> list[click.Parameter]:
         ),
         _output_option(
             "--help", callback=_show, is_eager=True, brief=True,
-            help="show every option, the exit codes, and what is read besides",
+            help="show every option, the exit codes, files and environment variables",
         ),
     ]  # fmt: skip
 
@@ -290,14 +291,14 @@ class _OurCommand(HelpedCommand):
         return {name.lstrip("-") for param in self.params for name in param.opts}
 
     def _whole_name(self, token: str) -> str:
-        """The long option that begins like this, if there is one alone."""
+        """The long option with this unique prefix."""
         matches = [name for name in self._names if name.startswith(token)]
         is_whole = len(token) == 1 or token in self._names
         return token if is_whole or len(matches) != 1 else matches[0]
 
 
 class Command(_OurCommand):
-    """A command that runs: its function takes the output and returns the exit code."""
+    """A command whose function takes the output and returns the exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
         session = _session(ctx)
@@ -310,11 +311,11 @@ class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-cl
     """A command that has actions (`flasher profile show`)."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """As they are declared: what is needed first comes first."""
+        """In the order of declaration, the most used first."""
         return list(self.commands)
 
     def action(self, name: str, **more: Any) -> Callable[[Callable[..., int]], Command]:
-        """Make an action of a function; its exit codes are the group's where none are given."""
+        """Make a function an action; its exit codes default to the group's."""
 
         def make(function: Callable[..., int]) -> Command:
             summary = (function.__doc__ or "").partition(".")[0]
@@ -327,13 +328,13 @@ class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-cl
 
 
 def command(**more: Any) -> Callable[[Callable[..., int]], Command]:
-    """Make a command of a function, whose docstring is the beginning of the help."""
+    """Make a function a command; its docstring begins the help."""
     return click.command(cls=Command, **more)
 
 
 def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., Any]], Group]:
-    """Make a command that has actions of a function, whose docstring is the beginning of the help.
-    With `runs_alone` the function is the command's own where no action is named.
+    """Make a function a command with actions; its docstring begins the help. With `runs_alone` the
+    function runs when no action is named.
     """
 
     def make(function: Callable[..., Any]) -> Group:
@@ -359,27 +360,25 @@ def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., A
 
 @dataclass(frozen=True)
 class Entry:
-    """A command of the program: where it is, and its line in the list of commands."""
+    """A command of the program: its location, and its line in the list of commands."""
 
     place: str
-    """Module below flasher.cli, and the name in it: "upgrade.flash:rescue"."""
+    """Module in flasher.cli, and the name in it: "upgrade.flash:rescue"."""
     summary: str
 
     def module(self) -> ModuleType:
-        """Import the module that it is in."""
         return importlib.import_module(f"flasher.cli.{self.place.partition(':')[0]}")
 
     def load(self) -> click.Command:
-        """Import the command."""
         found: click.Command = getattr(self.module(), self.place.partition(":")[2])
         return found
 
 
 class Program(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-click's own bases
-    """The program. A command is imported when it is called, or its help is asked for."""
+    """The program. It imports a command when it is called, or its help is requested."""
 
     def __init__(self, *args: Any, entries: Mapping[str, Mapping[str, Entry]], **more: Any) -> None:
-        """`entries` are the commands, by what they are for and by their names."""
+        """`entries` are the commands, by section and name."""
         super().__init__(
             *args,
             exit_codes=ExitCode,
@@ -408,7 +407,7 @@ class Program(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-
 
 
 def usage_error(wrong: click.UsageError, command: str | None) -> UsageError:
-    """What click says of the command line of `command`, as all other errors are reported."""
+    """Converts click's error about the command line of `command`."""
     ctx = wrong.ctx
     program = ctx.command_path if ctx else " ".join(filter(None, ("flasher", command)))
     close = getattr(wrong, "possibilities", None)

@@ -1,4 +1,4 @@
-"""What help says behind the options: examples, exit codes, files and environment."""
+"""Help text after the options: examples, exit codes, files and environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flasher.cli.terminal import wrap_line
 from flasher.errors import ExitCode
 
 BRIEF: Final = "flasher.brief"
-"""Key in `Context.meta`: True while the short help is made."""
+"""Key in `Context.meta`: True for the short help."""
 STYLE: Final = {
     "theme": "default-slim",
     "max_width": 100,
@@ -28,7 +28,7 @@ STYLE: Final = {
 }
 """Settings of rich-click."""
 _WIDTH: Final = 100
-"""Columns that examples take where there is no terminal."""
+"""Width of examples without a terminal."""
 _EXAMPLE: Final = re.compile(r"(\s+flasher .*?\S) {3,}(\S.*)")
 _MEANINGS: Final[Mapping[ExitCode, str]] = {
     ExitCode.OK: "done",
@@ -52,7 +52,7 @@ CAN_FILES: Final = {
     "Darwin": ("~/.canrc", "~/.can", "/etc/can.conf", "~/can.conf"),
     "Windows": (r"%APPDATA%\can.ini", "can.ini", "~/can.conf"),
 }
-"""python-can's configuration files on each system; what an earlier one says goes first."""
+"""python-can's configuration files on each system; an earlier one takes precedence."""
 _OWN_CAN_FILES: Final = CAN_FILES.get(platform.system(), ("~/can.conf",))
 
 
@@ -75,31 +75,31 @@ _READ_FOR: Final = {
   FLASHER_BUNDLE_DIR                 where bundles are looked for
 """,
 }
-"""Environment variables and files, by the option that stands for them."""
+"""Environment variables and files, by the option that replaces them."""
 _READ_ALWAYS: Final = """\
   NO_COLOR                           set to anything: no colours
 """
 
 
 class HelpedCommand(rich_click.RichCommand):
-    """A command with sections of ours in its help; `-h` leaves out what is not brief."""
+    """A command with additional sections in its help; `-h` omits options that are not brief."""
 
     def __init__(self, *args: Any, exit_codes: Iterable[ExitCode] = (), **more: Any) -> None:
-        """`exit_codes` are those that it can end with besides done, wrong usage and a bug."""
+        """`exit_codes` are added to those of every command: done, wrong usage and a bug."""
         super().__init__(*args, **more)
         self.exit_codes = exit_codes
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """The parameters; in the short help those that are needed most."""
+        """The parameters; in the short help only the most needed."""
         if ctx.meta.get(BRIEF):
             return [param for param in self.params if getattr(param, "brief", True)]
         return self.params
 
     def get_help_option(self, ctx: click.Context) -> None:
-        """None of click's: ours are among the output options."""
+        """Replaced by the output options."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Examples; in the whole help exit codes, files and environment too."""
+        """Examples; in the full help also exit codes, files and environment."""
         sections = [(self.epilog or "").strip("\n")]
         if ctx.meta.get(BRIEF):
             examples = sections[0].partition("\n\n")[0]
@@ -122,7 +122,7 @@ class HelpedCommand(rich_click.RichCommand):
 
 
 def _laid_out(section: str, width: int) -> Iterator[str]:
-    """The lines of a section: indented ones stay as they are where they fit, prose is filled."""
+    """The lines of a section: indented ones stay as they are if they fit, other text is wrapped."""
     for is_prose, group in itertools.groupby(
         section.splitlines(), lambda line: bool(line[:1].strip())
     ):

@@ -1,7 +1,7 @@
-"""Where log records go while a command runs: to stderr for -v and -vv, and into --log-file.
+"""Log handlers of a command: to stderr for -v and -vv, and into --log-file.
 
-What the command prints itself is in the log file too, but not on stderr a second time. A log that
-cannot be written any more (the disk is full) never disturbs the command; it is told at the end.
+The log file also has the output of the command, which is not repeated on stderr. A log that can no
+longer be written (the disk is full) never disturbs the command; it is reported at the end.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FILE_CAN_LEVEL: Final = logging.INFO
 
 
 class Logs:
-    """The handlers of one command. They are removed at the end, and levels put back."""
+    """The handlers of one command, removed at its end, with levels restored."""
 
     def __init__(self, output: Output) -> None:
         self._output = output
@@ -50,7 +50,7 @@ class Logs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # A bus that could not be opened complains when it is forgotten: not on a bare stderr.
+        # A bus that failed to open logs when it is deleted: not on a bare stderr.
         logging.getLogger(_PYTHON_CAN).addHandler(_NOWHERE)
         while self._restore:
             logger, level, handler = self._restore.pop()
@@ -62,8 +62,8 @@ class Logs:
                 self._output.say(f"warning: {self._file.failure}")
 
     def open(self, verbosity: int, log_file: str | None, others: Iterable[object] = ()) -> None:
-        """Begin. Raises UsageError when the log file cannot be written, or is one of the `others`:
-        the texts of the command line, which may name an image.
+        """Begin. Raises UsageError if the log file cannot be written, or is one of the `others`:
+        arguments that may name an image.
         """
         self._attach(_Screen(self._output), *_ON_STDERR[max(-1, min(verbosity, 2))])
         if log_file is not None:
@@ -103,7 +103,7 @@ class _Screen(logging.Handler):
 
 
 class _File(logging.FileHandler):
-    """Every record with its time, appended. `failure` says why it is incomplete, if it is."""
+    """Appends every record with its time. `failure` explains an incomplete log."""
 
     def __init__(self, path: Path) -> None:
         check_writable(path, LOG_FILE, is_appended_to=True)
@@ -127,7 +127,7 @@ class _File(logging.FileHandler):
         return head + "\n    ".join(_lines(record))
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
-        """A record that cannot be written is left out."""
+        """Skips a record that cannot be written."""
         self._fail()
 
     def close(self) -> None:
@@ -141,7 +141,7 @@ class _File(logging.FileHandler):
 
 
 def _lines(record: logging.LogRecord) -> list[str]:
-    """The text of a record. What the command has printed was escaped where it came from."""
+    """The text of a record. Output of the command was escaped at its source."""
     text = hide_passwords(record.getMessage())
     if record.exc_info:
         text += "\n" + hide_passwords(logging.Formatter().formatException(record.exc_info))

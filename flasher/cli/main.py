@@ -1,4 +1,4 @@
-"""Entry point: runs a command, and turns every error into one message and an exit code."""
+"""Entry point: runs a command, and turns every error into a message and an exit code."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
         "ui": Entry("upgrade.ui:ui", "upgrade a bike in a browser, step by step"),
         "image-info": Entry(
             "upgrade.image_info:image_info",
-            "what is in a file, what would be sent, how long it takes",
+            "show an image, the bytes to be sent, and the time it takes",
         ),
-        "history": Entry("upgrade.history:history", "what this computer has flashed"),
+        "history": Entry("upgrade.history:history", "list the upgrades made from this computer"),
         "manifest": Entry(
             "upgrade.manifest:manifest", "create or check the release manifest of an image"
         ),
@@ -46,33 +46,33 @@ PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
         "info": Entry(
             "look.info:info", "identity, versions, state, faults and history of a device"
         ),
-        "scan": Entry("look.scan:scan", "who is on the bus, and which dialect is spoken"),
+        "scan": Entry("look.scan:scan", "list the devices on the bus, and identify its dialect"),
         "read": Entry("look.read:read", "read an item of a device by its name, or its memory"),
         "write": Entry(
             "look.write:write", "write an item of a device by its name, and read it back"
         ),
         "backup": Entry(
-            "look.backup:backup", "save a device's memory and everything it tells to a file"
+            "look.backup:backup", "save a device's memory and all its answers to a file"
         ),
         "monitor": Entry(
             "look.monitor:monitor", "show decoded traffic, live or of a recorded trace"
         ),
         "export": Entry(
-            "look.export:export", "the protocol and traces for Wireshark and other tools"
+            "look.export:export", "convert the protocol and traces for Wireshark and other tools"
         ),
     },
     "when something goes wrong": {
         "adapters": Entry(
             "look.adapters:adapters",
-            "what is plugged into this computer, with the arguments that use it",
+            "list the adapters of this computer, with the arguments for each",
         ),
         "doctor": Entry(
             "look.doctor:doctor",
-            "look at adapters, bus and traffic, and say what fixes what is wrong",
+            "check adapters, bus and traffic, and suggest repairs",
         ),
-        "help": Entry("look.help:help_", "what stands behind an error code, as E402"),
+        "help": Entry("look.help:help_", "explain an error code, as E402"),
         "explain": Entry(
-            "look.explain:explain", "the story of a recorded trace or a bundle, with a verdict"
+            "look.explain:explain", "explain a recorded trace or a bundle, with a verdict"
         ),
     },
     "without hardware, and for bootloaders": {
@@ -89,11 +89,11 @@ PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
     "what a product does its own way": {
         "profile": Entry(
             "upgrade.profile:profile",
-            "what a target profile sets, and where each value comes from",
+            "show the settings of a target, and where each comes from",
         ),
     },
 }
-"""The commands, by what they are for."""
+"""The commands, by purpose."""
 COMMANDS: Final = {name: each for group in PURPOSES.values() for name, each in group.items()}
 _EPILOG: Final = """\
 examples:
@@ -103,8 +103,8 @@ examples:
   flasher flash firmware.hex -t mc -i pcan -c PCAN_USBBUS1 --trace-file upgrade.asc
   flasher mock -t bms -i socketcan -c vcan0 --save-image received.bin
 
-`flasher COMMAND -h` tells what a command needs most, `flasher COMMAND --help` everything;
-`flasher help CODE` what stands behind the code of an error, as E402.
+`flasher COMMAND -h` shows the most used options, `flasher COMMAND --help` everything;
+`flasher help CODE` explains the code of an error, as E402.
 """
 _COMPLETE: Final = "_FLASHER_COMPLETE"
 """Set by a shell that completes a command line."""
@@ -142,7 +142,7 @@ def _run(session: Session, words: list[str]) -> int:
 
 
 def _guarded(run: Callable[[], int], output: Output) -> int:
-    """Run, and turn whatever is raised into a message and its exit code."""
+    """Run, and turn any exception into a message and its exit code."""
     try:
         return run()
     except FlasherError as error:
@@ -165,7 +165,7 @@ def _guarded(run: Callable[[], int], output: Output) -> int:
 
 
 def _unfinished(output: Output) -> str:
-    """What an end at once may have left behind. Commands that only look leave nothing."""
+    """Possible state of the device after an immediate end. Read-only commands leave none."""
     if output.command not in _CHANGING:
         return ""
     return (
@@ -177,8 +177,8 @@ def _unfinished(output: Output) -> str:
 @click.group(cls=Program, entries=PURPOSES, epilog=_EPILOG)
 @click.pass_context
 def flasher(ctx: click.Context) -> int:
-    """Upgrade the firmware of Welling mid-drive e-bike systems over CAN, and look at what they say.
-    Plays the CAN dongle (CDL) on any adapter that python-can drives, or on a built-in device model
+    """Upgrade the firmware of Welling mid-drive e-bike systems over CAN, and read their data. Acts
+    as the CAN dongle (CDL) on any adapter that python-can supports, or on a built-in device model
     (--mock).
     """
     output = ctx.ensure_object(Session).output

@@ -1,4 +1,4 @@
-"""Options that several commands have, each declared once: image, target, bus and mock."""
+"""Options shared by several commands: image, target, bus and mock."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from flasher.settings.profile import FILE_NAME, find_bus
 
 
 def target_option(*, required: bool = True) -> Decorator:
-    """Which device."""
+    """The -t/--target option."""
     return option(
         "-t", "--target", type=values.target, required=required, brief=True, panel="device",
         metavar="|".join((*TARGETS, *TARGET_ALIASES)),
@@ -42,7 +42,7 @@ def target_option(*, required: bool = True) -> Decorator:
 
 dialect_option: Final = option(
     "--dialect", "dialect_name", type=click.Choice(tuple(DIALECTS)), default=WELLING.name,
-    panel="device", help="which protocol document holds",
+    panel="device", help="the protocol document in use",
 )  # fmt: skip
 profile_option: Final = option(
     "--profile", metavar="FILE", type=values.FilePath("toml"), panel="device",
@@ -55,7 +55,7 @@ profile_option: Final = option(
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """An image file, and what decides which of its bytes are sent."""
+    """An image file, and the selection of its bytes."""
 
     image: Annotated[str, argument(
         "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
@@ -63,7 +63,7 @@ class ImageOptions:
     )]  # fmt: skip
     format: Annotated[str | None, option(
         "--format", type=click.Choice(FORMATS), panel="image",
-        help="read IMAGE as this, do not detect",
+        help="format of IMAGE, instead of detecting it",
     )]  # fmt: skip
     base: Annotated[int | None, option(
         "--base", type=values.number, metavar="ADDRESS", panel="image", brief=True,
@@ -84,7 +84,7 @@ class ImageOptions:
     )]  # fmt: skip
 
     def load(self, *, force: bool = False) -> Image:
-        """The image. Raises ImageError, UsageError."""
+        """Load the image. Raises ImageError, UsageError."""
         return load(
             self.image,
             format=self.format,
@@ -99,7 +99,7 @@ image_options: Final = option_set("image", ImageOptions)
 
 
 def allow_implausible_option(panel: str | None = None) -> Decorator:
-    """For a command that has no other --allow-... for a device."""
+    """For a command without other --allow-... options."""
     return option(
         "--allow-implausible",
         is_flag=True,
@@ -109,7 +109,6 @@ def allow_implausible_option(panel: str | None = None) -> Decorator:
 
 
 def gap_options(function: Callable[..., int]) -> Callable[..., int]:
-    """--frame-gap and --packet-gap."""
     frame_gap_max_s = FRAME_GAP_SHARE * DEFAULT_TIMINGS.inter_frame_timeout_s
     function = option(
         "--packet-gap", "packet_gap_s", type=values.seconds, metavar="S", panel="upgrade",
@@ -145,7 +144,7 @@ def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:
 
 
 def can_filter(text: str) -> dict[str, int]:
-    """A filter of python-can: ID:MASK, or ID~MASK for all others, in hexadecimal."""
+    """A filter of python-can: ID:MASK, or ID~MASK for all other ids, in hexadecimal."""
     match = _FILTER.fullmatch(text)
     if match is None:
         raise click.BadParameter(f"{text!a} is not ID:MASK in hexadecimal")
@@ -155,7 +154,7 @@ def can_filter(text: str) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Bus:
-    """The bus that the options name: an adapter, or a device model in this process."""
+    """The bus of a command: an adapter, or a device model in this process."""
 
     dialect_name: str = WELLING.name
     mock: bool = False
@@ -199,16 +198,16 @@ class Bus:
     settings: str | None = None
     """A file that may name the adapter, as --profile names one."""
     found: DetectedAdapter | None = None
-    """The adapter, where nothing names one: the only one found (`flasher.cli.adapters`)."""
+    """The only detected adapter, if nothing names one (`flasher.cli.adapters`)."""
 
     @property
     def dialect(self) -> Dialect:
-        """The protocol document that holds."""
+        """The protocol document in use."""
         return as_dialect(self.dialect_name)
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """The keywords for python-can that were given on the command line."""
+        """python-can's keywords from the command line."""
         given = {name: getattr(self, name) for name in _KEYWORDS if getattr(self, name) is not None}
         if self.timing:
             given["timing"] = _timing(self.timing)
@@ -222,7 +221,7 @@ class Bus:
 
     @cached_property
     def fallback(self) -> Fallback | None:
-        """What a file of settings names. Raises UsageError for a file that is wrong."""
+        """The bus of the settings file. Raises UsageError for an invalid file."""
         return None if self.mock else find_bus(self.settings)
 
     @cached_property
@@ -233,12 +232,12 @@ class Bus:
         return names_adapter(self.config, self.fallback)
 
     def with_profile(self, file: str | None) -> Bus:
-        """The same, but a table [bus] of the file after --profile goes before those of others."""
+        """The same, but a table [bus] of the --profile file takes precedence."""
         return replace(self, settings=file)
 
     @cached_property
     def bit_rate(self) -> BitRate:
-        """Asked once: what is planned, said and recorded. Raises UsageError, BusError."""
+        """Read once, so that plan, messages and records agree. Raises UsageError, BusError."""
         if self.mock:
             return BitRate(self.dialect.bitrate_bps, "the dialect's")
         return settle_bit_rate(self.dialect, fallback=self.fallback, **self.config)
@@ -250,7 +249,7 @@ class Bus:
         be sent.
         """
         if self.mock:
-            riding = DeviceProfile(battery_use="riding")  # so that there is something to see
+            riding = DeviceProfile(battery_use="riding")  # so that traffic is visible
             return connect_mock(
                 target, self.dialect, speed=self.mock_speed, system=True, profile=riding
             )
@@ -264,14 +263,14 @@ class Bus:
 
 
 def holder() -> str:
-    """What other programs are told of this command while it has the adapter."""
+    """Name of this command for other programs, while it has the adapter."""
     return " ".join(click.get_current_context().command_path.split()[:2])
 
 
 def mock_options(
     what: str, speed: Callable[[str], float] = values.seconds
 ) -> tuple[Decorator, ...]:
-    """--mock and its speed; `what` says what it is used for."""
+    """--mock and its speed; `what` describes its use."""
     return (
         option("--mock", is_flag=True, panel="without hardware", brief=True, help=what),
         option(
@@ -290,6 +289,6 @@ def bus_options(
     mock: str | None = "use a device model in this process",
     speed: Callable[[str], float] = values.seconds,
 ) -> Decorator:
-    """The bus of a command: dialect, adapter, and the mock in its place unless that is None."""
+    """Options of the bus: dialect, adapter, and the mock instead unless that is None."""
     in_its_place = () if mock is None else mock_options(mock, speed)
     return option_set("bus", Bus, dialect_option, *in_its_place)

@@ -1,9 +1,9 @@
-"""Where everything that flasher says goes: results to stdout, the rest to stderr, or JSON; and all
-of it into the log, for `--log-file` (flasher.cli.logs).
+"""Prints all output of flasher: results to stdout, the rest to stderr, or JSON; and all of it to
+the log, for `--log-file` (flasher.cli.logs).
 
-Device text and file names reach this place escaped (flasher.protocol.text). A reader that goes away
-(`| head`) or a terminal that does changes nothing about a running upgrade: what cannot be said is
-left out, and the exit code tells.
+Device text and file names arrive here escaped (flasher.protocol.text). A closed pipe (`| head`) or
+a lost terminal changes nothing about a running upgrade: output that cannot be printed is dropped,
+and the exit code reports the result.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SAID: Final = {"said": True}
 
 
 class ClosingLine(NamedTuple):
-    """The end of a command in one line; it says in words what its colour says."""
+    """Last line of a command; its text is complete without its colour."""
 
     word: str
     text: str
@@ -53,24 +53,24 @@ class Output:
         self.events_wanted = False
         """True when each event is to be a JSON line."""
         self.command: str | None = None
-        """Name of the command that runs; None before it is known."""
+        """Name of the running command; None before it is known."""
         self.shows: Callable[[object], bool] = lambda _event: False
         """Whether the command prints an event itself: -v does not log it once more."""
         self.ending: Callable[[FlasherError], ClosingLine] | None = None
-        """What the last line says of an error, for a command that ends with a verdict."""
+        """Formats the last line for an error, in a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
-        # A terminal that is gone does not say any more that it is one.
+        # A lost terminal no longer reports that it is one.
         self._terminals = [each for each in (sys.stdout, sys.stderr) if each.isatty()]
 
     def leave_terminal(self, why: str) -> None:
-        """Say nothing more where a terminal was; files and pipes still get everything."""
+        """Print nothing more to a terminal; files and pipes still get everything."""
         _LOG.warning("%s", why, extra=SAID)
         for stream in self._terminals:
             _give_up(stream)
 
     def say(self, text: str) -> None:
-        """Write to stderr, wrapped at the window."""
+        """Write to stderr, wrapped at the window's width."""
         self.write_stderr(wrapped(text, sys.stderr))
 
     def restore_stderr(self) -> None:
@@ -83,28 +83,28 @@ class Output:
         return takes_colour(sys.stderr)
 
     def result(self, text: str) -> None:
-        """A line of the result; silent when JSON is wanted."""
+        """Print a line of the result; silent with --json."""
         if not self.json_wanted:
             _LOG.info("%s", unpainted(text), extra=SAID)
             _print_stdout(wrapped(text, sys.stdout))
 
     def results(self, lines: Iterable[str]) -> None:
-        """Lines of the result."""
+        """Print lines of the result."""
         for line in lines:
             self.result(line)
 
     def table(self, rows: Iterable[Sequence[str]], *, indent: int = 0) -> None:
-        """Rows of the result, in columns."""
+        """Print rows of the result, in columns."""
         if not self.json_wanted:
             self.results(columns(rows, indent=indent))
 
     def text(self, text: str) -> None:
-        """A file's worth of the result, as it is; silent when JSON is wanted."""
+        """Print a whole file as the result, unchanged; silent with --json."""
         if not self.json_wanted:
             _print_stdout(text.removesuffix("\n"))
 
     def print_help(self, text: str) -> None:
-        """Help, laid out for the window; it is printed when JSON is wanted too."""
+        """Print help, laid out for the window; also with --json."""
         _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
 
     def document(
@@ -125,9 +125,7 @@ class Output:
         return exit_code
 
     def line(self, line: object) -> None:
-        """A line of JSON that a command prints before its document; silent when no JSON is wanted.
-        It has the key `event`.
-        """
+        """Print a JSON line before the document; silent without --json. It has the key `event`."""
         if self.json_wanted:
             fields = line if isinstance(line, Mapping) else as_json(line)
             text = json.dumps({"schema": SCHEMA_VERSION, **fields})
@@ -135,24 +133,24 @@ class Output:
             _print_stdout(text)
 
     def event(self, event: object) -> None:
-        """An event of flasher.events, as a line of JSON when --events asks for it."""
+        """Print an event of flasher.events as a JSON line, with --events."""
         if self.events_wanted:
             self.line(to_json(event))
 
     def progress(self, text: str, *, level: int = 0) -> None:
-        """A line on how it goes."""
+        """Print a line of progress."""
         _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=SAID)
         if self.verbosity >= level:
             self.say(text)
 
     def error_line(self, text: str) -> None:
-        """A line that is never silenced."""
+        """Print a line that -q does not silence."""
         _LOG.error("%s", unpainted(text), extra=SAID)
         self.say(text)
 
     def verdict(self, verdict: ClosingLine) -> None:
-        """The last line of a command, in its colour: a result, or a line of stderr when it failed
-        (also when JSON is wanted).
+        """Print the last line of a command, in its colour: as a result, or on stderr after a
+        failure (also with --json).
         """
         is_good = verdict.colour != "red"
         stream = sys.stdout if is_good else sys.stderr
@@ -161,8 +159,8 @@ class Output:
         say(f"{word}  {verdict.text}")
 
     def failure(self, error: FlasherError, known: object = None) -> ExitCode:
-        """An error as a person reads it, and as the JSON document of the command, with the document
-        of what was `known` by then. Returns its exit code.
+        """Print an error for a person, and as the JSON document of the command, with the document
+        `known` so far. Returns its exit code.
         """
         what, *others = str(error).splitlines()
         text = "\n".join((f"{what} [{error.code}]", *others))
@@ -194,14 +192,14 @@ def _print_stdout(text: str) -> None:
         raise UsageError(
             f"Standard output cannot be written: {error.strerror}.",
             cause="the disk that it is redirected to is full",
-            remedy="Redirect it elsewhere. What was done before this message stays done.",
+            remedy="Redirect it elsewhere. All work before this message is complete.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
 
 
 def _give_up(stream: TextIO) -> None:
-    """Write to nowhere from now on: what waits in the buffer would fail again at the exit, and
-    take the exit code with it.
+    """Discard all further output: a full buffer would fail again at exit, and replace the exit
+    code.
     """
     with contextlib.suppress(OSError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -210,23 +208,21 @@ def _give_up(stream: TextIO) -> None:
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things as a person reads it."""
+    """A count with its noun."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def byte_count(count: int) -> str:
-    """A number of bytes as a person reads it."""
     return counted(count, "byte")
 
 
 def duration(seconds: float) -> str:
-    """A time as a person reads it."""
     if seconds < 120:
         return f"{seconds:.2f} s"
     return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
 
 
 def spread_ms(of: Distribution) -> str:
-    """Times in milliseconds: least, median, 95th and 99th percentile, most."""
+    """Times in milliseconds: minimum, median, 95th and 99th percentile, maximum."""
     times_s = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
     return " / ".join(f"{each * 1000:.2f}" for each in times_s)

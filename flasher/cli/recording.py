@@ -1,12 +1,12 @@
-"""What every command on a bus keeps of its frames: a trace if one is wanted, a bundle if it fails.
+"""Records the frames of a command: into a trace if requested, into a bundle if it fails.
 
     with recording(options, bus, output, target=target) as record:
         with connect(...) as connection:
             record.opened(connection)
             connection.device(target).identify(taps=record.taps)
 
-An error that leaves the `with` block, or is handed to `failed`, makes a bundle. Nothing that goes
-wrong here changes what the command says or its exit code.
+An error that leaves the `with` block, or is handed to `failed`, makes a bundle. An error here
+changes neither the output of the command nor its exit code.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
 _WITHOUT_BUNDLE: Final = (
     ExitCode.USAGE, ExitCode.IMAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
 )  # fmt: skip
-"""Ends of which no frame tells more."""
+"""Errors that frames do not help to explain."""
 _BUNDLES_KEPT: Final = 50
 """Bundles in the default folder; older ones are deleted."""
 
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What a command that talks on a bus leaves of it."""
+    """Trace and bundle of a command on a bus."""
 
     trace_file: Annotated[str | None, option(
         "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
@@ -75,7 +75,7 @@ recording_options: Final = option_set("recorded", RecordingOptions)
 
 
 def bundle_folder(chosen: Path | None = None) -> Path:
-    """Where bundles go: the folder of the option, of the environment, or the user's own."""
+    """Folder for bundles: of the option, of the environment, or the user's own."""
     named = chosen or os.environ.get(BUNDLE_FOLDER)
     return Path(named) if named else user_state_path("flasher", appauthor=False) / "bundles"
 
@@ -86,49 +86,49 @@ class Recording:
     def __init__(self, target: Target | None, bitrate_bps: int) -> None:
         self.flight = FlightRecorder()
         self.facts: dict[str, Any] = {}
-        """What goes into the bundle's report; anything that JSON knows."""
+        """Contents of the bundle's report; any JSON value."""
         self._connection: Connection | None = None
         self._meter = None if target is None else LinkMeter(target, bitrate_bps)
         self.recorders: list[Tap] = [self.flight]
         if self._meter is not None:
             self.recorders.append(self._meter)
         self.file: Recorder | None = None
-        """The trace file, where one is wanted."""
+        """The trace file, if requested."""
         self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
         """For the driver."""
         self.failure: BaseException | None = None
         self.bundle: Path | None = None
-        """Where it was left, if one was."""
+        """Path of the bundle, if any."""
         self.two_devices: str | None = None
-        """What spoke for a second device of the kind."""
+        """Evidence of a second device of the kind."""
         self.is_alone = False
-        """The terminal is gone: the verdict is left in a bundle, a good one too."""
+        """The terminal is lost: a bundle stores the verdict, even a good one."""
 
     def warn(self, output: Output, event: object) -> None:
-        """Print and keep what a command reports beside its result."""
+        """Print and record a warning."""
         if isinstance(event, TwoDevicesSeen):
             self.two_devices = event.what
             output.error_line(f"warning: {warning_text(event)}")
 
     def opened(self, connection: Connection) -> None:
-        """The bus is open."""
+        """Begin recording this bus."""
         self._connection = connection
         self.facts["connection"] = connection.name
         if self.file is not None:
             self.file.channel = connection.channel
 
     def failed(self, error: BaseException) -> None:
-        """The command reports this error itself, and does not raise it."""
+        """Record an error that the command reports without raising it."""
         self.failure = error
 
     def leave_terminal(self, output: Output) -> None:
-        """The terminal is gone."""
+        """Record that the terminal is lost."""
         if not self.is_alone:
             self.is_alone = True
             output.leave_terminal("the terminal is gone")
 
     def link_report(self) -> LinkReport | None:
-        """How the transfer used the bus so far; None before the first packet."""
+        """Use of the bus by the transfer so far; None before the first packet."""
         report = None if self._meter is None else self._meter.report()
         if report is None or self._connection is None:
             return report
@@ -139,8 +139,8 @@ class Recording:
 def recording(
     options: RecordingOptions, bus: Bus, output: Output, *, target: Target | None = None
 ) -> Iterator[Recording]:
-    """Record what goes over the bus while the block runs. Raises UsageError for a trace file that
-    cannot be written.
+    """Record the bus traffic while the block runs. Raises UsageError for a trace file that cannot
+    be written.
     """
     record = Recording(target, bus.bit_rate.bps)
     record.facts |= {
@@ -173,8 +173,8 @@ def _without_passwords(config: Mapping[str, Any]) -> dict[str, Any]:
 def recorded_connection(
     options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Connection, Recording]]:
-    """The bus that the options name, else the only adapter found, and a recording of it: for
-    commands that ask one thing.
+    """The bus of the options, else the only adapter detected, with its recording: for commands with
+    one query.
     """
     bus = choose_adapter(bus, output)
     with (
@@ -189,7 +189,7 @@ def recorded_connection(
 def recorded_device(
     options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Device, Recording]]:
-    """A device there, whose calls are recorded, and end when the user wants to."""
+    """A device there, with its calls recorded and stopped on request."""
     with (
         recorded_connection(options, bus, output, target) as (connection, record),
         stop_on_signal() as stopped,
@@ -202,7 +202,7 @@ def recorded_device(
 
 @contextmanager
 def _trace_file(options: RecordingOptions, record: Recording, output: Output) -> Iterator[None]:
-    """Records to a file, if one is named."""
+    """Records to the trace file, if any."""
     path = options.trace_file
     if path is None:
         yield
@@ -242,7 +242,7 @@ def _leave_bundle(
     else:
         output.error_line(f"bundle: {printable(str(path))}")
         if is_own:
-            output.error_line("        flasher explain --last tells what happened")
+            output.error_line("        flasher explain --last explains it")
 
 
 def _error(error: BaseException) -> dict[str, Any]:

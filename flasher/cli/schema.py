@@ -42,7 +42,7 @@ _PUBLISHED: Final = {
 
 
 class _Generator(GenerateJsonSchema):
-    """Every field of a document is there, and no other."""
+    """Requires every field of a document, and forbids others."""
 
     def get_defs_ref(self, core_mode_ref: tuple[CoreRef, JsonSchemaMode]) -> DefsRef:
         ref, mode = core_mode_ref
@@ -98,7 +98,7 @@ def build() -> Schema:
         _tidy(form)
     return {
         "$schema": DIALECT,
-        "title": f"What flasher --json prints, version {SCHEMA_VERSION}",
+        "title": f"Output of flasher --json, version {SCHEMA_VERSION}",
         "description": "One document; where events are wanted or a command streams, one line for "
         "each of them before it, told by their key `event`.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in found],
@@ -107,7 +107,6 @@ def build() -> Schema:
 
 
 def schema_of(kind: Any) -> Schema:
-    """The JSON Schema of one type alone."""
     return adapter(kind).json_schema(
         mode="serialization", schema_generator=_Generator, ref_template="#/$defs/{model}"
     )
@@ -141,7 +140,7 @@ def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:
 
 
 def _documents(command: str | None, own: Sequence[Schema], envelope: Schema) -> Iterator[Schema]:
-    """The documents of a command: each of its own, and how a failure looks."""
+    """The documents of a command: each of its own, and the document of a failure."""
     around = {**envelope["properties"], "command": {"const": command}}
     told: dict[str, list[Schema]] = {}
     for each in own:
@@ -156,7 +155,7 @@ def _documents(command: str | None, own: Sequence[Schema], envelope: Schema) -> 
     yield _closed(
         {**by_then, **around, "ok": {"const": False}, "error": {}},
         [*around, "error"],
-        "A failure, with as much as was known by then.",
+        "A failure, with the data known so far.",
     )
 
 
@@ -171,7 +170,7 @@ def _closed(properties: Mapping[str, Any], required: Sequence[str], description:
 
 
 def _tidy(part: Any) -> None:
-    """Descriptions are paragraphs; a title that repeats a name goes."""
+    """Makes descriptions paragraphs; removes titles that repeat a name."""
     for each in part.values() if isinstance(part, dict) else part:
         if isinstance(each, dict | list):
             _tidy(each)
@@ -182,7 +181,7 @@ def _tidy(part: Any) -> None:
 
 
 def _needed(found: Schema, known: Schema) -> Schema:
-    """The definitions that are referred to."""
+    """The referenced definitions."""
     needed: Schema = {}
     open_ones = _REFERENCE.findall(json.dumps(found))
     while open_ones:

@@ -1,8 +1,8 @@
 """Ctrl-C, Ctrl-Break, SIGTERM and SIGHUP: the first one asks for a clean end, a second Ctrl-C ends
 at once.
 
-SIGHUP, from a terminal that was closed or a connection that was lost, is asked for apart: what must
-not be left half done goes on without anybody who listens. Under `nohup` it stays ignored. Windows
+SIGHUP, from a terminal that was closed or a connection that was lost, is a separate request: work
+that must not be interrupted continues without a terminal. Under `nohup` it stays ignored. Windows
 ends the programs of a console that is closed within 5 s: there it asks for a clean end.
 """
 
@@ -23,13 +23,11 @@ _IS_WINDOWS: Final = os.name == "nt"
 _CLOSING: Final = frozenset({2, 5, 6})
 """Windows: CTRL_CLOSE_EVENT, CTRL_LOGOFF_EVENT, CTRL_SHUTDOWN_EVENT."""
 _CLOSING_LIMIT_S: Final = 10.0
-"""Longer than Windows waits for a program whose console is closed."""
+"""Longer than Windows waits after closing a console."""
 
 
 class Stop:
-    """Whether the user (Ctrl-C, SIGTERM) or a lost terminal (SIGHUP) asks to stop. Calling it is
-    True for either.
-    """
+    """True after a request to stop by the user (Ctrl-C, SIGTERM) or a lost terminal (SIGHUP)."""
 
     def __init__(self, on_first: Callable[[], None] | None) -> None:
         self._on_first = on_first
@@ -43,8 +41,8 @@ class Stop:
         return self.asked() or self.has_hung_up
 
     def asked(self) -> bool:
-        """True since Ctrl-C or SIGTERM; the first time that it says so, it calls `on_first`."""
-        # Not in the handler, which may have come in the middle of a print: printing there fails.
+        """True after Ctrl-C or SIGTERM; the first call that returns True calls `on_first`."""
+        # Not in the handler, which may interrupt a print: printing there fails.
         if self.is_asked and not self._told:
             self._told = True
             if self._on_first is not None:
@@ -56,9 +54,8 @@ class Stop:
 def stop_on_signal(
     on_first: Callable[[], None] | None = None, on_second: Callable[[], None] | None = None
 ) -> Iterator[Stop]:
-    """Gives what tells whether to stop. `on_first` is called when it first says that the user wants
-    to. With `on_second` the second signal calls it, in the handler, and only a third one ends at
-    once.
+    """Gives the stop request. `on_first` is called when it is first read. With `on_second` the
+    second signal calls it, in the handler, and only a third one ends at once.
     """
     stop = Stop(on_first)
     second = on_second
@@ -92,9 +89,9 @@ def stop_on_signal(
 
 @contextmanager
 def _asked_by_console(stop: Stop) -> Iterator[None]:
-    """Windows: a console that is closed, the user's log-off and a shutdown ask to stop.
+    """Windows: closing the console, log-off and shutdown request a stop.
 
-    The system calls the handler in a thread of its own, and ends the process as soon as it returns:
+    The system calls the handler in a separate thread, and ends the process as soon as it returns:
     so it waits. A process that ends meanwhile ends its threads.
     """
 

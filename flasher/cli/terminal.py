@@ -1,4 +1,4 @@
-"""What a terminal or a pipe takes: its encoding, its width, its colours; and who answers there."""
+"""Properties of terminals and pipes: encoding, width, colours; and yes/no questions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Final, TextIO
 from flasher.errors import InterruptedByUserError
 
 _NO_WINDOW: Final = 10_000
-"""Columns where nothing is wrapped."""
+"""Width without wrapping."""
 COLOURS: Final = {"green": 32, "yellow": 33, "red": 31, "cyan": 36}
 _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """Replacements for characters that an encoding lacks."""
@@ -25,16 +25,15 @@ _COLOUR: Final = re.compile(r"\x1b\[[\d;]+m")
 _PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
 """A line whose first words, or all, are coloured."""
 _COMMAND: Final = re.compile(r"\s*flasher ")
-"""A command line is never wrapped: it has to be copied as it is."""
+"""A command line is never wrapped, so that it can be copied."""
 _ENDS_WITH_COMMAND: Final = re.compile(r"(.*[:|]) (flasher [a-z-]+ .*)")
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
 """The beginning of a line that its continuations are indented to."""
 
 
 def prepare_streams() -> None:
-    """Give a process without stdin, stdout or stderr (a service, pythonw) somewhere to write to and
-    nothing to read: print() would else take one for the other. What the encoding of a stream does
-    not have is replaced, whoever writes it.
+    """Replace missing stdin, stdout or stderr (a service, pythonw): print() would otherwise mistake
+    one for the other. Characters that an encoding lacks are replaced.
     """
     if sys.stdin is None:
         sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115
@@ -58,8 +57,8 @@ def _substitute(error: UnicodeError) -> tuple[str, int]:
 
 
 def columns(rows: Iterable[Sequence[str]], *, indent: int = 0, first: int = 0) -> list[str]:
-    """Rows in columns, two blanks apart, as lines for stdout: a last cell that is too long for the
-    window is wrapped in its column. The first column is `first` wide at least.
+    """Format rows in columns, two blanks apart, as lines for stdout: a last cell too long for the
+    window is wrapped in its column. `first` is the minimum width of the first column.
     """
     from rich.console import Console  # noqa: PLC0415  not every command has a table
     from rich.table import Table  # noqa: PLC0415
@@ -80,7 +79,7 @@ def columns(rows: Iterable[Sequence[str]], *, indent: int = 0, first: int = 0) -
 
 
 def window_width(stream: TextIO) -> int | None:
-    """Columns of the window that a stream leads to; None where there is none."""
+    """Width of a stream's window in columns; None without one."""
     if not stream.isatty():
         return None
     try:
@@ -100,12 +99,12 @@ def painted(text: str, colour: str) -> str:
 
 
 def unpainted(text: str) -> str:
-    """Text without its colours, for a log."""
+    """Removes colours, for a log."""
     return _COLOUR.sub("", text)
 
 
 def wrapped(text: str, stream: TextIO) -> str:
-    """Text for a terminal wrapped at its width, never inside a word; elsewhere as it is."""
+    """Wrap text at the width of a terminal, never inside a word; unchanged elsewhere."""
     width = window_width(stream)
     if width is None:
         return text
@@ -113,7 +112,7 @@ def wrapped(text: str, stream: TextIO) -> str:
 
 
 def wrap_line(line: str, width: int) -> list[str]:
-    """A line in parts of `width` columns at the most (a longer word stays whole), the later ones
+    """Split a line into parts of at most `width` columns (a longer word stays whole), later ones
     indented to where the text of the first begins.
     """
     if len(line) <= width or width <= 0 or _COMMAND.match(line):
@@ -141,16 +140,16 @@ def wrap_line(line: str, width: int) -> list[str]:
     )
 
 
-# -- a question before something that cannot be taken back ----------------------------------------
+# -- a question before an irreversible action -----------------------------------------------------
 
 
 def can_ask() -> bool:
-    """True where somebody reads and answers."""
+    """True if a user can answer."""
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def agrees(question: str, *, interrupted: str) -> bool:
-    """Ask; True for yes. Raises InterruptedByUserError, which says `interrupted`, for Ctrl-C."""
+    """Ask; True for yes. Raises InterruptedByUserError with the text `interrupted`, for Ctrl-C."""
     sys.stderr.write(f"{question} [y/N] ")
     sys.stderr.flush()
     try:

@@ -1,4 +1,4 @@
-"""Values on the command line: how each is read, and what a shell offers for it."""
+"""Types of values on the command line, with their shell completion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRACE_SUFFIXES: Final = (
     "asc", "blf", "csv", "db", "log", "mf4", "pcap", "pcapng", "trc", "gz",
 )  # fmt: skip
 SLOWEST: Final = 0.1
-"""Smallest speed of the mock, but for 0."""
+"""Smallest speed of the mock, except 0."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
@@ -37,7 +37,7 @@ def number(text: str) -> int:
     """A whole number: decimal or 0x, with K or M for 1024 and 1024 * 1024."""
     match = _NUMBER.fullmatch(text)
     if match is None:
-        raise click.BadParameter(f"{text!r} is no number (decimal, 0x..., K or M suffix)")
+        raise click.BadParameter(f"{text!r} is not a number (decimal, 0x..., K or M suffix)")
     return (
         int(match[1], 0 if match[1].lower().startswith("0x") else 10) * _SUFFIXES[match[2].lower()]
     )
@@ -47,7 +47,7 @@ def address_range(text: str) -> tuple[int, int]:
     """START:END, the end exclusive."""
     start, colon, end = text.partition(":")
     if not colon:
-        raise click.BadParameter(f"{text!r} is no range; write START:END")
+        raise click.BadParameter(f"{text!r} is not a range; write START:END")
     return number(start), number(end)
 
 
@@ -61,7 +61,7 @@ def seconds(text: str) -> float:
 
 
 def speed(text: str) -> float:
-    """Times as fast as a real bus: 0, or a number that is not so small that nothing moves."""
+    """A factor of a real bus's speed: 0, or a number that is not too small."""
     value = seconds(text)
     if value and value < SLOWEST:
         raise click.BadParameter(f"must be 0, or {SLOWEST} and more")
@@ -69,7 +69,7 @@ def speed(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number from 1 on."""
+    """A whole number, at least 1."""
     value = number(text)
     if value < 1:
         raise click.BadParameter("must be 1 or more")
@@ -98,7 +98,7 @@ def target(text: str) -> Target:
 
 
 def node(text: str) -> str:
-    """A node of the bus by its name, or a target by another name."""
+    """A node of the bus by its name, or a target by an alias."""
     alias = TARGET_ALIASES.get(text.lower())
     name = text.upper() if alias is None else alias.node.name
     if name not in Node.__members__:
@@ -120,7 +120,7 @@ _NODES: Final = (*(each.name.lower() for each in Node), *TARGET_ALIASES)
 
 
 def offers(known: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
-    """For `shell_complete`: those words of `known(context)` that begin as typed."""
+    """For `shell_complete`: words of `known(context)` with the typed prefix."""
 
     def complete(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
         return [word for word in known(ctx) if word.startswith(incomplete)]
@@ -146,8 +146,8 @@ def interface_names(_ctx: click.Context | None = None) -> list[str]:
 
 
 def channels(_ctx: click.Context) -> list[str]:
-    """For --channel: the CAN interfaces of Linux. Other back ends do not name theirs without
-    opening them.
+    """For --channel: the CAN interfaces of Linux. Other back ends list theirs only after opening
+    them.
     """
     if not _NETWORK.is_dir():
         return []
@@ -163,9 +163,9 @@ def channels(_ctx: click.Context) -> list[str]:
 
 
 class FilePath(click.ParamType[Any]):
-    """The name of a file, as text or as a `Path`. What is wrong with it is told when it is opened.
+    """The name of a file, as text or as a `Path`. Errors are reported when it is opened.
 
-    A shell offers folders, and the files with one of the `suffixes`.
+    A shell completes folders, and the files with one of the `suffixes`.
     """
 
     name = "file"
@@ -184,7 +184,7 @@ class FilePath(click.ParamType[Any]):
             return [CompletionItem(incomplete, type="file")]
         found = self._matching(incomplete)
         while len(found) == 1 and found[0].endswith("/") and (inside := self._matching(found[0])):
-            found = inside  # shells write a blank behind the only word that is offered
+            found = inside  # shells append a blank to a unique completion
         return [CompletionItem(name) for name in found]
 
     def _matching(self, begun: str) -> list[str]:

@@ -34,7 +34,7 @@ def test_numbers_are_decimal_or_hexadecimal_with_a_suffix(text: str, value: int)
 
 @each("text", ["", "-1", "1.5", "0b1", "12x", "K", "1 K", "0x", "٣"])
 def test_what_is_no_number_is_refused(text: str) -> None:
-    with pytest.raises(click.BadParameter, match="is no number"):
+    with pytest.raises(click.BadParameter, match="is not a number"):
         values.number(text)
 
 

@@ -51,6 +51,6 @@ def test_a_link_of_another_user_is_not_followed(
     else:
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
     for name in ("own", "foreign"):
-        with pytest.raises(UsageError, match="a link that another user laid"):
+        with pytest.raises(UsageError, match="a link of another user"):
             write_whole(tmp_path / name, b"new", "--html")
     assert real.read_bytes() == b"mine"

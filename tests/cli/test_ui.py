@@ -126,4 +126,4 @@ def test_a_folder_of_images_that_is_none_is_refused_at_once(
     (tmp_path / "file").write_text("")
     run = flasher("ui", "--mock", "--no-browser", "--images", tmp_path / name)
     assert run.code == ExitCode.USAGE
-    assert "is no folder of this computer" in run.err
+    assert "is not a folder of this computer" in run.err

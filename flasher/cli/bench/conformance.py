@@ -1,5 +1,5 @@
-"""`flasher conformance`: tests a bootloader against the protocol, case by case; compares two such
-runs; documents the profile.
+"""`flasher conformance`: test a bootloader against the protocol, compare runs, document the
+profile.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ _FILES: Final = {
     name: f"--{name.replace('_', '-')}"
     for name in ("junit", "json_report", "html", "badge", "summary")
 }
-"""Files that are written: their names in the choices, and their options."""
+"""Report files: their field names in the options, and their options."""
 _RUN_OPTIONS: Final = frozenset(
     {
         *("--list", "--case", "--group", "--exclude", "--quick", "--seed", "--repeat", "--timeout"),
@@ -109,20 +109,20 @@ _RUN_OPTIONS: Final = frozenset(
 
 @dataclass(frozen=True)
 class ConformanceDocument:
-    """What came of a run."""
+    """Result of a run."""
 
     report: RunReport
 
 
 @dataclass(frozen=True)
 class CaseListDocument:
-    """The cases that are selected, and what cannot be judged of them."""
+    """The selected cases, with the reasons why some cannot be judged."""
 
     cases: list[ListedCase]
     bare_bench: tuple[Gap, ...]
     """On a bench of device, adapter and good image."""
     full_bench: tuple[Gap, ...]
-    """On one with power control, readback and a second image too."""
+    """On one that also has power control, readback and a second image."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class ProfileKeyDocument:
     """A key of the profile."""
 
     key: str
-    """With the table that it stands in, as limits.ack_s."""
+    """With its table, as limits.ack_s."""
     default: str | int | float
     allowed: str
     meaning: str
@@ -138,16 +138,16 @@ class ProfileKeyDocument:
 
 @dataclass(frozen=True)
 class ProfileKeysDocument:
-    """What a profile may say."""
+    """All keys of a profile."""
 
     keys: list[ProfileKeyDocument]
     toml: str
-    """A whole profile, as it is printed without --json."""
+    """A whole profile, as printed without --json."""
 
 
 @dataclass(frozen=True)
 class HeaderDocument:
-    """The files that were written."""
+    """The files written."""
 
     files: list[str]
 
@@ -168,7 +168,7 @@ _report = partial(option, metavar="FILE", type=values.FilePath(gives=Path), pane
 
 @dataclass(frozen=True)
 class Choices:
-    """What is run, and the files that are written."""
+    """Selected cases, and the report files."""
 
     is_list: Annotated[bool, _what(
         "--list", "is_list", is_flag=True, brief=True, help="list the cases, and end",
@@ -202,7 +202,7 @@ class Choices:
     )]  # fmt: skip
     strict: Annotated[bool, _what(
         "--strict", is_flag=True,
-        help="a pass in part fails the run, and a deviation of the profile that is none any more",
+        help="also fail the run for a partial pass, or a profile deviation that no longer occurs",
     )]  # fmt: skip
     upgrades: Annotated[int | None, _what(
         "--upgrades", type=values.count, metavar="N",
@@ -218,7 +218,7 @@ class Choices:
     )]  # fmt: skip
     html: Annotated[Path | None, _report("--html", help="the report as one self-contained page")]
     badge: Annotated[Path | None, _report(
-        "--badge", help="a drawing (SVG) that says how the run ended",
+        "--badge", help="a badge (SVG) with the result of the run",
     )]  # fmt: skip
     summary: Annotated[Path | None, _report(
         "--summary", help="the run on one page (HTML) to be printed, for a release",
@@ -230,7 +230,6 @@ class Choices:
 
     @property
     def selection(self) -> Selection:
-        """Which cases are meant."""
         return Selection(self.cases, self.groups, quick=self.quick, excluded=self.excluded)
 
 
@@ -288,7 +287,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
 
 
 def _check_files(chosen: Choices) -> None:
-    """Make sure that all files can be written. Raises UsageError."""
+    """Raises UsageError if a report file cannot be written."""
     for name, option_name in _FILES.items():
         check_writable(getattr(chosen, name), option_name, typed_values(but=name))
     if chosen.trace_dir is not None:
@@ -307,8 +306,8 @@ def _check_files(chosen: Choices) -> None:
 def _tell(
     report: RunReport, chosen: Choices, output: Output, started_at: str, code: ExitCode
 ) -> None:
-    """Print the summary and write the files. What cannot be written keeps nothing else from it.
-    Raises UsageError.
+    """Print the summary and write the files; one failure does not stop the others. Raises
+    UsageError.
     """
     from flasher.conformance.reports import (  # noqa: PLC0415
         candump,
@@ -353,7 +352,7 @@ def _tell(
 
 
 def _content(name: str, report: RunReport) -> bytes:
-    """What is written into the file of this name."""
+    """Content of the report file of this name."""
     from flasher.conformance import html_report, reports, summary_page  # noqa: PLC0415
 
     match name:
@@ -371,7 +370,7 @@ def _content(name: str, report: RunReport) -> bytes:
 
 
 def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:
-    """The command that runs each result's case again, on the same bench and with the same seed, by
+    """The command that repeats each result's case, on the same bench and with the same seed, by
     case id and repeat.
     """
     ctx = click.get_current_context()
@@ -389,8 +388,8 @@ def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:
 
 
 def exit_code(report: RunReport, *, was_stopped: bool) -> ExitCode:
-    """The exit code of a run: interrupted, the adapter, a device that never answered, else whether
-    all cases passed.
+    """The exit code of a run: interrupted, adapter failure, a device that never answered, else
+    whether all cases passed.
     """
     if was_stopped and report.stopped:
         return ExitCode.INTERRUPTED
@@ -415,7 +414,7 @@ def _list(selection: Selection, output: Output) -> int:
     from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
 
     selection.check()
-    # Those that run only when they are named have to be found somewhere.
+    # The list includes cases that run only when named.
     chosen = catalogue_order(known_cases()) if selection == Selection() else selection.chosen()
     texts = [case_text(case_id, ConformanceProfile()) for case_id in chosen]
     found = [
@@ -490,7 +489,7 @@ def compare_runs(output: Output, *, reports: tuple[Path, ...], html: Path | None
 
 
 @conformance.action("profile", exit_codes=())
-@option("--mock", is_flag=True, help="what the built-in device model would have")
+@option("--mock", is_flag=True, help="the profile of the built-in device model")
 @set_option
 def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
     """Print a profile with every key explained."""

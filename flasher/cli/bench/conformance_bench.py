@@ -1,4 +1,4 @@
-"""The device under test, as the options of `flasher conformance` describe it."""
+"""Device under test, from the options of `flasher conformance`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flasher.conformance.subject import Subject
 
 OUTPUT_OPTIONS: Final = ("--json", "--events", "--verbose", "--quiet", "--log-file")
-"""What a command that runs something again leaves out."""
+"""Options that a command to repeat a run omits."""
 
 
 def described(bench: BenchOptions, bus: Bus) -> BenchOptions:
@@ -48,7 +48,7 @@ def described(bench: BenchOptions, bus: Bus) -> BenchOptions:
 def opened(
     bench: BenchOptions, output: Output
 ) -> Iterator[tuple[Subject, ConformanceProfile, Stop]]:
-    """The device, its profile, and whether the user has enough of it."""
+    """The device, its profile, and the user's stop request."""
 
     def stopping() -> None:
         output.progress("stopping: the device gets its good image back; press again to end at once")
@@ -58,8 +58,8 @@ def opened(
 
 
 def confirm_wear(said: str, *, is_agreed: bool) -> None:
-    """Say what is done to the device, and ask unless it `is_agreed`. Raises UsageError without a
-    yes.
+    """Report how often the device is erased, and ask unless it `is_agreed`. Raises UsageError
+    without a yes.
     """
     if is_agreed:
         return
@@ -119,7 +119,7 @@ bench_options: Final = option_set(
     ),
     _without_hardware(
         "--variant", metavar="NAME",
-        help="one that is wrong, see `flasher mock --list-variants`",
+        help="a faulty one, see `flasher mock --list-variants`",
     ),
     set_option,
 )  # fmt: skip

@@ -1,6 +1,4 @@
-"""`flasher conformance explore`: random walks through messages of all kinds, until one finds
-something.
-"""
+"""`flasher conformance explore`: random walks through messages, until one breaks a rule."""
 
 from __future__ import annotations
 
@@ -37,8 +35,8 @@ examples:
   flasher conformance explore -t bms --mock --replay 'reset update=384 packet packet-crc'
 
 A walk begins with a running good image, and ends with an upgrade to it, which has to succeed. Only
-what is valid may be answered positively, and what is valid has to be answered. What is found is cut
-down to the shortest walk that finds the same; --replay takes that walk again. Exit code 12 for a
+valid messages may be answered positively, and every valid message has to be answered. A finding is
+reduced to the shortest walk that shows it; --replay repeats that walk. Exit code 12 for a
 finding. A device on a bus is erased about twice a walk (12 steps on average).
 """
 _TRACE_FILE: Final = "--trace-file"
@@ -66,7 +64,7 @@ _what = partial(option, panel="what is run, and how")
     help="end after so many steps",
 )  # fmt: skip
 @_what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk")
-@_what("--replay", metavar="STEPS", help="take these steps instead, as a finding tells them")
+@_what("--replay", metavar="STEPS", help="take these steps instead, as printed with a finding")
 @_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
 @option(
     _TRACE_FILE, type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
@@ -123,7 +121,7 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
         f"{printable(explored.subject)}: {explored.walks} walks, {explored.steps} steps, seed "
         f"{printable(explored.seed)}"
     )
-    output.result(f"{met} of {len(explored.coverage)} pairs of phase and step were met")
+    output.result(f"{met} of {len(explored.coverage)} pairs of phase and step were covered")
     if explored.not_covered and output.verbosity > 0:
         for phase in dict.fromkeys(phase for phase, _ in explored.not_covered):
             names = [name for its, name in explored.not_covered if its == phase]

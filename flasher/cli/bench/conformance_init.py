@@ -1,4 +1,4 @@
-"""`flasher conformance init`: asks a device, and writes the profile that it is judged by."""
+"""`flasher conformance init`: observe a device, and write its conformance profile."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ examples:
   flasher conformance init -t bms --mock --set repeated_packet=nak_next -o mock.toml
   flasher conformance init -t bms -i socketcan -c can0 --good-image known_good.hex -o p.toml
 
-The device is upgraded to its good image again and again, some hundred times, and what it answers to
-this and that in between is written with how often it was seen. What cannot be found out stays open,
-as a comment with the reason. Read the file before you judge by it: it says what the device does,
-and not what it should do. --profile names what is believed where nothing can be seen.
+The device is upgraded to its good image again and again, some hundred times, and its answers
+to test messages in between are written with their counts. A value that cannot be observed stays
+open, as a comment with the reason. Review the file before you judge by it: it describes what the
+device does, not what it should do. --profile gives the values that cannot be observed.
 """
 _OUTPUT: Final = "-o/--output"
 _SEEN_SHOWN: Final = 100
@@ -46,7 +46,7 @@ _what = partial(option, panel="what is written")
 
 
 @command(
-    short_help="Ask a device, and write the profile that it is judged by",
+    short_help="Observe a device, and write its conformance profile",
     epilog=_EXAMPLES,
     exit_codes=(
         ExitCode.IMAGE, ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.PARTIAL, ExitCode.INTERRUPTED,
@@ -57,14 +57,14 @@ _what = partial(option, panel="what is written")
     "-o", "--output", "file", type=values.FilePath("toml", gives=Path), metavar="FILE", brief=True,
     help="the profile (default: the name of the target, as bms.toml)",
 )  # fmt: skip
-@_what("--force", is_flag=True, brief=True, help="write over a file that exists")
+@_what("--force", is_flag=True, brief=True, help="overwrite an existing file")
 @_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
 @adapter_options
 def init(
     output: Output, bus: Bus, bench: BenchOptions, *, file: Path | None, force: bool, yes: bool
 ) -> int:
-    """Ask a device everything that a profile says, on the bus alone, and write the profile with
-    what was seen. The good image runs before and after it.
+    """Find the value of every profile key on the bus alone, and write the profile with the
+    observations. The good image runs before and after.
     """
     from flasher.conformance.init import UPGRADES, ask_device  # noqa: PLC0415  much is loaded
     from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
@@ -72,7 +72,7 @@ def init(
     bench = described(bench, bus)
     path = file or Path(f"{bench.device.name}.toml")
     check_new(path, _OUTPUT, force=force)
-    # What the bench knows of its device besides has to be seen like everything else.
+    # Other facts of the bench must be observed too.
     start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
     if not bench.is_simulated:
         said = f"the questions erase and write the device about {UPGRADES} times"

@@ -1,4 +1,4 @@
-"""How a run goes, on stderr: which case, and how many are left; a line of its own on a terminal."""
+"""Progress of a run on stderr: the current case and the count left; a bar on a terminal."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from flasher.conformance.runner import RunObserver
 from flasher.protocol.text import printable
 
 _BAD: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR)
-"""Verdicts that need somebody to look; cases that were not run have one reason for all of them."""
+"""Verdicts that need attention; cases that did not run share one reason."""
 _BAR: Final = "{n_fmt}/{total_fmt} |{bar:20}| {elapsed} {desc}"
 
 
 @contextmanager
 def progress(output: Output) -> Iterator[RunObserver]:
-    """An observer for one run; the terminal is as before at the end."""
+    """Gives the observer of one run; restores the terminal at the end."""
     shown = _Progress(output)
     with shown.bar:
         yield shown
 
 
 class _Progress(RunObserver):
-    """An observer that tells a person; on a terminal with a bar, elsewhere only with -v."""
+    """Prints progress: with a bar on a terminal, elsewhere only with -v."""
 
     def __init__(self, output: Output) -> None:
         self._output = output
@@ -36,22 +36,19 @@ class _Progress(RunObserver):
         self._ended = 0
 
     def run_began(self, count: int) -> None:
-        """So many case runs follow."""
         self._count = count
         if count:
             self.bar.move_to(0, count)
 
     def preparing(self, what: str) -> None:
-        """The device is brought to the known state."""
         self.bar.describe(printable(f"bringing the device to the known state, {what}"))
 
     def case_began(self, case: Case, repeat: int) -> None:
-        """A case begins."""
         again = f" (repeat {repeat})" if repeat > 1 else ""
         self.bar.describe(printable(f"{case.id} {case.title}{again}"))
 
     def case_ended(self, result: CaseResult) -> None:
-        """A case has its verdict; what this bench cannot run has one before the run begins."""
+        """Cases that this bench cannot run have a verdict before the run begins."""
         if not self._count or (result.verdict is CaseVerdict.UNSUPPORTED and not result.seed):
             return
         self._ended += 1

@@ -1,4 +1,6 @@
-"""What `flasher conformance` prints: the summary of a run, the difference of two, the list."""
+"""Formats the output of `flasher conformance`: summary of a run, comparison of two, list of
+cases.
+"""
 
 from __future__ import annotations
 
@@ -33,21 +35,21 @@ _TOLD: Final = (
     CaseVerdict.INCONCLUSIVE,
     CaseVerdict.DEVIATION,
 )
-"""Verdicts whose cases have a line each; unsupported ones share one for each reason."""
+"""Verdicts with one line per case; unsupported cases share one per reason."""
 _MS: Final = 1000
 _SHADES: Final = " .:-=+*#%@"
 _DRAWN_LEAST: Final = 20
 _DRAWN_MS: Final = 0.1
-"""Times that differ by less are one time."""
+"""Times that differ by less count as equal."""
 
 
 # -- a run ----------------------------------------------------------------------------------------
 
 
 def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
-    """The summary of a run: groups, what went wrong with how to see it again, times, the verdict.
+    """The summary of a run: groups, failures with the command to repeat each, times, the verdict.
 
-    `verbose` tells every case and every failed check.
+    `verbose` lists every case and every failed check.
     """
     yield printable(
         f"{report.subject}, target {report.target}, profile: {report.profile_source}, "
@@ -91,7 +93,7 @@ def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
 
 
 def _told(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]:
-    """One line: which case, what was expected, what was got, and how to run it again."""
+    """One line: case, expected, actual, and the command to repeat it."""
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     said = result.reason
     if result.verdict is CaseVerdict.DEVIATION:
@@ -110,7 +112,7 @@ def _told(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]
 
 
 def _not_judged(report: RunReport) -> Iterator[str]:
-    """Cases without a verdict, or with one in part, together with those of the same reason."""
+    """Cases without a full verdict, grouped by reason."""
     reasons: dict[tuple[CaseVerdict, str], list[str]] = {}
     for result in report.results:
         if result.verdict in (CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN):
@@ -147,9 +149,7 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
 
 
 def _drawn(of: Times) -> str:
-    """A histogram in a word, from the least value to the most: the darker, the more; empty where
-    there is nothing to draw.
-    """
+    """A histogram in one word, lowest value first: the darker, the more; empty without data."""
     if of.count < _DRAWN_LEAST or (of.maximum_s - of.minimum_s) * _MS < _DRAWN_MS:
         return ""
     counts = of.histogram.counts
@@ -161,7 +161,7 @@ def _drawn(of: Times) -> str:
 
 
 def gap_lines(bench: str, gaps: Sequence[Gap]) -> Iterator[str]:
-    """What a bench cannot judge, a line for each thing that it lacks, with the cases."""
+    """Cases that a bench cannot judge, one line per missing thing."""
     yield f"{bench}: {'judges all in full' if not gaps else ''}".rstrip()
     for gap in gaps:
         costs = {"cannot be run": gap.unsupported, "judged in part": gap.in_part}
@@ -185,22 +185,22 @@ class ListedCase:
     id: str
     group: str
     title: str
-    """For a case that cannot be run, the reason."""
+    """Why the case cannot be run."""
     clause: str
     clauses: Mapping[str, str]
     """Each of the clauses that `clause` names, with its content."""
     requires: tuple[str, ...]
     in_part_without: tuple[str, ...]
-    """What a bench needs besides, to judge all of it."""
+    """Needed on a bench to judge all of it."""
     choices: tuple[str, ...]
     """Keys of the profile that it depends on."""
     can_be_run: bool
     only_when_named: bool
-    """It wears the device, and runs only when it or its group is named."""
+    """It wears the device, so it runs only when it or its group is named."""
 
 
 def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterator[str]:
-    """The catalogue, a line a case; with `verbose` its clauses with their contents too."""
+    """The catalogue, one line per case; with `verbose` also the texts of its clauses."""
     width = max((len(case.title) for case in cases if case.can_be_run), default=0)
     for case in cases:
         if not case.can_be_run:
@@ -223,7 +223,7 @@ def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterato
 
 
 def difference_lines(found: Difference) -> Iterator[str]:
-    """What a run has made better, worse and slower."""
+    """Cases that became better, worse or slower."""
     for condition in found.conditions:
         yield f"not the same: {condition}"
     for kind in ("worse", "better", "new", "gone", "less", "more"):
@@ -249,7 +249,7 @@ def difference_lines(found: Difference) -> Iterator[str]:
 
 
 def side_by_side_lines(found: SideBySide, *, verbose: bool = False) -> Iterator[str]:
-    """Runs beside each other: what differs between them; `verbose` tells all cases."""
+    """Differences between runs, side by side; `verbose` lists all cases."""
     head = ["", *(run.name for run in found.runs)]
     rows = [["verdict", *("passed" if run.passed else "NOT PASSED" for run in found.runs)]]
     rows.append(["passes", *(f"{run.passes}, {run.passes_in_full} in full" for run in found.runs)])

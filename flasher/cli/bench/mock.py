@@ -1,4 +1,4 @@
-"""`flasher mock`: the device model, or a whole bicycle, on any python-can bus until interrupted."""
+"""`flasher mock`: run the device model, or a whole bicycle, on any python-can bus."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from flasher.wording import wording_of
 
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
-"""A tool that is quiet for this long has verified what it sent."""
+"""After this silence the tool has finished verifying."""
 _REOPEN_S: Final = 0.25
-"""Between two tries to open a lost adapter again."""
+"""Interval between attempts to reopen a lost adapter."""
 _EXAMPLES: Final = """\
 examples:
   flasher mock -t bms -i socketcan -c vcan0
@@ -58,7 +58,7 @@ choices for --set, the first value is the default:
 
 @dataclass(frozen=True)
 class MockDocument:
-    """What the device model received."""
+    """Upgrades that the device model received."""
 
     images: int
     """Complete upgrades."""
@@ -66,7 +66,7 @@ class MockDocument:
 
 @dataclass(frozen=True)
 class VariantsDocument:
-    """What --variant takes."""
+    """Values of --variant."""
 
     variants: list[Variant]
 
@@ -98,20 +98,20 @@ _SETTINGS: Final = describe_options()
 )  # fmt: skip
 @option(
     "--system", is_flag=True, panel="device model",
-    help="serve as a whole bicycle; what is printed is about the target",
+    help="simulate a whole bicycle; the output is about the target",
 )  # fmt: skip
 @option(
     "--variant", metavar="NAME", panel="device model",
     shell_complete=values.offers(lambda _ctx: VARIANTS),
-    help="serve as a device that is wrong in one thing, see --list-variants",
+    help="simulate a device with one fault, see --list-variants",
 )  # fmt: skip
 @option(
     "--list-variants", is_flag=True, panel="device model",
-    help="list what --variant takes, with the clause that each violates, and end",
+    help="list the values of --variant, with the clause that each violates, and end",
 )  # fmt: skip
 @option(
     "--upgrades", type=values.count, metavar="N", panel="device model",
-    help="end after N complete upgrades, when the tool asks no more",
+    help="end after N complete upgrades, when the tool is quiet",
 )  # fmt: skip
 @bus_options(mock=None)
 def mock(
@@ -127,7 +127,7 @@ def mock(
     list_variants: bool,
     upgrades: int | None,
 ) -> int:
-    """Serve as a device: its application and its bootloader. With --system, as all devices of a
+    """Simulate a device: its application and its bootloader. With --system, all devices of a
     bicycle, which talk to each other.
     """
     if list_variants:
@@ -191,7 +191,7 @@ def _served(
     is_system: bool,
     has_application: bool,
 ) -> tuple[Engine, MockDevice]:
-    """What is put on the bus, and the device of it that is watched."""
+    """The models to put on the bus, and the one to watch."""
     if is_system:
         if variant is not None:
             raise UsageError(
@@ -211,8 +211,8 @@ def _served(
 
 
 def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output) -> bool:
-    """Wait until the adapter can be opened again, as a device outlives trouble of its bus; False
-    when the user has enough. Each reason why it cannot is told once.
+    """Wait until the adapter opens again; False when the user stops. A device outlives faults of
+    its bus. Each reason is reported once.
     """
     told = ""
     while not stopped():
@@ -230,7 +230,7 @@ def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output
 
 
 class _Tool:
-    """Tap: tells when the tool has nothing more to say to the target."""
+    """Tap that detects when the tool has finished with the target."""
 
     def __init__(self, target: Target) -> None:
         self._request_id = target.request_id
@@ -241,12 +241,12 @@ class _Tool:
             self._last_at = now
 
     def is_quiet(self, now: float) -> bool:
-        """True when even the repetition of a query would have come."""
+        """True once even a repeated query would have arrived."""
         return now - self._last_at >= _QUIET_S
 
 
 class _Watcher:
-    """Prints what the device model sees, and saves what it received."""
+    """Prints the events of the device model, and saves received images."""
 
     def __init__(self, device: MockDevice, save_to: Path | None, output: Output) -> None:
         self._device = device

@@ -1,1 +1,1 @@
-"""The commands of the end-of-line station."""
+"""Commands of the end-of-line station."""

@@ -1,5 +1,5 @@
-"""`flasher station`: the options of its actions. What they do stands in modules beside this one,
-which are loaded only where an action needs them: they need the extra `station`.
+"""`flasher station`: options of its actions. The actions are in modules beside this one, imported
+only when called: they need the extra `station`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ station that runs with --web serves them too, beside its operator page.
 
 
 def __getattr__(name: str) -> tuple[type, ...]:
-    """What `--json` prints, for the schema; it is made of classes that need the extra."""
+    """Types of the `--json` documents, for the schema; they need the extra."""
     if name in ("DOCUMENTS", "LINES"):
         found: tuple[type, ...] = getattr(
             importlib.import_module("flasher.cli.station.documents"), name
@@ -67,8 +67,8 @@ def __getattr__(name: str) -> tuple[type, ...]:
 )
 def station() -> None:
     """Flash unit after unit at the end of a line, several sockets at a time, by a recipe. A PASS is
-    shown only when it is on disk; the records tell years later what was written to which unit, by
-    whom, with which file. The guide is docs/how-to/station.md.
+    shown only when it is on disk; the records show years later which file was written to which
+    unit, and by whom. The guide is docs/how-to/station.md.
     """
 
 
@@ -94,7 +94,7 @@ def _path_option(*names: str, **more: Any) -> Decorator:
 
 @dataclass(frozen=True)
 class RecordsOptions:
-    """Where the records are."""
+    """Location of the records."""
 
     database: Annotated[str | None, option(
         "--database", metavar="FILE|URL", panel="records", brief=True,
@@ -124,7 +124,7 @@ _records_options: Final = option_set("records", RecordsOptions)
 
 
 _operator_option: Final = option(
-    "--operator", metavar="NAME", brief=True, help="who says so (default: the login)"
+    "--operator", metavar="NAME", brief=True, help="who decides it (default: the login)"
 )
 
 
@@ -141,7 +141,7 @@ def _share(text: str) -> float:
 
 @dataclass(frozen=True)
 class Address:
-    """Where pages are served."""
+    """Address of the pages."""
 
     host: str
     port: int
@@ -173,7 +173,7 @@ _WRITTEN: Final = "what is written"
 
 @dataclass(frozen=True)
 class PagesOptions:
-    """Who may see the pages, and in which language."""
+    """Access to the pages, and their language."""
 
     web_password: Annotated[Path | None, _path_option(
         "--web-password", panel=_PAGES,
@@ -188,7 +188,7 @@ class PagesOptions:
     )]  # fmt: skip
     web_insecure: Annotated[bool, option(
         "--web-insecure", is_flag=True, panel=_PAGES,
-        help="let other computers in without TLS: whoever listens on the network can read along",
+        help="let other computers in without TLS: anyone on the network can read the traffic",
     )]  # fmt: skip
     language: Annotated[str | None, option(
         "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
@@ -209,7 +209,7 @@ def check(output: Output, recipe: Path, sockets: Path | None) -> int:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a station is run."""
+    """Settings of a station's run."""
 
     recipe: Annotated[Path, _path_option(
         "--recipe", required=True, help="what is done to each unit",
@@ -224,10 +224,10 @@ class RunOptions:
         "--badges", help="the table of the badges: who may work here (default: of --sockets)"
     )]  # fmt: skip
     scans: Annotated[Path | None, _path_option(
-        "--scans", help="labels in the order of the units; it ends behind the last",
+        "--scans", help="labels in the order of the units; the run ends after the last",
     )]  # fmt: skip
     lines: Annotated[bool, option(
-        "--lines", is_flag=True, help="a line for each happening, on a terminal too",
+        "--lines", is_flag=True, help="a line for each event, even on a terminal",
     )]  # fmt: skip
     web: Annotated[Address | None, option(
         "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
@@ -292,7 +292,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 @_records_options
 def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOptions) -> int:
     """Serve the supervisor pages of records, until Ctrl-C: runs, units, yield, causes, times,
-    images, audit trail. Nothing of the records is changed, and no station has to run here.
+    images, audit trail. The records are not changed, and no station has to run here.
     """
     need("The supervisor pages", "web")
     return _call("pages.serve", output, web, pages, records)
@@ -306,7 +306,7 @@ def pin(output: Output) -> int:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Which runs are reported, and what is written."""
+    """Selection of runs, and the files to write."""
 
     lot: Annotated[str | None, option(
         "--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot",
@@ -362,7 +362,7 @@ def unit(
     certificate: Path | None,
     records: RecordsOptions,
 ) -> int:
-    """Show the whole life of a unit, with its traces."""
+    """Show the whole history of a unit, with its traces."""
     return _call("records.unit", output, records, serial, part, certificate, full=story)
 
 
@@ -379,9 +379,9 @@ def backup(output: Output, file: Path, records: RecordsOptions) -> int:
 @option("--reader-role", metavar="NAME", default="flasher_reader", help="it reads them")
 @_records_options
 def roles(output: Output, station_role: str, reader_role: str, records: RecordsOptions) -> int:
-    """Give two users of a PostgreSQL server their rights, by the owner of the database: one for
-    stations, which adds records, and one which reads them. Neither can delete records, or change
-    tables and triggers. Users and records that are not there yet are made.
+    """Give two users of a PostgreSQL server their rights, as the owner of the database: one for
+    stations, which adds records, and one that reads them. Neither can delete records, or change
+    tables and triggers. Missing users and records are created.
     """
     return _call("maintenance.roles", output, records, station_role, reader_role)
 
@@ -400,7 +400,7 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
 def verify(
     output: Output, records: RecordsOptions, certificate: Path | None, *, is_all: bool
 ) -> int:
-    """Tell whether the records, or a certificate of them, were changed."""
+    """Check whether the records, or a certificate of them, were changed."""
     if certificate is not None:
         return _call("maintenance.verify_certificate", output, records, certificate)
     return _call("maintenance.verify", output, records, is_all=is_all)
@@ -440,14 +440,14 @@ def key(
 def accept(
     output: Output, what: str, operator: str | None, reason: str, records: RecordsOptions
 ) -> int:
-    """Let the station go on, and note who said so."""
+    """Let the station continue, and record who decided it."""
     return _call("maintenance.accept", output, records, what, operator, reason)
 
 
 @station.action("upgrade")
 @_records_options
 def upgrade(output: Output, records: RecordsOptions) -> int:
-    """Bring records of an older flasher up to date. Of a file, a backup is made first; a server
-    has to be backed up before (pg_dump), and its owner does it.
+    """Migrate records of an older flasher. A file is backed up first; a server has to be backed up
+    before (pg_dump), and its owner migrates it.
     """
     return _call("maintenance.upgrade", output, records)

@@ -1,4 +1,4 @@
-"""What `flasher station --json` prints, as types; see `flasher.cli.documents`."""
+"""Documents that `flasher station --json` prints; see `flasher.cli.documents`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flasher.trace.story import Cause, Story
 
 @dataclass(frozen=True)
 class RecipeFindingDocument:
-    """Something that speaks against a recipe."""
+    """A problem of a recipe."""
 
     where: str
     what: str
@@ -45,7 +45,7 @@ class CheckedTargetDocument:
 
 @dataclass(frozen=True)
 class StationCheckDocument:
-    """A recipe that can be used."""
+    """A valid recipe."""
 
     recipe: str
     part: str
@@ -58,7 +58,7 @@ class StationCheckDocument:
 
 @dataclass(frozen=True)
 class FindingsDocument:
-    """Why a recipe cannot be used; beside the error."""
+    """Problems of an invalid recipe; part of the error."""
 
     findings: list[RecipeFindingDocument]
 
@@ -88,7 +88,7 @@ class FiguresDocument:
 
 @dataclass(frozen=True)
 class StationRunDocument:
-    """What came of a station's work."""
+    """Result of a station's run."""
 
     station: str
     recipe: str
@@ -127,7 +127,7 @@ class UnitTraceDocument:
 
 @dataclass(frozen=True)
 class UnitDocument:
-    """The whole life of a unit."""
+    """The whole history of a unit."""
 
     unit: UnitLife
     traces: list[UnitTraceDocument]
@@ -146,7 +146,7 @@ class RoleDocument:
 
 @dataclass(frozen=True)
 class StationRolesDocument:
-    """Users that were given their rights."""
+    """Users who received rights."""
 
     records: str
     roles: list[RoleDocument]
@@ -170,7 +170,7 @@ class SigningKeyDocument:
 
 @dataclass(frozen=True)
 class AcceptedDocument:
-    """What a person let the station go on with."""
+    """A person's decision that lets the station continue."""
 
     station: str
     what: str

@@ -36,7 +36,7 @@ ELSEWHERE: Final = "a head kept elsewhere"
 
 
 def _open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
-    """The records, as the one station that the options or the records name."""
+    """Open the records for the one station that the options or the records name."""
     place = records_of(records)
     name = place.station
     if name is None:
@@ -55,7 +55,7 @@ def backup(output: Output, records: RecordsOptions, file: Path) -> int:
     return output.document(made)
 
 
-# -- what was changed -----------------------------------------------------------------------------
+# -- detecting changes ----------------------------------------------------------------------------
 
 
 def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
@@ -96,8 +96,8 @@ def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> i
 
 
 def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
-    """A line for each problem; many of the schema with one cause share one, and come first, so
-    that they hide nothing.
+    """A line for each problem; problems of the schema with one cause share a line, and come
+    first.
     """
     schema, others = "schema, ", []
     alike: dict[str, list[str]] = {}
@@ -233,7 +233,7 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
 
 
 def roles(output: Output, records: RecordsOptions, station_role: str, reader_role: str) -> int:
-    """Records that are not there yet are made: a station that may not make tables needs them."""
+    """Creates missing records: a station without the right to create tables needs them."""
     place = records_of(records)
     location = locate(place.url, Path())
     check_roles(location, station_role, reader_role)

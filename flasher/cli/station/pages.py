@@ -1,5 +1,5 @@
-"""The pages of a station: the operator's of `flasher station run --web` with the supervisor's
-beside it, the supervisor's alone of `flasher station pages`, and who may see them.
+"""Serves the pages of a station: operator and supervisor pages for `flasher station run --web`,
+supervisor pages only for `flasher station pages`; and controls access to them.
 """
 
 from __future__ import annotations

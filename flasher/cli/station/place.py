@@ -1,4 +1,4 @@
-"""Where the records are that the options name, and who works with them."""
+"""Finds the records and the operator from the options."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
 
 _READER: Final = "report"
-"""Who reads is no station: it claims no unit."""
+"""A reader is not a station: it claims no unit."""
 
 
 @dataclass(frozen=True)
 class RecordsPlace:
-    """Where the options say that the records are, and what belongs to them."""
+    """Location of the records, with its settings."""
 
     url: str
     """A file, or an SQLAlchemy URL."""
@@ -30,7 +30,7 @@ class RecordsPlace:
     lock_timeout_s: float
     keeping: KeyLocations
     station: str | None
-    """The station's name, where the options name its file."""
+    """The station's name, if the options give its file."""
 
     def open(
         self,
@@ -40,7 +40,7 @@ class RecordsPlace:
         read_only: bool = False,
         told: Callable[[str], None] = lambda _text: None,
     ) -> Store:
-        """The records as a station opens them. Raises UsageError, RecordError."""
+        """Open the records as a station. Raises UsageError, RecordError."""
         return Store.open(
             self.url,
             station=station,
@@ -54,7 +54,7 @@ class RecordsPlace:
 
 
 def records_of(options: RecordsOptions) -> RecordsPlace:
-    """Where the options say that the records are. Raises UsageError."""
+    """Location of the records in the options. Raises UsageError."""
     config = load_config(options.sockets) if options.sockets is not None else None
     database, files, keys, heads = options.database, options.files, options.keys, options.heads
     if config is None:

@@ -1,1 +1,1 @@
-"""Commands that upgrade a device, or look at what would be sent."""
+"""Commands that upgrade a device, or show the plan of an upgrade."""

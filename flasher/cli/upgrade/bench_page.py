@@ -57,11 +57,11 @@ from flasher.web.virtual_bike import NOTES, BikeFault, VirtualBike
 
 _TURN_S: Final = 0.2
 _MEMORY_MAX: Final = 4096
-"""In bytes, of the file with the adapter that was used last."""
+"""Limit in bytes of the file with the last adapter."""
 
 
 class Memory:
-    """What the page was told last: its adapter, its folder of images."""
+    """The adapter and image folder last chosen on the page."""
 
     def __init__(self) -> None:
         self._path = user_state_path("flasher", appauthor=False) / "ui.json"
@@ -74,11 +74,11 @@ class Memory:
             return {}
 
     def kept(self, name: str) -> str:
-        """What was told last; empty where nothing was."""
+        """The last choice; empty without one."""
         return self._all().get(name, "")
 
     def keep(self, **told: str) -> None:
-        """It is only for convenience: what cannot be written is left out."""
+        """Store choices. They are a convenience only: a failed write is ignored."""
         with contextlib.suppress(OSError):
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._path.write_text(json.dumps({**self._all(), **told}), "utf-8")
@@ -86,7 +86,7 @@ class Memory:
 
 @dataclass
 class _Place:
-    """What both kinds of workplace have: what is kept of an upgrade, and product profiles."""
+    """Shared by both kinds of workplace: the record of an upgrade, and product profiles."""
 
     _bus: Bus
     _output: Output
@@ -113,7 +113,6 @@ class _Place:
         return False
 
     def bus(self, _adapter: Adapter) -> Bus:
-        """The bus of an adapter."""
         return self._bus
 
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
@@ -135,9 +134,9 @@ class _Place:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(
-                f"The folder for backups cannot be made: {error.strerror or error}.",
+                f"Cannot create the folder for backups: {error.strerror or error}.",
                 where=printable(str(folder)),
-                remedy="Make room, or make the folder by hand.",
+                remedy="Make room, or create the folder by hand.",
                 code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
         with (
@@ -199,17 +198,17 @@ class _Place:
     def _told(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
     ) -> Callable[[object], None]:
-        """Who is told what happens in an upgrade that begins."""
+        """Builds the listener for events of an upgrade that begins."""
         return on_event
 
 
 def backup_folder() -> Path:
-    """Where backups of the page lie."""
+    """Folder for backups made on the page."""
     return user_data_path("flasher", appauthor=False) / "backups"
 
 
 def _backup_name(found: DeviceInfo) -> str:
-    """Of a new file: device, serial number and time."""
+    """File name from device, serial number and time."""
     version = found.version
     serial = "" if version is None else re.sub(r"[^A-Za-z0-9]+", "-", str(version.serial_number))
     at = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
@@ -274,7 +273,7 @@ class VirtualBikes(_Place):
         return [Adapter(fault.value, NOTES[fault]) for fault in BikeFault]
 
     def use(self, adapter: Adapter) -> None:
-        """A bike stays as it was left, so that it can be rescued."""
+        """A bike keeps its state, so that it can be rescued."""
         if adapter.name not in self._bikes:
             speed = self._bus.mock_speed
             self._bikes[adapter.name] = VirtualBike(
@@ -292,7 +291,7 @@ class VirtualBikes(_Place):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> bench.UpgradeEnding:
-        """What is wrong with a bike is shown, and not waited for until the overall deadline."""
+        """Shows a bike's fault instead of waiting for it until the overall deadline."""
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
 
@@ -312,8 +311,8 @@ class VirtualBikes(_Place):
 def serve(
     output: Output, bus: Bus, images: Path | None, *, port: int, opened: Callable[[str], None]
 ) -> FlasherError | None:
-    """Serve the page until Ctrl-C; `opened` is told its address. Returns how an upgrade ended in
-    which that came, where it did not end well.
+    """Serve the page until Ctrl-C; calls `opened` with its address. Returns the error of an upgrade
+    that was interrupted by Ctrl-C and failed.
     """
     ctx = click.get_current_context()
     pages = Pages(remembers_language=True)
@@ -354,12 +353,12 @@ def serve(
 
 
 def _folder(images: Path | None, memory: Memory) -> Path:
-    """Of images: the one that was named, else the one used last, else this one. Raises UsageError
-    for a name that is none.
+    """The image folder: the given one, else the last one used, else the working directory. Raises
+    UsageError if it is not a folder.
     """
     if images is not None and not images.expanduser().is_dir():
         raise UsageError(
-            f"{printable(str(images))} is no folder of this computer.",
+            f"{printable(str(images))} is not a folder of this computer.",
             where="--images",
             remedy="Name the folder that has the images, or choose it on the page.",
         )
@@ -368,8 +367,8 @@ def _folder(images: Path | None, memory: Memory) -> Path:
 
 
 def _wait(machine: Bench, worker: threading.Thread, stop: Stop) -> bool:
-    """Until the user ends it; True when that was in the middle of an upgrade. A terminal that is
-    gone ends it too, but an upgrade ends by itself then.
+    """Wait until the user ends it; True during an upgrade. A lost terminal ends it too, but an
+    upgrade then finishes by itself.
     """
     was_upgrading = False
     while worker.is_alive():

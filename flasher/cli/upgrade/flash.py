@@ -1,4 +1,4 @@
-"""`flasher flash` and `flasher rescue`: one upgrade, from the file to the last line."""
+"""`flasher flash` and `flasher rescue`: one upgrade of a device."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ examples:
   flasher flash firmware.hex -t bms --skip-same-version -i socketcan -c can0
   flasher flash firmware.hex -t obc --dry-run           show the plan, open no adapter
 
-"Transferred" (every packet acknowledged), "completed" (the device said so) and "running version X"
-(the new application answered) are three claims; the last lines say which of them were made good.
+"Transferred" (every packet acknowledged), "completed" (reported by the device) and "running
+version X" (the new application answered) are three claims; the last lines report which hold.
 """
 _RESCUE_EXAMPLES: Final = """\
 examples:
@@ -83,7 +83,7 @@ _EXIT_CODES: Final = (
     ExitCode.INTERRUPTED,
 )
 
-# -- what the user chooses -------------------------------------------------------------------------
+# -- options ---------------------------------------------------------------------------------------
 
 
 def _waiver_option(name: str) -> Decorator:
@@ -95,7 +95,7 @@ def _waiver_option(name: str) -> Decorator:
 
 @dataclass(frozen=True)
 class UpgradeChoices:
-    """How the upgrade goes, and which checks are waived."""
+    """Options of an upgrade, with its waived checks."""
 
     manifest: Annotated[str | None, option(
         "--manifest", metavar="FILE", type=values.FilePath("toml"), panel="image",
@@ -162,12 +162,12 @@ class UpgradeChoices:
         return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
 
     def waived_checks(self) -> frozenset[IdentityCheck]:
-        """The checks of image and device that are waived."""
+        """Waived checks of image and device."""
         return frozenset(check for check in WAIVABLE if self.allows(check.value))
 
     def options(self, profile: Profile, wait: float | None) -> UpgradeOptions:
-        """The profile's choices, the command line's where it makes any. Raises UsageError where
-        they do not go together.
+        """Options of the command line, with the profile as default. Raises UsageError for options
+        that exclude each other.
         """
         names = {each.name for each in (*fields(UpgradeOptions), *fields(Timings))}
         chosen = {name: value for name, value in vars(self).items() if name in names}
@@ -202,10 +202,10 @@ def flash(
     *,
     skip_same_version: bool,
 ) -> int:
-    """Upgrade a device: ask it who it is, check that the image belongs there, reset it into its
-    bootloader, transfer, wait for the final answer, verify. A device that sits in its bootloader
-    already, and announces itself, goes straight on, and so does one that still waits in an upgrade
-    that has no end; one that announces itself only at power-up needs `flasher rescue`.
+    """Upgrade a device: ask for its identity, check that the image fits, reset it into its
+    bootloader, transfer, wait for the final answer, verify. A device whose bootloader announces
+    itself starts at once, and so does one that still waits in an interrupted upgrade; one that
+    announces itself only at power-up needs `flasher rescue`.
     """
     upgrade = _Upgrade(output, target, image, choices, bus, recorded)
     return upgrade.run(skip_same_version=skip_same_version)
@@ -231,8 +231,8 @@ def rescue(
     *,
     wait: float | None,
 ) -> int:
-    """Upgrade a device that does not start any more: wait for the announcement that its bootloader
-    makes at power-up, answer it, transfer, wait for the final answer, verify.
+    """Upgrade a device that no longer starts: wait for the announcement of its bootloader at
+    power-up, answer it, transfer, wait for the final answer, verify.
     """
     upgrade = _Upgrade(output, target, image, choices, bus, recorded)
     return upgrade.run(at_power_up=True, power_up_timeout_s=wait)
@@ -240,7 +240,7 @@ def rescue(
 
 @dataclass
 class _Upgrade:
-    """One upgrade, and what is said about it."""
+    """One upgrade and its output."""
 
     output: Output
     target: Target
@@ -261,7 +261,7 @@ class _Upgrade:
         output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
         release = api.find_release(self.image.image, choices.manifest)
-        # What a file is refused for, before an adapter is looked for.
+        # Check the file before looking for an adapter.
         image = api.with_release(self.image.load(force=choices.force), release)
         profile.check_fits(image)
         self.bus = self.bus.with_profile(choices.profile)
@@ -317,7 +317,7 @@ class _Upgrade:
             lambda: self._connect(at_power_up=job.options.at_power_up),
             lambda connection, record: self._watching(upgrade_run.job, connection, record),
         )
-        # The bundle is told of before the error, so that the verdict stands at the end.
+        # Print the bundle before the error, so that the verdict is last.
         error, document = upgrade_run.error, upgrade_run.document
         show = output.result if error is None else output.progress
         if result.outcome.ok:
@@ -341,7 +341,7 @@ class _Upgrade:
     def _watching(
         self, job: api.Job, connection: api.Connection, record: Recording
     ) -> Iterator[api.CallOptions]:
-        """Shows the upgrade on the terminal, and ends it when the user wants to."""
+        """Shows the upgrade on the terminal, and stops it on request."""
         output = self.output
         output.progress(f"on {connection.name} at {connection.bit_rate}")
         with (
@@ -360,7 +360,7 @@ class _Upgrade:
                 output.event(event)
                 progress(event)
 
-            # A device that is waited for, or that may sit in an open session, need not be heard.
+            # A device before power-up, or in an open session, may be silent.
             if not job.options.at_power_up and not job.options.in_session:
                 device = connection.device(self.target, dialect=self.bus.dialect)
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
@@ -375,9 +375,9 @@ class _Upgrade:
         return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     def _add_repair(self, error: FlasherError) -> None:
-        """The exact command that repairs a device that was left without an application."""
+        """Adds the command that repairs a device left without an application."""
         if error.needs_rescue and not self.bus.mock:
-            # An image that the device has refused repairs nothing.
+            # An image that the device refused repairs nothing.
             is_refused = error.exit_code is ExitCode.REFUSED
             error.command = repair_command(click.get_current_context(), is_refused=is_refused)
             error.remedy = error.remedy.replace(f"{AGAIN} ", "")
@@ -386,7 +386,7 @@ class _Upgrade:
 # -- the command that repairs ----------------------------------------------------------------------
 
 OTHER_IMAGE: Final = "OTHER_IMAGE"
-"""Stands for an image that the device accepts, where it has refused the one that was sent."""
+"""Placeholder for another image, after the device refused the one sent."""
 _LEFT_OUT: Final = frozenset({"--timeout", "--trace-file", "--skip-same-version"})
 """What does not fit: a deadline meant for a device that answers at once (here somebody has to
 switch it off and on), a trace that is evidence now, what `rescue` has not."""
@@ -396,8 +396,8 @@ _OF_THE_IMAGE: Final = frozenset(
 
 
 def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
-    """The `flasher rescue` for the command of `ctx`, as a shell takes it. What was said about an
-    image that the device has refused is left out.
+    """The `flasher rescue` command for the command of `ctx`, quoted for a shell. Options about an
+    image that the device refused are omitted.
     """
 
     def is_left_out(name: str) -> bool:

@@ -1,4 +1,4 @@
-"""`flasher history`: what this computer has flashed."""
+"""`flasher history`: list the upgrades made from this computer."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ examples:
   flasher history --serial W2605001
   flasher history -t bms --limit 5 --json | jq '.flashes[].ended.exit_code'
 
-flash and rescue keep it, dry runs and stations do not. "No end recorded": the program was killed,
-or the computer lost power. The command that is shown below it brings the device its image.
+flash and rescue record it, dry runs and stations do not. "No end recorded": the program was killed,
+or the computer lost power. The command below it repeats the upgrade.
 """
 
 
 @dataclass(frozen=True)
 class HistoryDocument:
-    """What this computer has flashed."""
+    """Upgrades made from this computer."""
 
     file: str
     flashes: list[Flash]
     """The latest first."""
     total: int
-    """All that fit, shown or not."""
+    """Number of matching entries, shown or not."""
     damaged_lines: int
-    """Lines of the file that could not be read."""
+    """Unreadable lines of the file."""
 
 
 DOCUMENTS: Final = (HistoryDocument,)
@@ -52,8 +52,8 @@ DOCUMENTS: Final = (HistoryDocument,)
     help="show the latest N",
 )  # fmt: skip
 def history(output: Output, *, target: Target | None, serial: str | None, limit: int) -> int:
-    """Show what this computer has flashed: when, what onto which device, and how it ended. The
-    latest first.
+    """List the upgrades made from this computer, the latest first: time, image, device and
+    result.
     """
     kept = FlashHistory()
     flashes, damaged = kept.flashes()
@@ -110,7 +110,7 @@ def _lines(flash: Flash, *, is_open: bool) -> Iterator[str]:
         yield "           the device had no application then, or perhaps none: flasher rescue"
     if ended.bundle:
         yield printable(f"  bundle   {ended.bundle}")
-    # An image that the device has refused repairs nothing.
+    # An image that the device refused repairs nothing.
     if is_open and ended.exit_code != ExitCode.REFUSED:
         yield from _repair_lines(began)
 
@@ -122,7 +122,7 @@ def _repair_lines(began: Began) -> Iterator[str]:
 
 
 def reached(flash: Flash) -> str:
-    """How far a flash without an end came."""
+    """Progress of an upgrade without a recorded end."""
     found = flash.reached
     if found is None:
         return "nothing that erases, as far as is known"
@@ -131,5 +131,5 @@ def reached(flash: Flash) -> str:
 
 
 def again(began: Began) -> str:
-    """The command that brings the device of such a flash its image."""
+    """The command that repeats an upgrade without a recorded end."""
     return began.again or "flasher ui"

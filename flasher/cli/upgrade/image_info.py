@@ -1,4 +1,4 @@
-"""`flasher image-info`: what is in a file, what would be sent, how long it takes on the bus."""
+"""`flasher image-info`: show an image, the bytes to be sent, and the time on the bus."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ examples:
 
 @dataclass(frozen=True)
 class ImageInfoDocument:
-    """What is in a file, what lies beside it, and what an upgrade would send."""
+    """Contents of a file, its manifest, and the plan of an upgrade."""
 
     image: ImageDocument
     manifest: ManifestBesideDocument
     plan: PlanDocument
-    """For the BMS where no target was named: others differ by the ids alone."""
+    """For the BMS without a target: others differ only by their ids."""
 
 
 DOCUMENTS: Final = (ImageInfoDocument,)
@@ -66,12 +66,12 @@ def image_info(
     packet_gap_s: float | None,
     allow_implausible: bool,
 ) -> int:
-    """Show what is in an image file and what an upgrade would send. Opens no adapter. A file that
-    no device should get is shown as far as it can be read, and refused as flasher flash refuses it.
+    """Show the contents of an image file and the plan of its upgrade. Opens no adapter. A file that
+    no device should get is shown as far as it can be read, and refused as by flasher flash.
     """
     loaded = image.load()
     table = vector_table(loaded)
-    # The time differs by stuff bits only between targets: any one serves for the figure.
+    # Between targets the time differs only by stuff bits: any of them gives the figure.
     settings = load_profile(profile, target or BMS, api.as_dialect(dialect_name))
     plan = api.make_plan(
         loaded, settings.target, settings.dialect, has_upgrade=settings.has_upgrade
@@ -86,7 +86,7 @@ def image_info(
         plan=text.plan_document(plan, chosen),
     )
     release = None
-    with contextlib.suppress(FlasherError):  # told in `beside`
+    with contextlib.suppress(FlasherError):  # reported in `beside`
         release = api.find_release(image.image)
     waived = frozenset({IdentityCheck.PLAUSIBLE} if allow_implausible else ())
     identity = settings.identity(release=release, waived=waived)

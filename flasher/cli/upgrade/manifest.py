@@ -1,4 +1,4 @@
-"""`flasher manifest`: write the release manifest of an image, or hold an image against its own."""
+"""`flasher manifest`: write the release manifest of an image, or check an image against it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from flasher.settings.manifest import (
 
 @dataclass(frozen=True)
 class StatementDocument:
-    """One statement of a manifest, held against the image."""
+    """One statement of a manifest, compared with the image."""
 
     check: str
     result: Literal["agrees", "differs", "unchecked"]
@@ -97,7 +97,7 @@ Exit code 3 where the image is not the one of the manifest, or there is no right
 it is for another target.
 """
 _FOR_A_DEVICE: Final = ("hardware_versions", "minimum_boot_version", "previous_from")
-"""Statements that only a device's answers can be held against."""
+"""Statements that only a device's answers can confirm."""
 
 
 @group(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE, ExitCode.WRONG_DEVICE))
@@ -109,7 +109,7 @@ def manifest() -> None:
 
 
 def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Decorator:
-    """An option for a statement of the manifest, read as the manifest's key takes it."""
+    """Option for a statement of the manifest, parsed as the manifest's key."""
     name = key.removesuffix("s" if is_list else "").replace("_", "-")
 
     def read(value: str) -> str:
@@ -139,7 +139,7 @@ def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Deco
     "-o", "--output", "file", metavar="FILE", type=values.FilePath("toml"), panel="manifest",
     brief=True, help="(default: beside IMAGE, IMAGE.toml)",
 )  # fmt: skip
-@option("--force", "overwrite", is_flag=True, panel="manifest", help="write over an older manifest")
+@option("--force", "overwrite", is_flag=True, panel="manifest", help="overwrite an older manifest")
 def create(
     output: Output,
     image: ImageOptions,
@@ -172,7 +172,7 @@ def create(
 
 
 def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
-    """Raises UsageError where the manifest must not or cannot be written."""
+    """Raises UsageError if the manifest must not or cannot be written."""
     check_writable(path, "-o")
     if not path.exists():
         return
@@ -183,7 +183,7 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
     if not overwrite:
         raise UsageError(
             f"{printable(str(path))} exists.",
-            remedy="Look whether it is still wanted; --force writes over it, -o names another.",
+            remedy="Check whether it is still needed; --force overwrites it, -o names another.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         )
 
@@ -199,7 +199,7 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
     help="(default: beside IMAGE, IMAGE.toml)",
 )  # fmt: skip
 def check(output: Output, image: ImageOptions, target: Target | None, *, file: str | None) -> int:
-    """Hold the bytes that would be sent against the release manifest."""
+    """Check the bytes that would be sent against the release manifest."""
     loaded = image.load()
     release = find_release(image.image, file)
     if release is None:
@@ -225,7 +225,7 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
 
 
 def stated_rows(release: Release) -> dict[str, str]:
-    """What a manifest states, in words and safe to show."""
+    """Statements of a manifest as text, escaped for a terminal."""
     rows = {}
     for key in STATEMENTS:
         value: Any = getattr(release, key)
@@ -239,7 +239,7 @@ def stated_rows(release: Release) -> dict[str, str]:
 
 
 def checks_of(release: Release, image: Image, target: Target | None) -> list[StatementDocument]:
-    """Everything that a manifest states, held against image and target, or why it was not."""
+    """Every statement of a manifest, compared with image and target, or why it was not."""
     checks = [_held(finding, "the image") for finding in release.findings(image)]
     asked = None if target is None else target.node.name
     stated = release.target.node.name
@@ -257,7 +257,7 @@ def checks_of(release: Release, image: Image, target: Target | None) -> list[Sta
 
 
 def _held(finding: Comparison, other: str) -> StatementDocument:
-    """A finding; `other` is what the manifest is held against."""
+    """A finding; `other` is the thing that the manifest is compared with."""
     stated, found = finding.stated, finding.found
     if finding.agrees is None:
         detail = (
@@ -277,7 +277,7 @@ def _held(finding: Comparison, other: str) -> StatementDocument:
 
 @dataclass(frozen=True)
 class ManifestBesideDocument:
-    """The manifest that lies beside an image; `problem` says why it does not hold."""
+    """The manifest beside an image; `problem` explains why it does not match."""
 
     file: str
     found: bool
@@ -289,8 +289,8 @@ class ManifestBesideDocument:
 def manifest_beside(
     path: str | os.PathLike[str], image: Image, target: Target | None
 ) -> ManifestBesideDocument:
-    """Whether a manifest lies beside an image, and whether it agrees with it and with `target`.
-    What is wrong is told, not raised.
+    """Finds the manifest beside an image and compares it with the image and `target`. Errors are
+    reported in the result, not raised.
     """
     beside = str(manifest_path(path))
     release = None
@@ -314,7 +314,7 @@ def manifest_beside(
 
 
 def beside_line(beside: ManifestBesideDocument) -> str:
-    """The line of `image-info` for it."""
+    """Its line in `image-info`."""
     file, release = printable(beside.file), beside.release
     if not beside.found:
         return f"  release: no manifest beside it ({file})"

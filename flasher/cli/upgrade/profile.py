@@ -1,6 +1,4 @@
-"""`flasher profile`: what holds for a target, where each value comes from, and whether a file is
-right.
-"""
+"""`flasher profile`: show the settings of a target with their sources, or check a file."""
 
 from __future__ import annotations
 
@@ -55,7 +53,7 @@ ProfileValue = str | bool | int | float | list[int] | None
 
 @dataclass(frozen=True)
 class SourcedValue:
-    """A value of a profile and where it comes from."""
+    """A setting with its source."""
 
     value: ProfileValue
     source: str
@@ -64,7 +62,7 @@ class SourcedValue:
 
 @dataclass(frozen=True)
 class ProfileDocument:
-    """Every value that holds for a target; those of a table have its name before a point."""
+    """All settings of a target; those of a table have its name before a point."""
 
     target: str
     dialect: str
@@ -73,11 +71,11 @@ class ProfileDocument:
 
 @dataclass(frozen=True)
 class CheckedProfileDocument:
-    """A profile that is right."""
+    """A valid profile."""
 
     file: str
     targets: list[str]
-    """The targets that it has values of their own for."""
+    """The targets with tables of their own."""
 
 
 DOCUMENTS: Final = (ProfileDocument, CheckedProfileDocument)
@@ -85,15 +83,13 @@ DOCUMENTS: Final = (ProfileDocument, CheckedProfileDocument)
 
 @group(epilog=_EXAMPLES)
 def profile() -> None:
-    """Show what holds for a target and where each value comes from, or check a file. Opens no
-    adapter.
-    """
+    """Show the settings of a target with their sources, or check a file. Opens no adapter."""
 
 
 @profile.action("check")
 @argument("file", metavar="FILE", type=FilePath("toml"), help="the file to check")
 def check(output: Output, *, file: str) -> int:
-    """Check whether a file is right."""
+    """Check whether a file is valid."""
     names = [target.name for target in check_profile(file)]
     own = f"with values of their own for {', '.join(names)}" if names else "for every device alike"
     output.result(f"{printable(file)}: right, {own}")
@@ -105,7 +101,7 @@ def check(output: Output, *, file: str) -> int:
 @dialect_option
 @profile_option
 def show(output: Output, target: Target, *, dialect_name: str, profile: str | None) -> int:
-    """Show every value with its source."""
+    """Show every setting with its source."""
     holds = load_profile(profile, target, as_dialect(dialect_name))
     output.table(
         (name, _shown(name, value), printable(holds.sources[name]))
@@ -118,7 +114,7 @@ def show(output: Output, target: Target, *, dialect_name: str, profile: str | No
 
 
 def _shown(name: str, value: object) -> str:
-    """A value as the file would have it."""
+    """A value in the notation of the file."""
     match value:
         case None:
             return "not set"

@@ -1,4 +1,4 @@
-"""How an upgrade goes, on stderr: a bar on a terminal, one line a phase elsewhere."""
+"""Progress of an upgrade on stderr: a bar on a terminal, elsewhere one line per phase."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flasher.protocol.spec import PACKET_DATA_SIZE
 
 
 class Progress:
-    """Takes the events of an upgrade and shows them."""
+    """Shows the events of an upgrade."""
 
     def __init__(self, plan: Plan, output: Output) -> None:
         self._size_bytes = plan.image.size_bytes
@@ -34,7 +34,6 @@ class Progress:
         self._output.shows = lambda _event: False
 
     def __call__(self, event: object) -> None:
-        """Show one event."""
         match event:
             case events.PacketAcknowledged(number, total, _):
                 note = f"{self._repetitions} repeated" if self._repetitions else ""
@@ -56,7 +55,7 @@ class Progress:
             case events.AdapterBack():
                 self._wait.close()
             case events.PowerCycleAwaited(limit_s):
-                # What the user has to do now, so that it is seen.
+                # An instruction to the user must be visible.
                 text = f"power-cycle the device now (waiting {limit_s:.0f} s)"
                 bold = painted(text, "yellow") if self._output.colour else text
                 self._output.error_line(f">>> {bold}")
@@ -69,7 +68,7 @@ class Progress:
 
 
 def _is_shown(event: object) -> bool:
-    """True for what has a line or a bar of its own here."""
+    """True for an event with a line or bar of its own."""
     has_more = isinstance(
         event, events.PacketAcknowledged | events.AdapterAwaited | events.PowerCycleAwaited
     )

@@ -1,4 +1,4 @@
-"""Images, plans and upgrades in words and as JSON, for `flash`, `rescue` and `image-info`."""
+"""Formats images, plans and upgrades as text and JSON, for `flash`, `rescue` and `image-info`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class UpgradeDocument:
     outcome: Outcome
     verification: Verification
     previous_version: str | None
-    """What ran before; null where it could not be asked."""
+    """Version before the upgrade; null without an answer."""
     shutdown_heard: bool
     """The battery sent SHUTDOWN meanwhile."""
     link: LinkReport | None
@@ -53,7 +53,7 @@ class UpgradeDocument:
 
 @dataclass(frozen=True)
 class DryRunDocument:
-    """The plan of an upgrade that was not carried out."""
+    """Plan of an upgrade that was not run."""
 
     dry_run: bool
     image: ImageDocument
@@ -65,10 +65,10 @@ class DryRunDocument:
 
 
 def image_lines(image: Image) -> list[str]:
-    """What is in the file."""
+    """Contents of the file."""
     lines = [f"{printable(image.source)}: {image.format}, {byte_count(image.size_bytes)} to send"]
     if image.base is None:
-        lines.append("  address: unknown (a raw binary has none; --base tells it)")
+        lines.append("  address: unknown (a raw binary has none; --base sets it)")
     else:
         last = image.base + image.size_bytes - 1
         lines.append(f"  address: 0x{image.base:08X}..0x{last:08X}")
@@ -96,7 +96,7 @@ def vector_lines(table: VectorTable | None) -> list[str]:
 
 
 def plan_lines(plan: Plan, options: UpgradeOptions) -> list[str]:
-    """What would be sent to whom, and how long it takes on the bus, gaps included."""
+    """The bytes to be sent, their target, and the time on the bus, gaps included."""
     target = plan.target
     ids = f"CAN ids 0x{target.request_id:03X}, 0x{target.answer_id:03X}"
     document_bps = {dialect.bitrate_bps for dialect in DIALECTS.values() if dialect.has_upgrade}
@@ -117,7 +117,6 @@ def plan_lines(plan: Plan, options: UpgradeOptions) -> list[str]:
 
 
 def check_line(check: CheckMade) -> str:
-    """A check that was made, in one line."""
     return f"check: {check.verdict}: {check.text}"
 
 
@@ -131,7 +130,7 @@ _LEFT: Final = {
 
 
 def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> ClosingLine:
-    """The last line of an upgrade that was carried out or was not needed."""
+    """The last line of an upgrade that completed or was not needed."""
     outcome, node = result.outcome, result.outcome.target.node.name
     took = f"  {took_s:.1f} s"
     error = result.error()
@@ -148,7 +147,7 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
     elif verification.verdict is Verdict.VERSION_UNJUDGED:
         remark = "the image names no version to compare with"
     if outcome.ending is Ending.CONFIRMED_BY_VERSION:
-        remark += ", but it did not say complete"
+        remark += ", but it did not report completion"
     warnings = sum(check.verdict in ("warned", "waived") for check in checks)
     remark += f"; {counted(warnings, 'warning')}" if warnings else ""
     if result.running_version is None:
@@ -161,11 +160,11 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
 
 
 _LINE_MAX: Final = 120
-"""Characters of what failed: in a longer text a remark in brackets is left out."""
+"""Limit in characters: a longer text loses its remark in brackets."""
 
 
 def failed(error: FlasherError, more: str = "") -> ClosingLine:
-    """The last line of an upgrade that failed; the error stands in full above it."""
+    """The last line of an upgrade that failed; the whole error is printed above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
     what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
     if len(what) > _LINE_MAX:
@@ -176,7 +175,7 @@ def failed(error: FlasherError, more: str = "") -> ClosingLine:
 
 
 def summary_lines(result: Result, plan: Plan) -> list[str]:
-    """The final lines of an upgrade that went through: three claims, kept apart."""
+    """The final lines of a successful upgrade: three separate claims."""
     outcome = result.outcome
     figures = outcome.statistics
     transfer_s = figures.transfer_s or 0.0
@@ -193,7 +192,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
 
 
 def link_lines(report: LinkReport) -> list[str]:
-    """How long each end took, as min / median / p95 / p99 / max."""
+    """Times of both ends as min / median / p95 / p99 / max."""
     return [
         f"{end:<13} {spread_ms(figures)} ms {doing}"
         for end, figures, doing in (
@@ -205,13 +204,13 @@ def link_lines(report: LinkReport) -> list[str]:
 
 
 def unreadable_line(count: int) -> str:
-    """An adapter that damages what it delivers does not stop an upgrade, and slows it down."""
+    """An adapter that damages frames slows an upgrade down without stopping it."""
     times = "once" if count == 1 else f"{count:,} times"
     return f"{times} the adapter delivered unreadable frames; try another cable, port or adapter"
 
 
 def _running(result: Result) -> str:
-    """What is known of the application that runs now, and how."""
+    """The application that runs now, and its evidence."""
     verification = result.verification
     if verification.verdict is Verdict.NOT_ASKED:
         no_query = "" if _has_query(result) else _NO_QUERY
@@ -224,12 +223,12 @@ def _has_query(result: Result) -> bool:
 
 
 def _rate(plan: Plan, transfer_s: float) -> str:
-    """Bytes per second and how close to the line rate that is."""
+    """Bytes per second, and as a share of the line rate."""
     if not transfer_s:
         return ""
     share = plan.transfer_wire_s / transfer_s
     line = f"{plan.bitrate_bps / 1000:g} kbit/s line"
-    # A bus in memory or on a network has no bit rate to keep to.
+    # A bus in memory or on a network has no line rate.
     closeness = f"{min(share, 1):.0%} of a {line}" if share <= 1.02 else f"faster than a {line}"
     return f" ({plan.image.size_bytes / transfer_s / 1000:.1f} kB/s, {closeness})"
 
@@ -238,7 +237,6 @@ def _rate(plan: Plan, transfer_s: float) -> str:
 
 
 def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
-    """The image as JSON."""
     return document_of(
         ImageDocument,
         image,
@@ -248,7 +246,6 @@ def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
 
 
 def plan_document(plan: Plan, options: UpgradeOptions) -> PlanDocument:
-    """The plan as JSON."""
     return document_of(
         PlanDocument,
         plan,
@@ -268,7 +265,7 @@ def upgrade_document(
     checks: Iterable[CheckMade],
     link: LinkReport | None,
 ) -> UpgradeDocument:
-    """The document of an upgrade, good or bad."""
+    """The document of an upgrade, successful or not."""
     return UpgradeDocument(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),

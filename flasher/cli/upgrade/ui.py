@@ -1,5 +1,5 @@
-"""`flasher ui`: one bike upgraded in a browser; what is said on the page is said by
-`flasher.web.bench`. Its packages are loaded only here: they need the extra `web`.
+"""`flasher ui`: upgrade one bike in a browser, by the page of `flasher.web.bench`. Its packages
+(the extra `web`) are imported only here.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from flasher.errors import ExitCode
 _EXAMPLES: Final = """\
 examples:
   flasher ui --mock                                try it without hardware, with faults to choose
-  flasher ui                                       the adapters that are found are offered
+  flasher ui                                       offers the detected adapters
   flasher ui --images ~/firmware -i slcan -c /dev/ttyACM0
 
 The page is for this computer alone. Its address works once, in the browser that opens it first;
 more tabs of that show the same. Closing the page ends nothing; Ctrl-C here ends an upgrade at the
-end of its message, and says in which state the device is left. The guide is
+end of its message, and reports the state of the device. The guide is
 docs/how-to/bench_page.md.
 """
 
 
 @dataclass(frozen=True)
 class ServingLine:
-    """The page is there."""
+    """The page is served."""
 
     event: Literal["serving"]
     address: str
@@ -40,7 +40,7 @@ class ServingLine:
 
 @dataclass(frozen=True)
 class UiDocument:
-    """The page was ended; what was upgraded is in the history."""
+    """The page was closed; its upgrades are in the history."""
 
     address: str
 
@@ -65,7 +65,7 @@ DOCUMENTS: Final = (UiDocument,)
 )  # fmt: skip
 @bus_options(mock="offer virtual bikes, each with a fault or none", speed=values.speed)
 def ui(output: Output, bus: Bus, *, images: Path | None, no_browser: bool, port: int) -> int:
-    """Upgrade a bike in a browser: adapter, bike, image, checks, upgrade, and what came of it."""
+    """Upgrade a bike in a browser: adapter, bike, image, checks, upgrade, result."""
     need("The page", "web")
     from flasher.cli.upgrade.bench_page import serve  # noqa: PLC0415  an extra
 
@@ -77,7 +77,7 @@ def ui(output: Output, bus: Bus, *, images: Path | None, no_browser: bool, port:
         output.result(url)
         output.line(ServingLine("serving", url))
         if not no_browser and not webbrowser.open(url):
-            output.progress("no browser could be opened: open the address in one")
+            output.progress("no browser could be started: open the address in one")
 
     error = serve(output, bus, images, port=port, opened=opened)
     document = UiDocument(address)

@@ -1,7 +1,5 @@
-"""One recorded upgrade: its frames, a bundle when it fails, and its entry in this computer's
-history.
-
-A failure to record gives a warning; it never changes the upgrade.
+"""Runs one upgrade and records it: frames, a bundle when it fails, and this computer's history. A
+failure to record changes nothing about the upgrade: it only prints a warning.
 """
 
 from __future__ import annotations
@@ -32,32 +30,32 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
 Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]]
-"""Begins when the bus is open, and says who watches the upgrade."""
+"""Entered when the bus is open; gives the listeners of the upgrade."""
 
 
 @dataclass
 class UpgradeRun:
-    """An upgrade; `write_planned` fills in what is known of it."""
+    """One upgrade; `write_planned` fills in its facts."""
 
     job: Job
     bus: Bus
     recorded: RecordingOptions
     output: Output
     on_failure: Callable[[FlasherError], None] = lambda _error: None
-    """Completes an error before it is kept."""
+    """Completes an error before it is recorded."""
     again: str = ""
-    """What begins it again after this program was killed; empty where a page has begun it."""
+    """Command that repeats it after this program was killed; empty for the page."""
     checks: list[CheckMade] = field(default_factory=list)
     record: Recording | None = None
     document: UpgradeDocument | None = None
     error: FlasherError | None = None
-    """What stands for a bad end, completed."""
+    """The completed error of a failed upgrade."""
     took_s: float = 0.0
     warning: str = ""
-    """Why the history does not have it; empty where it has."""
+    """Why it is missing in the history; empty if it is there."""
     _history: FlashHistory = field(default_factory=FlashHistory)
     _name: str | None = None
-    """Of the history's; None before it has begun."""
+    """In the history; None before the start."""
     _serial_number: str | None = None
     _result: Result | None = None
 
@@ -156,7 +154,7 @@ class UpgradeRun:
                 self._history.reached(self._name, Reached(phase.value, packet))
 
     def _began(self, connection: Connection) -> None:
-        """The upgrade begins on this adapter."""
+        """Record the start on this adapter."""
         image = self.job.plan.image
         began = Began(
             at=_now(),
@@ -179,7 +177,7 @@ class UpgradeRun:
         self._carefully(write)
 
     def _ended(self, failure: BaseException | None) -> None:
-        """It is over, with this exception or without one."""
+        """Record the end, with the exception if it failed."""
         name, result = self._name, self._result
         if name is None:
             return
