@@ -476,7 +476,7 @@ def test_the_whole_life_of_a_unit_with_its_traces(
         "INTERRUPTED",
         "PASS",
     ]
-    assert "said complete, and is running version" in run.out
+    assert "reported complete, and is running version" in run.out
     assert SERIAL in page.read_text("utf-8")
     full = flasher("station", "unit", SERIAL, "--database", plant, "--story")
     assert "  | verdict: completed" in full.out
