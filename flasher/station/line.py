@@ -80,6 +80,8 @@ REACH_S: Final = 2.0
 """A unit that appears sooner after the prompt was in the socket before."""
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
+READ_S: Final = 2.0
+"""A label scanned again sooner was read twice, or by two people, before the refusal was read."""
 NOTE_S: Final = 15.0
 """A socket shows for this time that a card or label was dropped."""
 _RESUME: Final = Word.RESUME.value.lower()
@@ -463,7 +465,12 @@ class Line:
         match understood:
             case Label(serial):
                 if was_in_doubt and not waiting.label:
-                    raise self._in_doubt(waiting)
+                    refused, at_s = waiting.refused_label
+                    if refused != serial:
+                        waiting.refused_label = serial, now
+                    if refused != serial or now - at_s < READ_S:
+                        waiting.is_in_doubt = True
+                        raise self._in_doubt(waiting)
                 return "label", self._take_label(serial, waiting, now)
             case Command(word, argument):
                 person = self._crew.check_role(word)
@@ -667,7 +674,7 @@ class Line:
             raise self._in_doubt(waiting)
         if not waiting.label:
             # Until every check has passed: the label that follows must not go elsewhere.
-            waiting.is_in_doubt = True
+            waiting.is_in_doubt, waiting.refused_label = True, ("", now)
             waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
         self._check_line()

@@ -69,6 +69,11 @@ class Waiting:
     """Something was refused that belongs to what is scanned next, which must not be taken for
     another unit or socket: a card, or a second card or label beside the one that waits.
     """
+    refused_label: tuple[str, float] = ("", 0.0)
+    """The last label refused for that, and when. Scanned once more, after its refusal could be
+    read, it counts; another one does not: people who share the source may each have scanned the
+    card.
+    """
     forget_at_s: float | None = None
 
     @property
@@ -80,6 +85,7 @@ class Waiting:
         if self.card is not None:
             self.card.is_chosen = False
         self.label, self.card, self.is_in_doubt, self.forget_at_s = "", None, False, None
+        self.refused_label = "", 0.0
 
 
 ALONE: Final = frozenset({Word.CANCEL, Word.RESUME})

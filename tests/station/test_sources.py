@@ -329,6 +329,23 @@ def test_a_card_does_not_live_longer_than_its_unit(
         assert floor.runs == [(label, where)], (gap_s, name, label)
 
 
+def test_no_label_of_two_counts_alone_after_their_card_was_dropped(recipe: LoadedRecipe) -> None:
+    """Two people at one page scanned the card, and the unit is exchanged: both are asked for it."""
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.change_places(0.5)
+    for label in ("W1", "W2"):
+        floor.scan(label)
+        assert floor.refused()[-1].code == "NO_SOCKET"
+        assert floor.refused()[-1].text == label
+    floor.scan("W2")  # by the other one, or read twice
+    assert floor.runs == []
+    floor.scan("SOCKET A")
+    floor.scan("W2")
+    assert floor.runs == [("W2", "A")]
+
+
 def test_a_dropped_card_is_forgotten_in_the_end(recipe: LoadedRecipe) -> None:
     floor = Floor(recipe)
     floor.put_all(*pair())
