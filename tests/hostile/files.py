@@ -365,18 +365,18 @@ REPORTS = tuple(
     for name, make, said in (
         ("pipe.json", os.mkfifo, "not a regular file"),
         ("terabyte.json", sparse(1 << 40), "too large"),
-        ("deep.json", content(b"[" * 100_000), "no JSON"),
+        ("deep.json", content(b"[" * 100_000), "not valid JSON"),
         (
             "deep_value.json",
             content(b'{"report_schema": ' + b"[" * 900 + b"]" * 900 + b"}"),
-            "no JSON",
+            "not valid JSON",
         ),
         ("infinite.json", content(report_with("1e999")), "not finite"),
         ("nan.json", content(report_with("NaN")), "not finite"),
-        ("digits.json", content(report_with("9" * 5000)), "no JSON"),
+        ("digits.json", content(report_with("9" * 5000)), "not valid JSON"),
         ("large.json", content(report_with("9" * 1000)), "bits"),
         ("objects.json", content(b"[" + b"{}," * (6 * MEGA // 3 - 2) + b"1]"), "no conformance"),
-        ("nul.json", content(b"\0" * 100), "no JSON"),
+        ("nul.json", content(b"\0" * 100), "not valid JSON"),
     )
 )
 
@@ -551,7 +551,7 @@ TRACES = tuple(
         ("endless.db", database([], view("i")), USAGE, "no table messages"),
         ("silent.db", database([], view("count(*)")), USAGE, "no table messages"),
         ("blob.db", database([(1.0, 1, 0, 0, 0, 0, bytes(10 * MEGA))]), USAGE, "too big"),
-        ("folder.db", bundle(os.mkfifo), USAGE, "no bundle"),
+        ("folder.db", bundle(os.mkfifo), USAGE, "not a bundle"),
         ("journal.db", content(b"SQLite format 3\0" + bytes(84)), USAGE, "not a trace"),
         ("table.db", database([], "CREATE TABLE other (a)"), USAGE, "no table messages"),
         ("empty.db", content(b""), USAGE, "no table messages"),
@@ -594,16 +594,21 @@ TRACES = tuple(
             "ids more",
         ),
         # Bundles.
-        ("bundle", bundle(content(GOOD_LOG), os.mkfifo), USAGE, "no report"),
-        ("bundle_json", bundle(content(GOOD_LOG), content(b"[" * 100_000)), USAGE, "no report"),
+        ("bundle", bundle(content(GOOD_LOG), os.mkfifo), USAGE, "not the report"),
+        (
+            "bundle_json",
+            bundle(content(GOOD_LOG), content(b"[" * 100_000)),
+            USAGE,
+            "not the report",
+        ),
         (
             "bundle_nan",
             bundle(content(GOOD_LOG), content(b'{"written_at": 1e999}')),
             USAGE,
-            "no report",
+            "not the report",
         ),
         ("bundle_far", bundle(content(GOOD_LOG), content(b'{"written_at": 1e300}')), 0, "2 frames"),
-        ("bundle_link", bundle(link("/dev/zero")), USAGE, "no bundle"),
+        ("bundle_link", bundle(link("/dev/zero")), USAGE, "not a bundle"),
     )
 )
 
