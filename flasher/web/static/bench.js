@@ -6,8 +6,13 @@ let isFocusLost = false;
 function apply(message) {
   const name = document.activeElement.id;
   isFocusLost ||= name !== "";
+  const opened = [...document.querySelectorAll("details[open] > summary[id]")].map((of) => of.id);
   for (const [id, html] of Object.entries(message.parts ?? {})) {
     byId(id).innerHTML = html;
+  }
+  // What was unfolded stays so, when its piece comes anew.
+  for (const id of opened) {
+    byId(id)?.parentElement.setAttribute("open", "");
   }
   // Who uses the keyboard is where he was, or at what is wanted now, as soon as something is.
   for (const id of isFocusLost ? [name, "now"] : []) {
