@@ -31,6 +31,17 @@ signals_reach_processes = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(autouse=True)
+def hangups_arrive() -> Iterator[None]:
+    """Also where the tests were started by nohup, which lets its children ignore a hangup."""
+    if not hasattr(signal, "SIGHUP"):
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 # -- handlers -------------------------------------------------------------------------------------
 
 
