@@ -196,6 +196,20 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
         "refused: byId('refused').innerHTML.replaceAll(' open=', ' data-was=')}})"
     )
     assert page.locator("#refused details[data-was]").count() > 0
+    expect(page.locator("#refused details.waive[open]")).to_have_count(1)
+    # The next one is about another file, which nobody has looked at.
+    page.evaluate(
+        "() => apply({parts: {"
+        "refused: byId('refused').innerHTML.replaceAll(' open=', ' data-was=')"
+        ".replaceAll('odd.bin', 'another.bin')}})"
+    )
+    expect(page.locator("#refused details.waive[open]")).to_have_count(0)
+    expect(page.locator("#refused-all")).to_be_visible()
+    page.evaluate(
+        "() => apply({parts: {"
+        "refused: byId('refused').innerHTML.replaceAll('another.bin', 'odd.bin')}})"
+    )
+    page.click("#refused summary:text('Take it all the same')")
     expect(page.locator("#refused")).to_contain_text("do not look like a program for the device")
     page.click("#waive-2-go")  # not without the tick
     expect(page.locator("#waive-2-risk:invalid")).to_be_visible()

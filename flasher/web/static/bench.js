@@ -3,16 +3,25 @@
 
 let isFocusLost = false;
 
+// The file that an unfolding text is about, if it is about one.
+function about(summary) {
+  return summary.parentElement.querySelector(":scope > form [name=name]")?.value;
+}
+
 function apply(message) {
   const name = document.activeElement.id;
   isFocusLost ||= name !== "";
-  const opened = [...document.querySelectorAll("details[open] > summary[id]")].map((of) => of.id);
+  const opened = [...document.querySelectorAll("details[open] > summary[id]")]
+    .map((summary) => [summary.id, about(summary)]);
   for (const [id, html] of Object.entries(message.parts ?? {})) {
     byId(id).innerHTML = html;
   }
-  // What was unfolded stays so, when its piece comes anew.
-  for (const id of opened) {
-    byId(id)?.parentElement.setAttribute("open", "");
+  // What was unfolded stays so when its piece comes anew, unless it is about another file by now.
+  for (const [id, what] of opened) {
+    const summary = byId(id);
+    if (summary && about(summary) === what) {
+      summary.parentElement.setAttribute("open", "");
+    }
   }
   // Who uses the keyboard is where he was, or at what is wanted now, as soon as something is.
   for (const id of isFocusLost ? [name, "now"] : []) {
