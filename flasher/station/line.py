@@ -244,8 +244,7 @@ class Line:
             return  # the adapter was reopened between two polls
         was_short = now - socket.out_since_s < SHORT_OUTAGE_S
         # A unit can be exchanged quickly: one that has passed must report its number again.
-        has_passed = socket.last is not None and socket.last.outcome is RunState.PASS
-        socket.is_last_there = socket.is_last_there and was_short and not has_passed
+        socket.is_last_there = socket.is_last_there and was_short and not socket.has_passed
         socket.out_of_service, socket.sees_units = None, what.sees_units
         if not what.sees_units:
             socket.occupancy = Occupancy.SILENT
@@ -465,7 +464,7 @@ class Line:
         match understood:
             case Label(serial):
                 if was_in_doubt and not waiting.label:
-                    refused, at_s = waiting.refused_label
+                    refused, at_s = waiting.refused_label or ("", now)
                     if refused != serial:
                         waiting.refused_label = serial, now
                     if refused != serial or now - at_s < READ_S:
@@ -674,7 +673,7 @@ class Line:
             raise self._in_doubt(waiting)
         if not waiting.label:
             # Until every check has passed: the label that follows must not go elsewhere.
-            waiting.is_in_doubt, waiting.refused_label = True, ("", now)
+            waiting.is_in_doubt, waiting.refused_label = True, None
             waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
         self._check_line()

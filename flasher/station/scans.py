@@ -69,7 +69,7 @@ class Waiting:
     """Something was refused that belongs to what is scanned next, which must not be taken for
     another unit or socket: a card, or a second card or label beside the one that waits.
     """
-    refused_label: tuple[str, float] = ("", 0.0)
+    refused_label: tuple[str, float] | None = None
     """The last label refused for that, and when. Scanned once more, after its refusal could be
     read, it counts; another one does not: people who share the source may each have scanned the
     card.
@@ -85,7 +85,7 @@ class Waiting:
         if self.card is not None:
             self.card.is_chosen = False
         self.label, self.card, self.is_in_doubt, self.forget_at_s = "", None, False, None
-        self.refused_label = "", 0.0
+        self.refused_label = None
 
 
 ALONE: Final = frozenset({Word.CANCEL, Word.RESUME})

@@ -209,18 +209,19 @@ class Socket:
         is_other = None not in (self.own, what.serial) and self.own != what.serial
         return self.is_there and what.is_there and (what.is_power_up or what.was_missed or is_other)
 
+    @property
+    def has_passed(self) -> bool:
+        """True when the last unit here has passed, wherever it is by now."""
+        return self.last is not None and self.last.outcome is RunState.PASS
+
     def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
         """Note a unit that was detected or reported its serial number; `is_serial`: a number of the
         recipe. True when it is another unit than before.
         """
         before, self.occupancy = self.occupancy, Occupancy.THERE
         self.is_in_bootloader = what.is_in_bootloader
-        has_passed = self.last is not None and self.last.outcome is RunState.PASS
-        if (
-            before is Occupancy.UNKNOWN
-            and has_passed
-            and (what.is_power_up or what.is_in_bootloader)
-        ):
+        is_starting = what.is_power_up or what.is_in_bootloader
+        if before is Occupancy.UNKNOWN and self.has_passed and is_starting:
             # One that has passed runs its application: another one was put in, and nobody listened.
             before = Occupancy.SILENT
         if what.serial is not None:
@@ -260,7 +261,7 @@ class Socket:
         # Nor does one that has reported its number since, whatever happened to the adapter.
         is_pulled = (
             last is not None
-            and last.outcome is RunState.PASS
+            and self.has_passed
             and (not last.has_talked or (last.has_said and self.is_last_there))
         )
         is_out = is_certain or self.is_own_known or is_pulled or before is Occupancy.EMPTY
