@@ -56,7 +56,7 @@ class ProcessPort:
         self._process = context.Process(
             target=worker_main, args=(theirs, setup), name=f"socket {setup.socket}", daemon=True
         )
-        with deaf_from_birth():
+        with deaf_from_birth(to_sigterm=True):  # `kill` ends it with SIGKILL
             self._process.start()
         # The child has its own: only without this one its end is seen here.
         theirs.close()

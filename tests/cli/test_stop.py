@@ -22,6 +22,7 @@ from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment, lines_until
 from tests.loops import each
+from tests.station.factory import USUAL, write_recipe
 
 pytestmark = pytest.mark.slow
 
@@ -286,3 +287,38 @@ def test_a_closed_terminal_ends_before_the_update_command_and_finishes_after_it(
     report = json.loads((bundle / "report.json").read_text())
     assert report["outcome"]["ending"] == ending
     assert f"exit code {int(code)}" in log.read_text()
+
+
+@signals_reach_processes
+def test_sigterm_to_all_processes_of_a_station_finishes_the_runs_that_go_on(tmp_path: Path) -> None:
+    """Service managers and `timeout` send it to the processes of the sockets too."""
+    recipe = write_recipe(tmp_path, USUAL)
+    sockets = (
+        "--mock-sockets",
+        "2",
+        "--units",
+        "6",
+        "--mock-bad",
+        "0",
+        "--mock-dead",
+        "0",
+        "--mock-slow",
+        "0",
+    )
+    with subprocess.Popen(
+        [*FLASHER, "station", "run", "--recipe", str(recipe), *sockets, "--mock-speed", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=clean_environment(),
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        lines_until(process.stdout, "StepStarted")
+        os.killpg(process.pid, signal.SIGTERM)
+        out, err = process.communicate()
+    assert process.returncode == ExitCode.INTERRUPTED
+    units = json.loads(out.splitlines()[-1])["units"]
+    assert units
+    assert {unit["outcome"] for unit in units} == {"pass"}
+    assert "Ctrl-C again" in err
