@@ -416,9 +416,9 @@ def work_on(
 
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
-    # The station handles Ctrl-C, a closed terminal and SIGTERM, which a service manager sends to all
+    # The station handles Ctrl-C, a closed terminal and SIGTERM, which service managers send to all
     # processes of a service at once, and ends its processes itself.
-    for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGBREAK"):  # Windows has no SIGHUP, others no SIGBREAK
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):  # some lack one of the last two
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     pipe = StationPipe(channel, time.perf_counter)
