@@ -1,4 +1,4 @@
-"""What the records hand out and take: outcomes, what a run is claimed with, and how it ended."""
+"""Types of the station's records: claims, outcomes, runs with their steps, and filters."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
 
 
 class Clock(Protocol):
-    """Where the records take the time from."""
+    """The records' source of time; tests pass their own."""
 
     def utc(self) -> datetime:
-        """Now, with the time zone UTC."""
+        """Returns the current time, with the time zone UTC."""
 
     def monotonic_s(self) -> float:
-        """Seconds that only go forward; comparable within one start of the computer."""
+        """Returns seconds that never go backward; comparable until the computer restarts."""
 
 
 def utc_text(moment: datetime) -> str:
-    """A moment as it stands in the records: UTC, of one length, so that text order is time order.
+    """Formats a moment for the records: UTC, always the same length, so that texts sort by time.
 
     Raises ValueError for a moment without a time zone.
     """
     if moment.tzinfo is None:
-        raise ValueError("a time without a zone is no moment")
-    # isoformat: a report has ten thousands of them, and strftime takes twenty times as long.
+        raise ValueError("the time has no time zone")
+    # isoformat: a report formats tens of thousands, and strftime takes twenty times as long.
     return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix("+00:00") + "Z"
 
 
 def utc_moment(text: str) -> datetime:
-    """The moment that `utc_text` wrote."""
+    """Parses the text of `utc_text`."""
     return datetime.fromisoformat(text)
 
 
@@ -51,15 +51,15 @@ class RunState(LowerCaseInJson, StrEnum):
     FAIL = "FAIL"
     """The unit is bad."""
     ERROR = "ERROR"
-    """The station could not tell: adapter, power, files."""
+    """No verdict on the unit: its adapter, power or files failed."""
     ABORTED = "ABORTED"
     """A person stopped it."""
     INTERRUPTED = "INTERRUPTED"
-    """The station died under it; `recover` found it."""
+    """The station died during the run; `recover` marked it."""
 
 
 OUTCOMES: Final = (RunState.PASS, RunState.FAIL, RunState.ERROR, RunState.ABORTED)
-"""What `finish` takes."""
+"""The states that `Store.finish` accepts."""
 
 
 class RunKind(StrEnum):
@@ -67,51 +67,51 @@ class RunKind(StrEnum):
 
     PRODUCTION = "production"
     RECHECK = "recheck"
-    """The last run of this unit ended in the open: the device decides what is still to do."""
+    """The unit's last run ended without a verdict: the run asks the device which steps remain."""
     VERIFY_ONLY = "verify-only"
-    """The unit has passed: nothing is flashed or written."""
+    """The unit passed before: nothing is flashed or written."""
     REFLASH = "reflash"
-    """The unit has passed, and is done again for the reason given."""
+    """The unit passed before, and is flashed again for the reason given."""
     GOLDEN = "golden"
-    """A known unit tests the station; it counts in no figure."""
+    """A known good unit tests the station; figures exclude it."""
 
 
 class AuditEvent(StrEnum):
-    """What a person did at the station, noted in the audit trail by `Store.note`."""
+    """Acts of people at the station, which `Store.note` writes to the audit trail."""
 
     OPERATOR = "operator"
-    """Another person works from now on."""
+    """The operator changed."""
     RESUME = "resume"
-    """The line was stopped, and goes on."""
+    """A stopped line was resumed."""
     ABORT = "abort"
-    """A run was stopped by hand."""
+    """A run was aborted."""
     REASON = "reason"
-    """Why a unit is done again."""
+    """The reason for flashing a unit again."""
     REPRINT = "reprint"
-    """The label of a unit is printed once more."""
+    """The label of a unit was printed again."""
     REFUSED_SCAN = "refused scan"
     SIGN_IN = "sign-in"
-    """Somebody signed in at a page."""
+    """A person signed in at a page."""
     SIGN_IN_REFUSED = "refused sign-in"
     """A wrong badge, PIN or password was given at a page."""
     SIGN_OUT = "sign-out"
     SIGN_IN_ENDED = "ended sign-in"
-    """By a supervisor, by its own person at another browser, or by its limits."""
+    """A supervisor ended it, its own person did in another browser, or it expired."""
 
 
 class UnitState(LowerCaseInJson, StrEnum):
-    """What is known of a unit: derived from its last run."""
+    """The state of a unit, derived from its last run."""
 
     NEW = "NEW"
     RUNNING = "RUNNING"
     PASS = "PASS"  # noqa: S105
     FAIL = "FAIL"
     RECHECK = "RECHECK"
-    """The last run ended in the open. The device has to be asked."""
+    """The last run ended without a verdict: the device has to be asked."""
 
     @classmethod
     def after(cls, last: RunState | None) -> UnitState:
-        """The state of a unit whose last run is in this state; None: it had none."""
+        """The state of a unit whose last run has the state `last`; None: it has no run."""
         if last is None:
             return cls.NEW
         if last in (RunState.RUNNING, RunState.PASS, RunState.FAIL):
@@ -120,7 +120,7 @@ class UnitState(LowerCaseInJson, StrEnum):
 
 
 class StepName(StrEnum):
-    """A step of a run, in the order in which they come."""
+    """The steps of a run, in their order."""
 
     CONNECT = "connect"
     IDENTIFY = "identify"
@@ -133,7 +133,7 @@ class StepName(StrEnum):
 
 
 class Verified(IntEnum):
-    """How far a target was verified; more is greater."""
+    """How far a target was verified; ordered, the strictest is the greatest."""
 
     COMPLETED = 0
     """The device confirmed the complete image; nothing was read back."""
@@ -144,7 +144,7 @@ class Verified(IntEnum):
 
     @property
     def words(self) -> str:
-        """As a person reads it."""
+        """The level in words."""
         return ("completed, not read back", "version read back", "memory read back")[self]
 
 
@@ -160,7 +160,7 @@ class StepState(LowerCaseInJson, StrEnum):
 
 @dataclass(frozen=True)
 class Order:
-    """A run to be claimed."""
+    """A request for a run: the argument of `Store.claim`."""
 
     serial: str
     socket: str
@@ -172,7 +172,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Claim:
-    """A run that has begun; it is on disk. The process of its socket works on it."""
+    """A run that has begun and is on disk; it is sent to the process of its socket."""
 
     run_id: RunId
     kind: RunKind
@@ -181,22 +181,22 @@ class Claim:
     lot: str = ""
     # The station adds the following for the process of the socket.
     known_before: Mapping[str, str] = field(default_factory=dict)
-    """What must not change, as earlier runs read it first, by the name of its measurement."""
+    """Values that must not change, as earlier runs first read them, by measurement."""
     flashed_before: frozenset[str] = frozenset()
-    """Targets whose last flash, of this very image, was read back."""
+    """Targets whose last flash was of this same image, and was read back."""
     written_before: Mapping[str, str] = field(default_factory=dict)
-    """What the unit's last PASS wrote, by target and item ("bms serial-number")."""
+    """Values that the unit's last PASS wrote, by target and item ("bms serial-number")."""
     trace: Path = Path()
-    """Where the trace goes."""
+    """The file to record the trace in."""
     presence: int = 0
-    """The number of the last change of presence that the station knows: the label was given to
-    the unit of which that is true.
+    """`PresenceChanged.number` of the unit that the label was assigned to: the run ends when
+    another unit is in the socket.
     """
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A number with its limits, or a text with what was expected; exactly one of the two."""
+    """A measured number with its limits, or a text with the expected one; exactly one of both."""
 
     name: str
     value: float | None = None
@@ -208,7 +208,7 @@ class Measurement:
 
     @property
     def is_within(self) -> bool:
-        """True when nothing speaks against it."""
+        """True when the value is within its limits, or the text is the expected one."""
         if self.value is None:
             return self.expected is None or self.text == self.expected
         return (self.low is None or self.value >= self.low) and (
@@ -217,24 +217,24 @@ class Measurement:
 
 
 FLASH: Final = "flash"
-"""What the transfer of an image is called among the writes to a target."""
+"""`WriteRecord.what` of the transfer of an image."""
 SERIAL_NUMBER: Final = "serial-number"
-"""What a write of the serial number is called: that of its item."""
+"""`WriteRecord.what` of the serial number: the name of its item."""
 BY_POWER: Final = "by power"
-"""What a step says that restarted the unit by its power."""
+"""`StepRecord.text` of a restart by switching the unit's power."""
 AFTER_RESTART: Final = "after restart"
-"""What is measured where the recipe lets a run go on after a restart that it did not cause."""
+"""Measurement of a run that went on after a restart that it did not cause."""
 POWER_CYCLES: Final = "power cycles"
-"""What the count of a run's own power cycles is called among its measurements."""
+"""Measurement that counts the run's own power cycles."""
 TRACE: Final = "trace"
-"""Kind of the attachment: the whole trace of the bus."""
+"""Kind of attachment: the complete trace of the bus."""
 TORN_TRACE: Final = "torn-trace"
-"""Of a process that died: its end is missing."""
+"""Kind of attachment: the trace of a process that died; its end is missing."""
 
 
 @dataclass(frozen=True)
 class AttachmentFile:
-    """A file that belongs to a run, already stored by its hash."""
+    """A file of a run, already stored under its hash."""
 
     kind: str
     name: str
@@ -244,17 +244,17 @@ class AttachmentFile:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended: all that `Store.finish` saves in its one transaction."""
+    """The end of a run: everything that `Store.finish` saves in one transaction."""
 
     state: RunState
     code: str
-    """A short stable word for the cause, as "NO_ANSWER"; "OK" for a PASS."""
+    """Stable code of the cause, such as "NO_ANSWER"; "OK" for a PASS."""
     text: str
-    """What happened and what to do, for a person."""
+    """What happened and what to do, for people."""
     verified: Mapping[str, Verified] = field(default_factory=dict)
     """How far each target was verified, by the target's name."""
     log_sha256: str | None = None
-    """The hash of the bus trace, which is one of the attachments."""
+    """SHA-256 of the bus trace, which is one of the attachments."""
     attachments: Sequence[AttachmentFile] = ()
 
 
@@ -275,7 +275,7 @@ class StepRecord:
 
 @dataclass(frozen=True)
 class WriteRecord:
-    """An act that cannot be taken back: what was intended, and what is known of it."""
+    """A write to a device: recorded as intended before it, and as verified after it."""
 
     write_id: WriteId
     target: str
@@ -284,12 +284,12 @@ class WriteRecord:
     intended_at: datetime
     verified_at: datetime | None
     read_back: str | None
-    """What was read back; None where nothing was, or could be."""
+    """The value read back; None when none was, or when it cannot be read."""
 
 
 @dataclass(frozen=True)
 class TargetRecord:
-    """A target of a run: the image, how far it had to be verified and how far it was."""
+    """A target of a run: its image, the required verification and the one reached."""
 
     target: str
     image: str
@@ -301,7 +301,7 @@ class TargetRecord:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run as recorded, without its parts."""
+    """A run as recorded, without its targets, steps, writes and attachments."""
 
     run_id: RunId
     serial: str
@@ -309,7 +309,7 @@ class RunRecord:
     lot: str | None
     kind: RunKind
     is_virtual: bool
-    """The unit was a virtual one, made by the program: no product."""
+    """The unit was virtual: no product."""
     reason: str
     state: RunState
     code: str
@@ -317,7 +317,7 @@ class RunRecord:
     begun_at: datetime
     ended_at: datetime | None
     duration_s: float | None
-    """None for a run that goes on or was interrupted: its end is not known."""
+    """None while the run is active, and for an interrupted one: its end is not known."""
     station: str
     socket: str
     operator: str
@@ -325,7 +325,7 @@ class RunRecord:
     recipe_revision: str
     recipe_sha256: str
     verified: Verified | None
-    """The weakest of its targets; None where nothing is known."""
+    """The lowest level among its targets; None when not known."""
     log_sha256: str | None
 
 
@@ -339,7 +339,7 @@ class ReportedRun:
     lot: str | None
     kind: RunKind
     is_virtual: bool
-    """The unit was a virtual one: no product."""
+    """The unit was virtual: no product."""
     state: RunState
     code: str
     text: str
@@ -353,14 +353,14 @@ class ReportedRun:
     recipe_revision: str
     recipe_sha256: str
     verified: str | None
-    """The weakest of its targets: completed, version or memory."""
+    """The lowest level among its targets: completed, version or memory."""
     log_sha256: str | None
     reason: str
 
 
 @dataclass(frozen=True)
 class RunDetails:
-    """A run with all its parts."""
+    """A run with its targets, steps, writes and attachments."""
 
     run: RunRecord
     targets: tuple[TargetRecord, ...]
@@ -371,7 +371,7 @@ class RunDetails:
 
 @dataclass(frozen=True)
 class UnitLife:
-    """A unit and everything that was ever done to it, the oldest run first."""
+    """A unit with all of its runs, the oldest first."""
 
     serial: str
     part: str
@@ -380,7 +380,7 @@ class UnitLife:
 
     @property
     def is_virtual(self) -> bool:
-        """True for a unit that the program made; a unit is never both."""
+        """True for a virtual unit; a serial number is never used for both kinds."""
         return any(details.run.is_virtual for details in self.runs)
 
     @property
@@ -391,7 +391,7 @@ class UnitLife:
 
 @dataclass(frozen=True)
 class RunFilter:
-    """Which runs a report is about; None is no bound."""
+    """Selects the runs of a report; None does not restrict."""
 
     lot: str | None = None
     recipe: str | None = None
@@ -402,7 +402,7 @@ class RunFilter:
     serial: str | None = None
     part: str | None = None
     search: str | None = None
-    """Part of the serial number; large and small letters are one."""
+    """Part of the serial number; case is ignored."""
     state: RunState | None = None
     code: str | None = None
     socket: str | None = None
@@ -410,89 +410,89 @@ class RunFilter:
 
 @dataclass(frozen=True)
 class Figures:
-    """The figures of a report. Golden units count in none of them."""
+    """The figures of a report. They exclude golden units."""
 
     runs: int
     units: int
-    """Units with a run that told PASS from FAIL."""
+    """Units with at least one run that ended in PASS or FAIL."""
     passed: int
     """Units whose last such run is a PASS."""
     first_passed: int
     """Units whose first such run is a PASS."""
     by_state: Mapping[str, int]
     failures: Mapping[str, int]
-    """Runs that are no PASS, by code; the most frequent first."""
+    """Runs that ended in another state than PASS, by code; the most frequent first."""
     duration_median_s: float | None
     """Of runs that passed."""
     duration_longest_s: float | None
     virtual_runs: int = 0
-    """Runs of virtual units among all of these; none of them made a product."""
+    """Runs of virtual units, which are counted above too; none of them made a product."""
 
     @property
     def yield_share(self) -> float | None:
-        """Units passed in the end, as a share of 1; None without units."""
+        """`passed` divided by `units`, from 0 to 1; None without units."""
         return self.passed / self.units if self.units else None
 
     @property
     def first_pass_share(self) -> float | None:
-        """Units passed at the first try, as a share of 1; None without units."""
+        """`first_passed` divided by `units`, from 0 to 1; None without units."""
         return self.first_passed / self.units if self.units else None
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something in the records that is not as it has to be."""
+    """A damage, contradiction or forgery found in the records."""
 
     where: str
     what: str
     runs: tuple[int, ...] = ()
-    """The runs that it is about; empty when it is about all of them."""
+    """The numbers of the runs concerned; empty: all of them."""
 
 
 @dataclass(frozen=True)
 class KeptHeads:
-    """The heads that a station's chain was compared with."""
+    """The copies of a station's chain heads in one place, which its chain was compared with."""
 
     station: str
     place: str
     """A folder, or a database server."""
     first: int
-    """Number of the first audit row whose head is kept there: from 1 where all of them are."""
+    """Number of the first audit row whose head is stored there; 1 when all are."""
     last: int
     rows: int
-    """Of the chain; the last of them may not be kept there yet."""
+    """Audit rows of the chain; heads of the newest may not be stored there yet."""
     is_elsewhere: bool
-    """False beside the key of the station: whoever can write there can make all of it anew."""
+    """False beside the station's key: whoever can write there can forge records and heads."""
 
     @property
     def is_whole(self) -> bool:
-        """True when it vouches for every row."""
+        """True when it covers every audit row."""
         return self.first == 1 and self.last >= self.rows
 
 
 @json_keys("problems remarks kept unkept unreached since traces is_checked_elsewhere")
 @dataclass(frozen=True)
 class Examination:
-    """What was found in the records, and what they could be compared with."""
+    """Result of an examination of the records."""
 
     problems: tuple[Problem, ...]
-    remarks: tuple[str, ...]  # what a person should know, though nothing is wrong with it
+    remarks: tuple[str, ...]  # for people: notable, but no problem
     kept: tuple[KeptHeads, ...]
     unkept: tuple[str, ...]
-    """Stations of which no heads are kept elsewhere than beside their key: records made anew with
-    key and heads would look the same."""
+    """Stations whose heads are stored only beside their key: records forged together with key and
+    heads could not be detected."""
     traces: int
-    """Runs that passed and were compared with their own traces."""
+    """Number of passed runs that were compared with their traces."""
     unreached: tuple[str, ...] = ()
-    """Places of heads that could not be reached, each with why."""
+    """Places of heads that could not be reached, each with the reason."""
     since: str | None = None
-    """When everything before was examined, where only what came after that was now; null:
-    everything was."""
+    """The time of the complete examination that this one continues: only newer records were
+    examined; null: all were."""
 
     @property
     def is_checked_elsewhere(self) -> bool:
-        """Every audit trail was compared, from its first row to its last, with heads that are kept
-        in another place than beside the key.
+        """True when every audit trail was compared as a whole with heads that are stored in
+        another place than beside the key.
         """
         stations = {each.station for each in self.kept}
         return (
@@ -511,20 +511,20 @@ class Examination:
 
 @dataclass(frozen=True)
 class RunExamination:
-    """What was found about one run, its audit rows, and the heads of them that are kept."""
+    """Result of an examination of one run with its audit rows."""
 
     problems: tuple[Problem, ...]
     elsewhere: tuple[str, ...]
-    """Places in which the head of its last row is kept; not the one beside the key."""
+    """Places that hold the head of its last audit row, without the one beside the key."""
     is_beside: bool
-    """It is kept beside the key."""
+    """The head of its last audit row is stored beside the key."""
     examined_at: str | None
-    """When all records up to its last row were examined; None where they were not since."""
+    """When all records up to its last audit row were last examined; None: never."""
 
 
 @dataclass(frozen=True)
 class Backup:
-    """A copy that was made."""
+    """A backup of the records, as it was written."""
 
     path: Path
     sha256: str
