@@ -58,8 +58,6 @@ _UNOBSERVED: Final = (
     "This computer did not listen {}: another unit could have come, and would announce itself in"
     " the same way."
 )
-_MESSAGE_S: Final = 0.1
-"""The frames of one announcement arrive within this time."""
 
 
 class Continuity:
@@ -118,15 +116,13 @@ class Continuity:
         """The same when the last announcement of the burst came that goes on; None: none does."""
         self._burst_until = -inf
         """Up to when a burst may begin that the run has caused."""
-        self._heard_s, self._returned_s = 0.0, -inf
-        """How long somebody had listened when the unit was heard last, and when it was heard again
-        after a silence that allows an exchange.
-        """
+        self._heard_s = 0.0
+        """How long somebody had listened when the unit was heard last."""
         self._announced_on = 0
         """Announcements of the burst that goes on, since the last reset."""
-        self._awaits_confirmation = self._awaits_complete = False
+        self._awaits_confirmation = self._awaits_complete = self._awaits_application = False
         """A reset was sent to an application that runs, or the end of the transfer, and is not
-        confirmed.
+        confirmed; the end of the transfer was sent, and no application has sent anything since.
         """
         self._requested_s: float | None = None
         """The same for when the transfer that goes on was requested; None: none does."""
@@ -214,16 +210,14 @@ class Continuity:
             return
         watcher = self.watcher
         requests, announcements = watcher.transfer_requests, watcher.announcements
+        begun = watcher.begun_announcements
         answers, confirmations = watcher.answers, watcher.confirmations
         was_heard, power_ups = watcher.is_known, watcher.power_ups
-        completions = watcher.completions
+        completions, application_frames = watcher.completions, watcher.application_frames
         watcher(frame, sent=False, now=now)
         if watcher.power_ups > power_ups and (was_heard or self._was_silent):
             self._take_power_up(now, was_heard=was_heard)
-        if watcher.heard_at == now:
-            if self._listened_s - self._heard_s > _EXCHANGE_S:
-                self._returned_s = self._listened_s
-            self._heard_s = self._listened_s
+        has_returned = watcher.heard_at == now and self._returns()
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
         if watcher.confirmations > confirmations and (self._announced_s or 0.0) <= self._reset_s:
@@ -232,12 +226,22 @@ class Continuity:
         self._awaits_complete = self._awaits_complete and watcher.completions == completions
         if watcher.transfer_requests > requests and self.is_told_to_update:
             self._requested_s, self._burst_until = self._listened_s, -inf
-        if watcher.announcements > announcements:
-            self._take_announcement(now)
+        if watcher.application_frames > application_frames and self._awaits_application:
+            # The new application runs: the burst after the end of the transfer is over.
+            self._awaits_application, self._burst_until = False, -inf
+        if watcher.begun_announcements > begun:  # it may be pulled before the last frame
+            self._take_announcement(now, has_returned=has_returned)
+        if watcher.announcements > announcements and self._is_identified:
+            self._compare_boot_version()
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
             if self._requested_s is not None and not self._goes_on:
                 self._lose("runs an application in the middle of its transfer")
             self._compare(watcher.answer)
+
+    def _returns(self) -> bool:
+        """Note that it was heard; True after a silence that allows an exchange."""
+        before, self._heard_s = self._heard_s, self._listened_s
+        return self._listened_s - before > _EXCHANGE_S
 
     def _note_sent(self, frame: Frame, now: float) -> None:
         if frame.can_id == self._supply_id and frame.data.startswith(_WRITE):
@@ -272,7 +276,7 @@ class Continuity:
                 if not self._is_identified:
                     self._stay()
                 self.is_running = self._awaits_confirmation = self._awaits_complete = False
-                self.is_told_to_update = True
+                self.is_told_to_update, self._awaits_application = True, False
                 # A burst that the reset before it has caused may still come: it was lost then.
                 self._requested_s = None
             elif found.command == Command.END_OF_TRANSFER:
@@ -280,6 +284,7 @@ class Continuity:
                 self._announced_s = self._announced_s if self._requested_s is None else None
                 self._requested_s = None
                 self._burst_until, self._awaits_complete = inf, True
+                self._awaits_application = True
                 self._announced_on = _ANNOUNCED_ON
 
     @property
@@ -294,7 +299,7 @@ class Continuity:
 
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = self._awaits_complete = False
-        self._has_acted = True
+        self._has_acted, self._awaits_application = True, False
         self._requested_s = None
         # However late: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
@@ -313,7 +318,8 @@ class Continuity:
         else:
             self._lose("only announced its bootloader before, and runs an application now")
 
-    def _take_announcement(self, now: float) -> None:
+    def _take_announcement(self, now: float, *, has_returned: bool) -> None:
+        """Judge an announcement; `has_returned`: it follows a silence that allows an exchange."""
         since_s = self._pause_s
         goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
         self._judge_missed(since_s, goes_on=goes_on, is_caused=now <= self._burst_until)
@@ -332,13 +338,14 @@ class Continuity:
         if goes_on:
             return
         if is_caused:
-            has_returned = self._listened_s - self._returned_s < _MESSAGE_S
             if (self._awaits_confirmation or self._awaits_complete) and has_returned:
                 what = "the reset" if self._awaits_confirmation else "its image"
                 self._lose_by_restart(f"and had not confirmed {what} before")
             self.is_running = self._awaits_confirmation = self._awaits_complete = False
         elif now > self._supplied_until:
             self._lose_by_restart("although this run had not restarted it")
+
+    def _compare_boot_version(self) -> None:
         version, self._boot_version = self._boot_version, self.watcher.version
         if version and version != self._boot_version:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")

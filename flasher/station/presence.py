@@ -20,7 +20,7 @@ from flasher.protocol.messages import (
     RequestTransfer,
     decode,
 )
-from flasher.protocol.spec import Target, data_size
+from flasher.protocol.spec import COMMAND_SIZE, HEADER, Command, Mode, Target, data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from flasher.settings.profile import Profile, sent_ids
@@ -36,6 +36,12 @@ PROBE_S: Final = 0.5
 """Interval between requests to a unit."""
 PAUSE_S: Final = 0.25
 """Announcements of one power-up are less than this apart."""
+_ANNOUNCEMENT: Final = (
+    HEADER
+    + bytes((Mode.REPORT, COMMAND_SIZE + data_size(Command.BOOT_VERSION)))
+    + Command.BOOT_VERSION.to_bytes(COMMAND_SIZE, "big")
+)
+"""Begins the first frame of an announcement."""
 _RHYTHM_S: Final = 1.0
 """Pauses of a bootloader that keeps announcing recur within this time."""
 _ALIKE: Final = 1.5
@@ -64,8 +70,8 @@ class TargetWatcher:
         item = None if self.request is None else self.request.answer_item
         self._item = item
         self._answers = None if item is None else Reassembler(item.can_id, limit_s)
-        self.announcements = 0
-        """Of its bootloader."""
+        self.announcements = self.begun_announcements = 0
+        """Of its bootloader: complete ones, and those whose first frame was received."""
         self.version = ""
         """The boot version that was announced last, escaped."""
         self.heard_at: float | None = None
@@ -89,6 +95,7 @@ class TargetWatcher:
         expected to end."""
         self.has_application = False
         """The application has sent since the last announcement."""
+        self.application_frames = 0
         self._announcing_on_s = timings.announcing_on_s
         self._announcing_s = 0.0
         """Duration of the announcements so far."""
@@ -111,6 +118,7 @@ class TargetWatcher:
                 self._hear_application()
                 self.has_sent_message = True
         if frame.can_id == self._boot.can_id:
+            self.begun_announcements += frame.data.startswith(_ANNOUNCEMENT)
             for found in self._boot.feed(frame.data, now):
                 if isinstance(found, Message):
                     self._hear_bootloader(found, now)
@@ -146,6 +154,7 @@ class TargetWatcher:
         if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
             self._powered_up()  # a device without an application does not start one
         self.has_application = True
+        self.application_frames += 1
 
     def miss(self, missed_s: float) -> None:
         """Add unobserved time: it counts neither as a pause of the device nor as silence."""

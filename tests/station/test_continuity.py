@@ -44,10 +44,14 @@ class Watched:
             self.now = min(self.now + 0.05, now)
             self.continuity.listened(self.now)
 
-    def hear(self, now: float, message: object, *, sent: bool = False) -> None:
+    def hear(
+        self, now: float, message: object, *, sent: bool = False, frames: int | None = None
+    ) -> None:
+        """`frames`: only so many of its first ones."""
         self.go_to(now)
         can_id = BMS.request_id if sent else BMS.answer_id
-        for frame in split(can_id, encode(message.to_message(can_id))):  # type: ignore[attr-defined]
+        data = encode(message.to_message(can_id))  # type: ignore[attr-defined]
+        for frame in split(can_id, data)[:frames]:
             self.continuity(frame, sent=sent, now=self.now)
 
     def send(self, now: float, message: object) -> None:
@@ -112,6 +116,37 @@ def test_an_update_command_after_a_confirmed_reset_and_one_announcement_allows_n
     assert not run.continuity.lost
     run.announce(1.8)
     assert "announced its bootloader" in run.continuity.lost
+
+
+@each("pause_s", [0.05, 0.4])
+@each("frames", [1, 2])
+def test_a_unit_that_is_pulled_in_its_first_announcement_has_announced_itself(
+    tmp_path: Path, frames: int, pause_s: float
+) -> None:
+    run = Watched(tmp_path)
+    run.identify()
+    run.send(1.1, ResetCommand())
+    run.hear(1.11, GeneralFeedbackMessage())
+    run.hear(1.2, ANNOUNCEMENT, frames=frames)
+    run.announce(1.2 + pause_s)
+    assert bool(run.continuity.lost) == (pause_s > 0.3), "else a frame was lost"
+
+
+@each("frames", [0, 1, 3])
+def test_a_unit_that_is_pulled_in_its_first_answer_has_started(tmp_path: Path, frames: int) -> None:
+    run = Watched(tmp_path)
+    run.identify()
+    run.send(1.1, ResetCommand())
+    run.hear(1.11, GeneralFeedbackMessage())
+    run.announce(1.2, 1)
+    run.send(1.21, UpdateCommand(BMS.update_text, 256))
+    run.hear(1.22, RequestTransfer())
+    run.send(1.23, EndOfTransfer())
+    run.hear(1.24, Complete())
+    for frame in version_answer("NONE")[:frames]:
+        run.continuity(frame, sent=False, now=run.now)
+    run.announce(2.0)
+    assert bool(run.continuity.lost) == (frames > 0)
 
 
 def test_what_announces_itself_in_a_silent_socket_came_after_the_run_began(tmp_path: Path) -> None:

@@ -238,6 +238,16 @@ STORIES = {
         " @7.0 label by=jo unit=1 ; @8.0 worker socket=B ; @10.0 card by=jo unit=1 ;"
         " @10.5 pull unit=1 ; @10.78 put unit=3 socket=B ; @11.0 label by=jo unit=1"
     ),
+    "pulled in its first announcement": (
+        "line sockets=1 recipe=plain ; unit label=2 ; unit label=5 application=new ;"
+        " person name=jo ; @2.0 card by=jo unit=2 socket=A ; @2.1 label by=jo unit=2 ;"
+        " @2.74 put unit=2 socket=A ; @4.057 pull unit=2 ; @5.0 put unit=5 socket=A"
+    ),
+    "pulled in its first answer": (
+        "line sockets=1 recipe=plain ; unit label=1 pace=slow ; unit label=5 application=new ;"
+        " person name=al source=al ; @2.0 put unit=1 socket=A ; @5.9 label by=al unit=1 ;"
+        " @8.324 pull unit=1 ; @9.0 put unit=5 socket=A"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
