@@ -7,10 +7,7 @@ template and fill in the values. A value that is a `Text` itself is translated t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
-
-Gettext = Callable[[str], str]
 
 
 class Text(str):
@@ -43,19 +40,3 @@ def with_value(sentence: str, old: str, new: str) -> str:
         for name, value in sentence.values.items()
     }
     return Text(sentence.template, values)
-
-
-def translate(sentence: str, gettext: Gettext) -> str:
-    """Translate a sentence, and the values in it; `gettext` returns what it does not know."""
-    if not sentence:
-        return ""
-    if not isinstance(sentence, Text):
-        return gettext(sentence)
-    template = gettext(sentence.template)
-    if not sentence.values:
-        return template
-    values = {
-        name: translate(value, gettext) if isinstance(value, Text) else value
-        for name, value in sentence.values.items()
-    }
-    return template.format(**values)

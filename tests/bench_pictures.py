@@ -17,7 +17,7 @@ from typing import Final, Literal
 from playwright.sync_api import Browser, Page, expect
 
 from flasher import events
-from flasher.web.translation import NAMES
+from flasher.translation import NAMES
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.firmware import VECTORS

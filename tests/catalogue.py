@@ -33,11 +33,11 @@ from flasher.protocol.contents import BatteryFault
 from flasher.protocol.fields import flag_names, label
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
-from flasher.web.translation import NAMES
+from flasher.translation import NAMES
 from flasher.wording import wording
 
 ROOT: Final = Path(__file__).parent.parent / "flasher"
-FOLDER: Final = ROOT / "web" / "locale"
+FOLDER: Final = ROOT / "locale"
 LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
 _PAGES: Final = "web/templates/**.html"
 _METHODS: Final = {"text": ("**.py", "python"), "_": (_PAGES, "jinja2.ext:babel_extract")}

@@ -18,7 +18,7 @@ from flasher.i18n import text
 from flasher.station import codes
 from flasher.station.events import LineStopped, Progressed, ScanAccepted, ScanRefused, SocketState
 from flasher.station.records.model import StepName
-from flasher.web.translation import NAMES
+from flasher.translation import NAMES
 from tests.web.browser import chromium
 from tests.web.line_screen import AT, LineScreen, served
 from tests.web.test_operator_page import LONGEST, SIZES, STATES, TOO_LARGE

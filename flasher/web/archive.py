@@ -22,9 +22,9 @@ from flasher.report.base import visible
 from flasher.report.explain_page import story_context
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
+from flasher.translation import translator
 from flasher.web.pages import Pages
 from flasher.web.query_processes import HTML, Answer, Question
-from flasher.web.translation import translator
 
 SHOWN_MAX: Final = 50
 """Limit for flashes, and for files of one kind."""

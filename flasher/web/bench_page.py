@@ -23,10 +23,10 @@ from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
 from flasher.report.base import visible
 from flasher.trace.decoder import Field, content_fields
+from flasher.translation import Translator
 from flasher.web.bench import Bench
 from flasher.web.bench_state import BenchState, Done
 from flasher.web.pages import Pages, streamed
-from flasher.web.translation import Translator
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
 """In bytes: more than the largest image as Intel HEX."""

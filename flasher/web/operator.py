@@ -25,9 +25,9 @@ from flasher.station.events import LineStopped, RunEnded, SocketState, StationEv
 from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.shift_counts import EndedRun, Output, ShiftCounts
 from flasher.station.socket import PAGE, Source
+from flasher.translation import Translator
 from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
-from flasher.web.translation import Translator
 
 TAIL_DIGITS: Final = 6
 """Digits of a serial number shown large: enough to tell the units on a bench apart."""

@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, Response, StreamingResponse
 
 from flasher import __version__
 from flasher.report.base import environment
-from flasher.web.translation import NAMES, Translator, chosen
+from flasher.translation import NAMES, Translator, chosen
 
 _PART: Final = "part_"
 

@@ -58,10 +58,10 @@ from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.station.stories import explained
 from flasher.trace.figures import Distribution
 from flasher.trace.story import Story
+from flasher.translation import Translator, translator
 from flasher.web.charts import SERIES_MAX, lines, stacked_bars
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question
-from flasher.web.translation import Translator, translator
 
 USUAL_DAYS: Final = 30
 """Days with runs that figures cover by default."""

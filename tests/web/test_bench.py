@@ -30,10 +30,10 @@ from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
+from flasher.translation import translator
 from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import battery_answers
 from flasher.web.bench_state import Activity, BenchState, Done
-from flasher.web.translation import translator
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order

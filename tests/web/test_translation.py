@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from flasher.i18n import Text, text, translate, with_value
+from flasher.i18n import Text, text, with_value
 from flasher.station.scans import Word
-from flasher.web.translation import chosen, translator
+from flasher.translation import chosen, translator
 from tests import catalogue
 from tests.loops import each
 
@@ -66,8 +66,24 @@ def test_a_sentence_passes_from_process_to_process() -> None:
 
 
 def test_what_no_catalogue_knows_stays_as_it_is() -> None:
-    assert translate("relay 3: no such file", lambda text: text) == "relay 3: no such file"
     assert translator("zh")("relay 3: no such file") == "relay 3: no such file"
+
+
+def test_plain_english_is_translated_by_the_sentence_that_it_matches() -> None:
+    german = translator("de")
+    assert german("Put W1 into socket A.") == "W1 auf Platz A setzen."
+    assert german("Put W1 into socket A. Connect W2.") == "W1 auf Platz A setzen. W2 anschließen."
+    assert german("Put W1 into socket A. Relay 3 fell off.").endswith(". Relay 3 fell off.")
+    assert translator("en")("Put W1 into socket A.") == "Put W1 into socket A."
+
+
+def test_numbers_are_written_as_in_the_language() -> None:
+    german = translator("de")
+    assert (
+        german.numbers("1,234.5 s, version 1.2.3, 65,535.") == "1.234,5 s, version 1.2.3, 65.535."
+    )
+    assert german("{seconds:.1f} s", seconds=1234.56) == "1234,6 s"
+    assert translator("zh").numbers("1,234.5 s") == "1,234.5 s"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,165 @@
+"""Translations of pages and certificates: Babel catalogues in `locale`, by English sentences.
+
+A page translates a `Text` by its template. Errors, stories and records hold plain English, made by
+f-strings: the catalogue has these with their values in braces, and a sentence is translated by the
+entry that matches it. What no entry matches stays as it is.
+"""
+
+from __future__ import annotations
+
+import gettext
+import io
+import re
+from collections.abc import Iterable, Iterator
+from functools import cache, lru_cache
+from importlib import resources
+from string import Formatter
+from typing import Any, Final, NamedTuple
+
+from flasher.i18n import Text
+
+NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
+"""Native language names by code. English needs no catalogue."""
+_COMMA: Final = str.maketrans(",.", ".,")
+_COMMA_LANGUAGES: Final = frozenset({"de"})
+"""They write 1.234,5."""
+_NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
+_LETTERS_MIN: Final = 4
+"""In an entry without its values: fewer would match anything."""
+_SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
+_JOINTS: Final = (
+    re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL),
+    re.compile(r"(.+?)(; )(.+)()", re.DOTALL),
+    re.compile(r"(.+?)(: )(.+)()", re.DOTALL),
+)
+"""Where a text is joined from several ones."""
+_OF_ONE_SENTENCE: Final = re.compile(r"(?:(?![.!?] [A-Z]).)*", re.DOTALL)
+_ANY: Final = re.compile(r".*", re.DOTALL)
+
+
+class _Entry(NamedTuple):
+    """A sentence with values, and the longest part that each of its texts has."""
+
+    template: str
+    pattern: re.Pattern[str]
+    landmark: str
+
+
+class _Shown(str):
+    """A value as it was formatted in English."""
+
+    __slots__ = ()
+
+
+class Translator(Formatter):
+    """Translates into one language; `code` is for a page's `lang` attribute."""
+
+    def __init__(self, code: str, catalogue: gettext.NullTranslations) -> None:
+        self.code = code
+        self._gettext = catalogue.gettext
+        self._entries = sorted(_entries(catalogue), key=lambda entry: -len(entry.landmark))
+        self._plain = lru_cache(4096)(self._translate_plain)
+
+    def __call__(self, sentence: str, **values: object) -> str:
+        """Translate a sentence; `values` fill a page's own ones."""
+        if isinstance(sentence, Text):
+            values |= sentence.values
+            sentence = sentence.template
+        elif not values:
+            return self._plain(sentence)
+        said = self._gettext(sentence) if sentence else ""
+        return self.vformat(said, (), values) if values else said
+
+    def numbers(self, text: str) -> str:
+        """Write the numbers of a text, 1,234.5 in English, as the language does."""
+        if self.code not in _COMMA_LANGUAGES:
+            return text
+        return _NUMBER.sub(lambda number: number[0].translate(_COMMA), text)
+
+    def _translate_plain(self, sentence: str) -> str:
+        said = self._gettext(sentence) if sentence else ""
+        if said != sentence or " " not in sentence or not self._entries:
+            return said
+        return (
+            self._matched(sentence, _OF_ONE_SENTENCE)
+            or self._split(sentence, _SENTENCES)
+            or self._matched(sentence, _ANY)
+            or next(filter(None, (self._split(sentence, joint) for joint in _JOINTS)), sentence)
+        )
+
+    def _matched(self, sentence: str, values: re.Pattern[str]) -> str:
+        """Translate by the entry that matches with such values; "" without one."""
+        for entry in self._entries:
+            found = entry.pattern.fullmatch(sentence) if entry.landmark in sentence else None
+            if found is not None and all(map(values.fullmatch, found.groups())):
+                shown = {name: _Shown(text) for name, text in found.groupdict().items()}
+                return self.vformat(self._gettext(entry.template), (), shown)
+        return ""
+
+    def _split(self, sentence: str, joint: re.Pattern[str]) -> str:
+        """Translate what is joined; "" if it is not, or nothing of it is known."""
+        parts = joint.fullmatch(sentence)
+        if parts is None:
+            return ""
+        first, between, second, end = parts.groups()
+        said = "".join([self._plain(first), between, self._plain(second), end])
+        return said if said != sentence else ""
+
+    # -- filling in values ------------------------------------------------------------------------
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, Text):
+            return self(value)
+        if isinstance(value, _Shown):
+            text = str(value)
+            return self.numbers(text) if format_spec else self._with_edges(text)
+        text = format(value, format_spec)
+        return self._with_edges(text) if isinstance(value, str) else self.numbers(text)
+
+    def convert_field(self, value: Any, conversion: Any) -> Any:
+        return value if isinstance(value, _Shown) else super().convert_field(value, conversion)
+
+    def _with_edges(self, text: str) -> str:
+        """Translate a value of several words, and keep the spaces around it."""
+        bare = text.strip()
+        return text.replace(bare, self._plain(bare)) if " " in bare else text
+
+
+def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:
+    for template in getattr(catalogue, "_catalog", ()):
+        pattern, landmark, letters, names = "", "", 0, set[str]()
+        for literal, name, _, _ in Formatter().parse(template):
+            pattern += re.escape(literal)
+            landmark = max(landmark, literal, key=len)
+            letters += sum(map(str.isalpha, literal))
+            if name is not None:
+                pattern += f"(?P={name})" if name in names else f"(?P<{name}>.*?)"
+                names.add(name)
+        if names and letters >= _LETTERS_MIN:
+            yield _Entry(template, re.compile(pattern, re.DOTALL), landmark)
+
+
+@cache
+def translator(code: str) -> Translator:
+    """The translator for a code. Raises KeyError for an unknown one."""
+    if code not in NAMES:
+        raise KeyError(code)
+    if code == "en":
+        return Translator(code, gettext.NullTranslations())
+    from babel.messages.mofile import write_mo  # noqa: PLC0415  not everybody has it
+    from babel.messages.pofile import read_po  # noqa: PLC0415
+
+    source = resources.files("flasher").joinpath("locale", f"{code}.po")
+    compiled = io.BytesIO()
+    with source.open("rb") as file:
+        write_mo(compiled, read_po(file, locale=code))
+    compiled.seek(0)
+    return Translator(code, gettext.GNUTranslations(compiled))
+
+
+def chosen(wanted: str | None, accepted: Iterable[str]) -> Translator:
+    """The translator that the address selects, else the browser's first supported language."""
+    for code in (wanted or "", *accepted):
+        if code.split("-")[0].lower() in NAMES:
+            return translator(code.split("-")[0].lower())
+    return translator("en")
