@@ -1,7 +1,7 @@
-"""The events of a running station: frozen dataclasses, in the order in which they happened.
+"""Events of a running station, published in the order in which they happen.
 
-A view (a table on a terminal, JSON lines, a web page) needs nothing else. `RunEnded` is the one
-event that says PASS, and it leaves only after the outcome is in the records, on disk.
+Views (the terminal's table, JSON lines, web pages) are drawn from these alone. Only `RunEnded`
+reports a PASS, and it is published after the outcome is in the records on disk.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from flasher.validation import LowerCaseInJson
 
 
 class SocketState(LowerCaseInJson, StrEnum):
-    """What a socket shows; the word is for people."""
+    """State of a socket, as screens show it."""
 
     STARTING = "STARTING"
     """Its process opens the adapter."""
     EMPTY = "EMPTY"
-    """No unit is in it, and no label is meant for it."""
+    """It holds no unit, and no label waits for one."""
     SILENT = "SILENT"
-    """Nothing is heard: no unit is in it, or one that sleeps."""
+    """No frames are received: it holds no unit, or one that sleeps."""
     SCAN = "SCAN"
-    """A unit waits for its label, or a label for its unit; `SocketChanged.text` says which."""
+    """A unit waits for its label, or a label for its unit; `SocketChanged.text` names which."""
     RUNNING = "RUNNING"
     SAVING = "SAVING"
-    """The run is over, its outcome is not on disk yet: not a PASS."""
+    """The run is over, but its outcome is not on disk yet: not a PASS."""
     PASS = "PASS"  # noqa: S105  the word is no password
     FAIL = "FAIL"
     RECHECK = "RECHECK"
-    """The run ended without a verdict: the unit has to be scanned again."""
+    """The run ended without a verdict: scan the unit again."""
     ERROR = "ERROR"
-    """The socket cannot work: adapter, process, or a record that is not saved."""
+    """The socket cannot work: its adapter or process failed, or an outcome is not saved."""
     STOPPED = "STOPPED"
-    """The line is stopped; `LineStopped` gave the reason."""
+    """The line is stopped; `LineStopped` has the reason."""
 
     @property
     def is_verdict(self) -> bool:
-        """True while a unit that is done waits to be taken out."""
+        """True while a finished unit waits to be taken out."""
         return self in (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
 
 
@@ -55,13 +55,13 @@ class Timed:
     """Base of all events."""
 
     at: str = field(default="", kw_only=True, compare=False)
-    """UTC, as 2026-05-17T09:00:00.123Z; given when the event leaves the station."""
+    """UTC, such as 2026-05-17T09:00:00.123Z; set when the event is published."""
 
 
 @dataclass(frozen=True)
 class StationStarted(Timed):
-    """The station is ready. `recovered` are runs that a dead station left: INTERRUPTED now, their
-    units RECHECK.
+    """The station is ready. `recovered`: runs that were active when the station died; they are
+    INTERRUPTED now, and their units RECHECK.
     """
 
     station: str
@@ -71,25 +71,25 @@ class StationStarted(Timed):
     sockets: tuple[str, ...]
     recovered: tuple[RunId, ...]
     virtual_sockets: tuple[str, ...] = ()
-    """Sockets whose units are virtual: no product comes out of them."""
+    """Sockets whose units are virtual: they make no products."""
     has_badges: bool = False
-    """People scan badges, and their roles say what they may override."""
+    """People scan badges, whose roles decide what they may override."""
 
 
 @dataclass(frozen=True)
 class SocketChanged(Timed):
-    """The state of a socket changed, or the text beside it."""
+    """The state of a socket, or its text, changed."""
 
     socket: str
     state: SocketState
     serial: str = ""
     text: str = ""
-    """What is awaited, or what is wrong; one sentence."""
+    """One sentence: what the socket waits for, or what is wrong."""
 
 
 @dataclass(frozen=True)
 class UnitArrived(Timed):
-    """A unit is in the socket. `label` is the label that only virtual units bring along."""
+    """A unit was put into the socket. `label`: the label of a virtual unit, else empty."""
 
     socket: str
     how: str
@@ -98,27 +98,27 @@ class UnitArrived(Timed):
 
 @dataclass(frozen=True)
 class UnitRemoved(Timed):
-    """The unit is out: nothing was heard from it for the time set."""
+    """The unit was taken out: no frame of it was received for the configured time."""
 
     socket: str
 
 
 @dataclass(frozen=True)
 class ScanAccepted(Timed):
-    """A scan was accepted: a label, or a command (`flasher.station.scans`)."""
+    """A scan was accepted: a label or a command (`flasher.station.scans`)."""
 
     text: str
     meaning: str
     socket: str = ""
-    """The socket that it is for; empty while none is chosen."""
+    """The socket that it applies to; empty while none is chosen."""
     source: str = ""
-    """Where it was scanned, as "scanner left"."""
+    """The scanner or page that it came from, such as "scanner left"."""
 
 
 @dataclass(frozen=True)
 class ScanRefused(Timed):
-    """A scan was refused and changed nothing, or what waited of it was dropped. `code` is a stable
-    word, `remedy` one action.
+    """A scan was refused and had no effect, or an accepted scan that still waited was dropped.
+    `code` is stable; `remedy` is one action.
     """
 
     text: str
@@ -127,12 +127,12 @@ class ScanRefused(Timed):
     remedy: str
     socket: str = ""
     source: str = ""
-    """Where it was scanned."""
+    """The scanner or page that it came from."""
 
 
 @dataclass(frozen=True)
 class ScannerChanged(Timed):
-    """A scanner of the station can be read, or cannot."""
+    """A scanner was connected or lost."""
 
     scanner: str
     is_ready: bool
@@ -141,21 +141,21 @@ class ScannerChanged(Timed):
 
 @dataclass(frozen=True)
 class PinAwaited(Timed):
-    """What is scanned or typed next is the PIN of this person: it must not be shown."""
+    """The next scan or line is the PIN of this person: views must not show it."""
 
     person: str
     text: str
-    """The scan that needs it."""
+    """The scan that needs the PIN."""
     limit_s: float
 
 
 @dataclass(frozen=True)
 class PinEnded(Timed):
-    """No PIN is awaited any more."""
+    """The station no longer waits for a PIN."""
 
     person: str
     is_right: bool
-    """False when none came, the last try was wrong, or CANCEL was scanned."""
+    """False after a wrong PIN, CANCEL or the time limit."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class OperatorPrompted(Timed):
     text: str
     limit_s: float | None = None
     source: str = ""
-    """Where the label was scanned that it is about; empty: it is not about a scan."""
+    """Source of the label concerned; empty when no scan is."""
 
 
 @dataclass(frozen=True)
@@ -178,12 +178,12 @@ class RunStarted(Timed):
     run_id: RunId
     kind: RunKind
     is_virtual: bool = False
-    """The unit is a virtual one: no product."""
+    """The unit is virtual: no product."""
 
 
 @dataclass(frozen=True)
 class StepStarted(Timed):
-    """A step of the run begins; tries count from 1. `target` is empty for steps of all targets."""
+    """A step of the run begins. Tries count from 1; `target` is empty for a step of all targets."""
 
     socket: str
     serial: str
@@ -220,13 +220,13 @@ class StepEnded(Timed):
 
     @property
     def name(self) -> str:
-        """The name in the records: steps of one target name it, tries are counted by name."""
+        """The name in the records: the step, with the target if it is a step of one target."""
         return f"{self.step.value} {self.target}".strip()
 
 
 @dataclass(frozen=True)
 class RunEnded(Timed):
-    """A run has ended **and its outcome is on disk**. `action` tells the operator what to do."""
+    """A run has ended **and its outcome is on disk**. `action`: what the operator has to do."""
 
     socket: str
     serial: str
@@ -240,12 +240,12 @@ class RunEnded(Timed):
     verified: tuple[tuple[str, Verified], ...] = ()
     """How far each target was verified, in the recipe's order."""
     is_virtual: bool = False
-    """The unit was a virtual one: no product."""
+    """The unit was virtual: no product."""
 
 
 @dataclass(frozen=True)
 class LabelPrinted(Timed):
-    """The label of a unit that has passed went to the printer."""
+    """The label of a passed unit was sent to the printer."""
 
     socket: str
     serial: str
@@ -254,7 +254,7 @@ class LabelPrinted(Timed):
 
 @dataclass(frozen=True)
 class LabelFailed(Timed):
-    """The label of a unit was not printed. Its PASS stands."""
+    """The label of a unit was not printed. The unit is still a PASS."""
 
     socket: str
     serial: str
@@ -264,7 +264,7 @@ class LabelFailed(Timed):
 
 @dataclass(frozen=True)
 class RecordNotSaved(Timed):
-    """The outcome could not be saved: PASS must not be shown. RESUME tries again."""
+    """The outcome could not be saved: do not show a PASS. RESUME tries again."""
 
     socket: str
     serial: str
@@ -275,7 +275,7 @@ class RecordNotSaved(Timed):
 
 @dataclass(frozen=True)
 class LineStopped(Timed):
-    """No run is started until RESUME; active runs are completed."""
+    """The line was stopped: active runs are completed, and no run starts before RESUME."""
 
     code: str
     reason: str
@@ -284,17 +284,17 @@ class LineStopped(Timed):
 
 @dataclass(frozen=True)
 class LineResumed(Timed):
-    """The line goes on after RESUME."""
+    """The line was resumed by RESUME."""
 
 
 @dataclass(frozen=True)
 class WorkerFailed(Timed):
-    """A socket's process ended or hung; a new one is started after `restart_in_s`."""
+    """The process of a socket ended or hung; a new one starts after `restart_in_s`."""
 
     socket: str
     reason: str
     restart_in_s: float | None
-    """None: it is not started again before the station is."""
+    """None: no new one starts until the station is restarted."""
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class FiguresChanged(Timed):
 
 @dataclass(frozen=True)
 class StationStopped(Timed):
-    """The station has ended; nothing is running."""
+    """The station has ended, with all of its processes."""
 
     station: str
 
