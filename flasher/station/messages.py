@@ -1,4 +1,4 @@
-"""Messages between a station and the processes of its sockets; all of them can be pickled."""
+"""Messages between a station and the processes of its sockets; all can be pickled."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flasher.station.records.model import Claim, Measurement, RunState, Verified
 
 @dataclass(frozen=True)
 class RunResult:
-    """Outcome of a run, not saved yet."""
+    """Outcome of a run, before it is saved."""
 
     outcome: RunState
     code: str
@@ -25,18 +25,18 @@ class RunResult:
     duration_s: float
     verified: Mapping[str, Verified] = field(default_factory=dict)
     trace_sha256: str | None = None
-    """Of the closed trace (`packed`); None where it could not be written."""
+    """SHA-256 of the compressed trace (`packed`); None when it could not be written."""
 
 
 @dataclass(frozen=True)
 class Write:
-    """A write to a device, which is recorded before it is done, and again when it is."""
+    """A write to a device, recorded before it is done and again after it."""
 
     target: str
     what: str
     value: str
     write_id: WriteId | None = None
-    """Once it is recorded."""
+    """None until the intent is recorded."""
     read_back: str | None = None
     """None when nothing could be read back."""
 
@@ -46,63 +46,65 @@ class JournalError(FlasherError):
 
 
 class Journal(Protocol):
-    """Records on disk when a method returns; each method raises JournalError when not."""
+    """Records the steps and writes of a run. When a method returns, its record is on disk; each
+    raises JournalError when it cannot be saved.
+    """
 
     def intent(self, target: str, what: str, value: str) -> Write:
-        """Before a write to the device."""
+        """Records a write before it is sent to the device."""
 
     def verified(self, write: Write, read_back: str | None) -> None:
-        """After it; `read_back` is None when nothing could be read back."""
+        """Records that it was done; `read_back` is None when nothing could be read back."""
 
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
-        """A try of a step ended."""
+        """Records the end of one try of a step."""
 
 
 def packed(trace: Path) -> Path:
-    """Where the closed trace of a run is."""
+    """Path of a run's trace after it was closed and compressed."""
     return trace.with_name(f"{trace.name}.gz")
 
 
 def write_key(target: str, item: str) -> str:
-    """The name of something written, as `Claim.written_before` has it."""
+    """Key of a written item in `Claim.written_before`."""
     return f"{target} {item}"
 
 
 def flash_value(version: str, sha256: str) -> str:
-    """What the records say of a flash: enough to know the same image again."""
+    """Value of a flash in the records; equal for equal images."""
     return f"{version or 'no version'}, sha256 {sha256}"
 
 
-# -- how a process is set up ----------------------------------------------------------------------
+# -- set-up of a process --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class VirtualUnits:
-    """Virtual units of a socket, and their serial numbers."""
+    """Settings of a socket with virtual units."""
 
     units: MockUnits
     first_number: int = 1
     number_step: int = 1
     speed: float = 1.0
-    """Times as fast as a real bus; 0 takes no time at all."""
+    """Speed of the simulated bus relative to a real one; 0: transfers take no time."""
     arrive_after_s: float = 1.0
-    """From an empty socket to the next unit."""
+    """Time from an empty socket to the next unit."""
     leave_after_s: float = 1.0
-    """From the end of a run to the unit's leaving."""
+    """Time from the end of a run until its unit is taken out."""
     count: int | None = None
-    """Units in all; None: without end."""
+    """Number of units; None: no limit."""
 
 
 @dataclass(frozen=True)
 class WorkerSetup:
-    """Everything that the process of a socket needs; nothing of it changes while it lives."""
+    """Settings of the process of a socket, constant while it lives."""
 
     socket: str
     recipe: Path
     files: Mapping[str, str]
-    """The recipe's files, each with its SHA-256: the process must work with the very same."""
+    """SHA-256 of each file of the recipe: the process refuses to work with others."""
     bus: Mapping[str, Any] | None
-    """python-can's keywords; None: virtual units."""
+    """Keywords of python-can's bus; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
 
@@ -112,7 +114,7 @@ class WorkerSetup:
 
 @dataclass(frozen=True)
 class WriteReply:
-    """The answer to an `Ask`. `error` is empty when it is on disk."""
+    """The reply to an `Ask`. `error` is empty when the record is on disk."""
 
     number: int
     write_id: WriteId | None = None
@@ -121,12 +123,12 @@ class WriteReply:
 
 @dataclass(frozen=True)
 class Abort:
-    """A person stops the run."""
+    """Stop the run at the request of a person."""
 
 
 @dataclass(frozen=True)
 class Quit:
-    """End; a run that goes on is stopped first."""
+    """End the process, after stopping an active run."""
 
 
 ToWorker = Claim | WriteReply | Abort | Quit
@@ -136,7 +138,7 @@ ToWorker = Claim | WriteReply | Abort | Quit
 
 @dataclass(frozen=True)
 class Ready:
-    """The adapter is open. `sees_units` is False when a unit that is there may say nothing."""
+    """The adapter is open. `sees_units` is False when present units may be silent."""
 
     adapter: str
     sees_units: bool
@@ -144,50 +146,52 @@ class Ready:
 
 @dataclass(frozen=True)
 class Beat:
-    """Heartbeat."""
+    """Sign of life, sent regularly."""
 
 
 @dataclass(frozen=True)
 class AdapterDown:
-    """The adapter failed, or the process is gone; it is opened again."""
+    """The adapter failed, or the process died; the adapter is opened again."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class PresenceChanged:
-    """A unit came or went, or reported its serial number; sent again after each run and opening."""
+    """A unit was put in or taken out, or reported its serial number. Sent again after each run and
+    after each opening of the adapter.
+    """
 
     is_there: bool
     how: str = ""
     label: str = ""
-    """The label that a virtual unit bears."""
+    """The label of a virtual unit."""
     serial: str | None = None
-    """The serial number that the unit itself says; empty: it has none; None: not said yet."""
+    """The serial number that the unit reports; empty: it has none; None: not reported yet."""
     is_certain: bool = False
-    """Nothing is in the socket; else nothing is heard, which may be a unit that sleeps."""
+    """With `is_there` False: the socket is empty; else a sleeping unit may be in it."""
     is_power_up: bool = False
-    """A bootloader announced that its power came, or a unit that had only announced itself has an
-    application now: of a unit that was put in, which may be another one than was heard before.
+    """A bootloader announced its power-up, or the application of a unit started that had only been
+    announced by its bootloader: the unit may be another one than before.
     """
     was_missed: bool = False
-    """Nobody has listened for a while to a unit that only announces itself: another one may have
-    been put in.
+    """The process did not listen for a while, and the unit is only announced by its bootloader: it
+    may be another one than before.
     """
     is_in_bootloader: bool = False
-    """Only announcements of a bootloader are heard, and no application."""
+    """Only announcements of a bootloader are received, and no frames of an application."""
     number: int = 0
-    """Changes are numbered; 0 of a virtual unit."""
+    """Number of this change, counting up; always 0 for virtual units."""
 
 
 @dataclass(frozen=True)
 class Ask:
-    """Save this and reply; the process waits for the reply."""
+    """A request to save a write or step; the process waits for the `WriteReply`."""
 
     number: int
     what: Write | StepEnded
     measurements: tuple[Measurement, ...] = ()
-    """Of a step."""
+    """The measurements of the step."""
 
 
 @dataclass(frozen=True)
@@ -198,5 +202,5 @@ class CannotWork:
 
 
 RunEvent = StepStarted | Progressed | OperatorPrompted
-"""Progress of a run, for display only. The station adds the socket."""
+"""Progress of a run, only displayed. The station adds the socket."""
 FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork
