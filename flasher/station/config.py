@@ -1,4 +1,4 @@
-"""The station's own file: its name, where its records are, and its sockets.
+"""The station file: the station's name, records, sockets, scanners and label printer.
 
     name = "line-2"
     records = "records.sqlite"
@@ -13,8 +13,8 @@
     name = "B"
     mock = { bad = 0.1, slow = 0.1, seed = 7 }
 
-A socket finds its adapter by the adapter's serial number or by its place on the USB, never by the
-order in which the computer counted them (`adapters.resolve`).
+A socket finds its adapter by the adapter's serial number or USB path, never by the order in which
+the computer found them (`adapters.resolve`).
 """
 
 from __future__ import annotations
@@ -43,45 +43,45 @@ BusValue = bool | int | float | str
 
 
 class MockUnits(TomlTable):
-    """What virtual units a socket without an adapter meets: shares of 1 of all units."""
+    """Virtual units of a socket without an adapter: shares of faulty ones, from 0 to 1."""
 
     bad: Share = 0.0
-    """Units that take the image, and then do not run it, or refuse it."""
+    """Units that refuse the image, or do not run it afterwards."""
     slow: Share = 0.0
-    """Units that take long."""
+    """Units that are slow."""
     dead: Share = 0.0
     """Units that never answer."""
     exchanged: Share = 0.0
-    """Units that somebody exchanges for the next one while they are flashed; they come back."""
+    """Units that are exchanged for the next one while they are flashed, and put in again later."""
     mislabelled: Share = 0.0
-    """Units with the serial number of another one in them than their label says."""
+    """Units whose stored serial number differs from their label."""
     seed: int = Field(default=1, ge=0)
-    """The same seed and serial number is the same unit."""
+    """Seed of the draw: the same seed and serial number give the same unit."""
 
     @model_validator(mode="after")
     def _check_sum(self) -> MockUnits:
         if self.bad + self.slow + self.dead > 1:
-            raise ValueError("bad, slow and dead are more than all units together")
+            raise ValueError("bad, slow and dead add up to more than 1")
         return self
 
 
 class SocketConfig(TomlTable):
-    """One socket: an adapter of its own, or virtual units."""
+    """A socket with its own adapter, or with virtual units."""
 
     name: ShortText
-    """As screens and cards call it."""
+    """Name of the socket on screens and cards."""
     interface: str = ""
-    """As python-can names it."""
+    """Interface of python-can."""
     channel: str = ""
-    """As python-can names it; not needed with one of the next two."""
+    """Channel of python-can; not needed with serial_number or usb_path."""
     serial_number: str = ""
-    """Of the adapter; it finds the channel."""
+    """Serial number of the adapter, which determines the channel."""
     usb_path: str = ""
-    """Place of the adapter on the USB, as "1-1.4"; for adapters without a serial number."""
+    """USB path of the adapter, such as "1-1.4"; for adapters without a serial number."""
     bus: dict[str, BusValue] = Field(default_factory=dict)
     """Further keywords of python-can's bus."""
     power: str = ""
-    """A command, run without a shell, that switches the unit's power; `{on|off}` for the words."""
+    """Command that switches the unit's power, run without a shell, such as "relay 3 {on|off}"."""
     mock: MockUnits | None = None
 
     @field_validator("channel", mode="before")
@@ -112,79 +112,80 @@ class SocketConfig(TomlTable):
             raise ValueError("it has no channel, serial_number or usb_path to find its adapter by")
         taken = sorted(_NOT_FOR_BUS & self.bus.keys())
         if taken:
-            raise ValueError(f"{taken[0]} stands beside bus, not in it")
+            raise ValueError(f"{taken[0]} belongs beside bus, not in it")
         return self
 
 
 class ScannerConfig(TomlTable):
-    """A scanner that the station reads itself."""
+    """A scanner that the station reads directly. It has one of input, usb_path and port."""
 
     name: ShortText
-    """As screens call it."""
+    """Name of the scanner on screens."""
     input: str = ""
-    """A Linux input device, as "/dev/input/by-id/usb-..."."""
+    """Linux input device, such as "/dev/input/by-id/usb-..."."""
     usb_path: str = ""
-    """In place of input: where it is plugged in, as "1-1.4"."""
+    """USB path, such as "1-1.4"."""
     port: str = ""
-    """In place of both: a serial port."""
+    """Serial port."""
     baudrate: int = Field(default=9600, ge=300, le=4_000_000)
-    """Of the serial port."""
+    """Baud rate of the serial port."""
     socket: str = ""
-    """The socket that it is mounted at: the labels that it scans are for that one."""
+    """The socket that it is mounted at, to which its labels are assigned; empty: none."""
 
     @model_validator(mode="after")
     def _check_place(self) -> ScannerConfig:
         if sum(map(bool, (self.input, self.usb_path, self.port))) != 1:
-            raise ValueError("give input, usb_path or port, one of them")
+            raise ValueError("give exactly one of input, usb_path and port")
         return self
 
 
 class LabelConfig(TomlTable):
-    """The label that a unit gets when it has passed."""
+    """The label that is printed for a passed unit."""
 
     template: str = Field(min_length=1)
-    """A file with ZPL, in which values stand as {{ serial }}."""
+    """A file with ZPL and placeholders such as {{ serial }}."""
     printer: str = ""
-    """As "tcp://192.168.1.7:9100", or "file:/dev/usb/lp0"."""
+    """Address of the printer, such as "tcp://192.168.1.7:9100" or "file:/dev/usb/lp0"."""
     command: tuple[str, ...] = ()
-    """In place of printer: a program that reads the label on its standard input."""
+    """Instead of printer: a program that reads the label from its standard input."""
     on: Literal["pass", "reprint"] = "pass"
-    """Print for every unit that passes, or only what REPRINT asks for."""
+    """Print for every passed unit, or only on REPRINT."""
     time_limit_s: float = Field(default=10.0, gt=0, le=60)
-    """How long the printer may take for a label."""
+    """Time limit for printing a label."""
 
     @model_validator(mode="after")
     def _check_printer(self) -> LabelConfig:
         if bool(self.printer) == bool(self.command):
-            raise ValueError("give printer or command, one of them")
+            raise ValueError("give either printer or command")
         if self.printer and not _PRINTER.fullmatch(self.printer):
-            raise ValueError(f"{self.printer!a:.60} is no printer: tcp://HOST:PORT or file:PATH")
+            raise ValueError(f"{self.printer!a:.60} is not tcp://HOST:PORT or file:PATH")
         return self
 
 
 class StationConfig(TomlTable):
-    """The whole file."""
+    """The station file. Relative paths start at its folder."""
 
     name: ShortText = "station"
-    """Of the station; another one for each."""
+    """Name of the station; different for each station that shares the records."""
     records: str = "records.sqlite"
-    """A file beside this one, or the URL of a PostgreSQL server."""
+    """Records: an SQLite file, or the URL of a PostgreSQL database."""
     files: str = ""
-    """The folder of the traces; needed for a server, else beside the file of the records."""
+    """Folder of the traces; required for a server, else default beside the SQLite file."""
     keys: str = ""
-    """The folder of the signing key; empty: a place of this user."""
+    """Folder of the signing key; empty: a folder of this user."""
     heads: tuple[str, ...] = Field(default=(), max_length=8)
-    """Other places than beside the key in which the signed heads of the audit trail are kept: a
-    folder, best on another computer, or the URL of a PostgreSQL server; or a list of them.
+    """Places that store copies of the signed heads of the audit trail, in addition to the one
+    beside the key: a folder, best on another computer, or the URL of a PostgreSQL database; or a
+    list of them.
     """
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
-    """How long a record waits for another program that holds the database."""
+    """How long a write waits while another program locks the database."""
     badges: str = ""
-    """The table of the badges (TOML): who may work here; empty: there are none."""
+    """The badge table (TOML) of the people who may work here; empty: no badges."""
     shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
-    """When each shift begins, as "06:00"; figures of the operator page count from there."""
+    """Local start times of the shifts, such as "06:00"; the operator page counts per shift."""
     sound_volume: float = Field(default=0.3, ge=0, le=1)
-    """Of the operator page; 0 is silent."""
+    """Volume of the operator page's sounds, from 0 (silent) to 1."""
     label: LabelConfig | None = None
     scanner: tuple[ScannerConfig, ...] = Field(default=(), max_length=SOCKETS_MAX)
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
@@ -200,7 +201,7 @@ class StationConfig(TomlTable):
     @classmethod
     def _check_heads(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not all(value):
-            raise ValueError("a place of the heads is empty")
+            raise ValueError("heads contains an empty place")
         return value
 
     @model_validator(mode="after")
@@ -212,7 +213,9 @@ class StationConfig(TomlTable):
         names = [socket.name for socket in self.socket]
         for each in self.scanner:
             if each.socket and each.socket not in names:
-                raise ValueError(f"there is no socket {each.socket!a:.60} for scanner {each.name}")
+                raise ValueError(
+                    f"scanner {each.name} names the unknown socket {each.socket!a:.60}"
+                )
         real = [socket for socket in self.socket if socket.mock is None]
         for first in ("serial_number", "usb_path"):
             named = [socket for socket in real if getattr(socket, first)]
@@ -226,14 +229,14 @@ CONFIG: Final = Reader(StationConfig, "station file")
 
 
 def no_two(which: str, what: str, values: list[str]) -> None:
-    """Raises ValueError for a value that occurs twice."""
+    """Raises ValueError if a value occurs twice."""
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
         raise ValueError(f"two {which} have the same {what} {twice[0]!a:.60}")
 
 
 def load_config(path: Path) -> StationConfig:
-    """Load a station file. Raises UsageError naming every wrong key."""
+    """Load a station file and make its paths absolute. Raises UsageError with all wrong keys."""
     config = CONFIG.load(path)
     here = path.parent
     changes: dict[str, str] = {}
@@ -255,7 +258,9 @@ def load_config(path: Path) -> StationConfig:
 def mock_config(
     count: int, units: MockUnits, *, name: str = "mock", records: str = "records.sqlite"
 ) -> StationConfig:
-    """A station of virtual units: sockets 1 to `count`. Raises UsageError for a wrong count."""
+    """Make a station of sockets 1 to `count` with virtual units. Raises UsageError for a count
+    above `SOCKETS_MAX`.
+    """
     if not 1 <= count <= SOCKETS_MAX:
         raise UsageError(f"A station has 1 to {SOCKETS_MAX} sockets, not {count}.")
     sockets = tuple(SocketConfig(name=str(number + 1), mock=units) for number in range(count))
@@ -263,11 +268,13 @@ def mock_config(
 
 
 def power_command(template: str, *, on: bool) -> list[str]:
-    """The words of a power command, to be run without a shell. Raises ValueError."""
+    """Argument list of a power command, to be run without a shell. Raises ValueError for a
+    template without exactly one `{on|off}`.
+    """
     words = shlex.split(template)
     switches = [word for word in words if _SWITCH.search(word)]
     if not words or len(switches) != 1 or len(_SWITCH.findall(switches[0])) != 1:
-        raise ValueError('power has one {on|off}, as in "relay 3 {on|off}"')
+        raise ValueError('power needs exactly one {on|off}, such as "relay 3 {on|off}"')
     if _SWITCH.search(words[0]):
-        raise ValueError("power begins with the program, and {on|off} stands behind it")
-    return [_SWITCH.sub(lambda found: found[1 if on else 2], word) for word in words]
+        raise ValueError("power must begin with the program, followed by {on|off}")
+    return [_SWITCH.sub(lambda match: match[1 if on else 2], word) for word in words]

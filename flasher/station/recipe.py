@@ -1,5 +1,5 @@
-"""What a recipe says: how one product is made, as data. `recipe_file` reads it with its images, and
-holds it against them and the protocol.
+"""Recipes: how a station flashes, writes and checks one product. `recipe_file` loads a recipe with
+its images, and checks it against them and the protocol.
 
     name = "Battery 36 V, line 2"
     part = "BAT-36-10"
@@ -19,9 +19,9 @@ holds it against them and the protocol.
     item = "serial-number"
     values = ["{serial}"]
 
-Values are templates, filled in from the scan: `{serial}`, `{lot}`, `{date:%Y%m%d}`, `{match.week}`.
-They are not Python's own formatting, which reaches into objects: a template is data, and knows
-these words and no others. `{{` and `}}` are the brackets themselves.
+Values are templates that the scan fills in: `{serial}`, `{lot}`, `{date:%Y%m%d}` and
+`{match.week}`, and no others. `{{` and `}}` stand for the brackets. Python's `str.format` is not
+used, since it can reach the attributes of objects.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ Seconds = Annotated[float, Field(gt=0, le=_TIME_MAX_S)]
 def _target_name(value: str) -> str:
     target = find_target(value)
     if target is None:
-        raise ValueError(f"there is no target {value!a:.20}; there are: {', '.join(TARGETS)}")
+        raise ValueError(f"unknown target {value!a:.20}; targets are {', '.join(TARGETS)}")
     return target.name
 
 
 class TargetTable(TomlTable):
-    """A table for one of the targets."""
+    """Base of tables that name a target."""
 
     target: Annotated[str, AfterValidator(_target_name)]
     """The device."""
@@ -67,22 +67,22 @@ class TargetTable(TomlTable):
 
 
 class SerialNumber(TomlTable):
-    """How serial numbers look."""
+    """The form of the product's serial numbers."""
 
     pattern: str
-    """Which texts are serial numbers (`pattern`), and its named groups."""
+    """Pattern of serial numbers, with named groups (see `flasher.station.pattern`)."""
     example: str = Field(min_length=1, max_length=TEXT_MAX)
-    """A good serial number; `station check` tries the whole recipe with it."""
+    """A valid serial number; `station check` tries the recipe with it."""
     check_digit: str = ""
-    """Its method, as luhn, gtin, mod11-2, mod11-10, mod37-2, mod37-36 or mod97-10; without it there
-    is none.
+    """Method of the check digit: luhn, gtin, mod11-2, mod11-10, mod37-2, mod37-36 or mod97-10;
+    empty: no check digit.
     """
     check_group: str = ""
-    """The group that the check digit is of; without it the whole serial number."""
+    """The group that the check digit covers; empty: the whole serial number."""
     lot_group: str = ""
-    """The group that is the lot, where it stands in the serial number."""
+    """The group that holds the lot; empty: serial numbers do not contain the lot."""
     number_group: str = ""
-    """The group with the running number."""
+    """The group that holds the running number."""
     number_min: int = Field(default=0, ge=0)
     """The smallest running number."""
     number_max: int | None = Field(default=None, ge=0)
@@ -98,7 +98,7 @@ class SerialNumber(TomlTable):
     @classmethod
     def _check_method(cls, value: str) -> str:
         if value and value not in CHECKS:
-            raise ValueError(f"it is one of {', '.join(CHECKS)}")
+            raise ValueError(f"must be one of {', '.join(CHECKS)}")
         return value
 
     @model_validator(mode="after")
@@ -107,14 +107,14 @@ class SerialNumber(TomlTable):
         for key in ("check_group", "lot_group", "number_group"):
             name = getattr(self, key)
             if name and name not in groups:
-                raise ValueError(f"{key} {name!a:.40} is no group of the pattern")
+                raise ValueError(f"{key} {name!a:.40} is not a group of the pattern")
         if not self.number_group and (self.number_min or self.number_max is not None):
             raise ValueError("number_min and number_max need number_group")
         self.read(self.example)
         return self
 
     def read(self, serial: str) -> dict[str, str]:
-        """The groups of a serial number. Raises ValueError saying why it is none."""
+        """The pattern's groups in a serial number. Raises ValueError for an invalid one."""
         groups = pattern_of(self.pattern).match(serial)
         if groups is None:
             raise ValueError(f"{serial!a:.80} does not fit the pattern {self.pattern}")
@@ -132,16 +132,16 @@ class SerialNumber(TomlTable):
 
 
 class Lot(TomlTable):
-    """What holds for a lot."""
+    """Rules for lots."""
 
     quantity_max: int | None = Field(default=None, ge=1)
-    """Units that may pass in one lot."""
+    """Maximum number of units that pass in one lot."""
     required: bool = False
-    """A unit needs a lot: from its serial number, or given to the station."""
+    """Every unit needs a lot, in its serial number or set at the station."""
 
 
 class Verify(StrEnum):
-    """How far a target is to be verified."""
+    """Required verification of a target."""
 
     COMPLETED = "completed"
     VERSION = "version"
@@ -153,57 +153,58 @@ class Verify(StrEnum):
 
 
 class Firmware(TargetTable):
-    """A target, and what it is flashed with. Targets are done in the order of the recipe."""
+    """A target and its image. Targets are flashed in the order of the recipe."""
 
     image: str = Field(min_length=1)
-    """A file in the recipe's folder."""
+    """The image: a file in the recipe's folder."""
     manifest: str = ""
-    """What its maker states of it; without it the one beside the image, `IMAGE.toml`."""
+    """The release manifest of the image; empty: `IMAGE.toml` beside the image."""
     sha256: Sha256
-    """Of the bytes to be sent, as in the manifest."""
+    """SHA-256 of the bytes to be sent, as in the manifest."""
     base: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
     """Address of the first byte of a raw binary."""
     hardware_versions: tuple[ShortText, ...] = ()
-    """Narrower than the manifest's, which hold as well; * stands for any text."""
+    """Accepted hardware versions, in addition to the manifest's limits; * matches any text."""
     previous_versions: tuple[ShortText, ...] = ()
-    """Running versions that it may replace; without it as the manifest says."""
+    """Running versions that it may replace; empty: those of the manifest."""
     verify: Verify | None = None
-    """How far it is verified; without it the version, where it can be asked for, else completed."""
+    """Required verification; unset: the version where the target can be asked for it, else
+    completed."""
 
 
 class Write(TargetTable):
-    """Something to write to a unit, with values that are templates."""
+    """An item to write to a unit."""
 
     item: ShortText
-    """As `flasher write --list` names it."""
+    """Name of the item, as in `flasher write --list`."""
     values: tuple[str, ...] = Field(min_length=1)
-    """May hold {serial}, {lot}, {date:%Y%m%d} and {match.GROUP}; each is read back."""
+    """Templates with {serial}, {lot}, {date:%Y%m%d} and {match.GROUP}; values are read back."""
     manufacturer: bool = False
-    """Needed for what the document reserves for the manufacturer."""
+    """Allows items that the protocol reserves for the manufacturer."""
 
 
 class Unchanged(TargetTable):
-    """Something that must read the same after the run as before it."""
+    """An item that must read the same after the run as before it."""
 
     item: ShortText
-    """As `flasher read --list` names it."""
+    """Name of the item, as in `flasher read --list`."""
 
 
 class Limit(TargetTable):
-    """Something that is measured in a step, with its limits."""
+    """A measurement of a step, with its limits."""
 
     step: Literal[StepName.IDENTIFY, StepName.CHECK, StepName.VERIFY] = StepName.CHECK
-    """When it is measured: check is before the first write."""
+    """The step that measures it; check is before the first write."""
     item: ShortText
-    """As `flasher read --list` names it."""
+    """Name of the item, as in `flasher read --list`."""
     field: ShortText
-    """A field of that item, with its unit in its name."""
+    """Name of a field of the item, which ends with its unit."""
     low: float | None = None
-    """The least good value."""
+    """The smallest accepted value."""
     high: float | None = None
-    """The greatest good value."""
+    """The largest accepted value."""
     expected: str | None = None
-    """For a text; a template."""
+    """Template of the expected text, for a field that is no number."""
 
     @model_validator(mode="after")
     def _check_limits(self) -> Limit:
@@ -216,20 +217,20 @@ class Limit(TargetTable):
 
 
 class StepRule(TomlTable):
-    """How long a step may take, and when it is tried again."""
+    """Time limit and tries of a step."""
 
     time_limit_s: Seconds | None = None
-    """A unit whose step takes longer has failed."""
+    """A unit fails when the step takes longer; unset: no limit."""
     tries: int = Field(default=1, ge=1, le=_TRIES_MAX)
-    """How often it is begun, in all."""
+    """Number of tries, including the first."""
     pause_s: float = Field(default=0.0, ge=0, le=_TIME_MAX_S)
-    """Between two tries."""
+    """Pause between two tries."""
     power_cycle: bool = False
-    """Switch the socket off and on before a new try."""
+    """Switch the unit off and on before another try."""
 
 
 class Duplicate(StrEnum):
-    """What is done with a unit that has passed already."""
+    """Handling of a unit that has already passed."""
 
     BLOCK = "block"
     VERIFY_ONLY = "verify-only"
@@ -237,44 +238,44 @@ class Duplicate(StrEnum):
 
 
 class AfterRestart(StrEnum):
-    """What a run does when the unit has restarted, and the run has not caused it."""
+    """Handling of a restart that the run did not cause."""
 
     END = "end"
     CONTINUE = "continue"
 
 
 class Golden(TomlTable):
-    """Known good units that test a socket before it may go on. Their runs count in no figure."""
+    """Known good units that test the sockets at intervals. Figures exclude their runs."""
 
     serial_numbers: tuple[ShortText, ...] = Field(min_length=1)
-    """Of the known good units."""
+    """Serial numbers of the known good units."""
     shift_starts: tuple[time, ...] = ()
-    """Local times at which a shift starts; one must pass on each socket after each."""
+    """Local times; after each, a known good unit must pass on a socket before other units."""
     every_h: float | None = Field(default=None, gt=0, le=24 * 31)
-    """One must pass on each socket after so many hours."""
+    """Hours after which a known good unit must pass on a socket again."""
 
     @model_validator(mode="after")
     def _check_rule(self) -> Golden:
         if not self.shift_starts and self.every_h is None:
             raise ValueError("give shift_starts or every_h")
         if any(start.tzinfo is not None for start in self.shift_starts):
-            raise ValueError("shift_starts are times of the clock on the wall, without a zone")
+            raise ValueError("shift_starts are local times, without a time zone")
         return self
 
 
 class Recipe(TomlTable):
-    """A recipe. `target` and `write` are in the order in which they are done."""
+    """A recipe. `target` and `write` are processed in their order."""
 
     name: ShortText
-    """As people know it."""
+    """Name for people."""
     part: ShortText
-    """The product. A serial number is unique for its part."""
+    """Part number of the product. Serial numbers are unique within a part."""
     revision: Annotated[str, Field(min_length=1, max_length=64)]
-    """Raise it with every change: the records name it."""
+    """Revision, which the records name; change it with every change of the recipe."""
     notes: str = ""
-    """For people."""
+    """Notes for people."""
     profile: str = ""
-    """A target profile of `flasher profile`, in the recipe's folder."""
+    """A target profile (see `flasher profile`) in the recipe's folder."""
     serial_number: SerialNumber
     lot: Lot = Lot()
     target: tuple[Firmware, ...] = Field(min_length=1)
@@ -283,13 +284,13 @@ class Recipe(TomlTable):
     limit: tuple[Limit, ...] = ()
     step: dict[StepName, StepRule] = Field(default_factory=dict)
     duplicate: Duplicate = Duplicate.BLOCK
-    """What is done with a unit that has passed already."""
+    """Handling of a unit that has already passed."""
     after_restart: AfterRestart = AfterRestart.END
-    """A unit that restarts by itself in a run may be another one. "continue" is for sockets that
-    hold the unit until the run has ended; the record says so."""
+    """Handling of a unit that restarts by itself in a run, which may have been exchanged.
+    "continue" is for sockets that hold the unit until the run has ended; it is recorded."""
     golden: Golden | None = None
     allow_completed_not_read_back: bool = True
-    """A target that cannot be asked for its version may pass; the record says so."""
+    """Let a target pass that cannot be asked for its version; it is recorded."""
 
     @model_validator(mode="after")
     def _check_targets(self) -> Recipe:
@@ -299,11 +300,11 @@ class Recipe(TomlTable):
         for key in ("write", "unchanged", "limit"):
             for part in getattr(self, key):
                 if part.target not in names:
-                    raise ValueError(f"[[{key}]] names {part.target}, which is no [[target]]")
+                    raise ValueError(f"[[{key}]] names {part.target}, which has no [[target]]")
         return self
 
     def rule(self, step: StepName) -> StepRule:
-        """The rule of a step; the usual one where the recipe gives none."""
+        """The rule of a step; the default rule if the recipe has none."""
         return self.step.get(step, _USUAL)
 
 
@@ -321,28 +322,28 @@ _GROUP: Final = "match."
 
 @dataclass(frozen=True)
 class Scan:
-    """What is known of a unit before it is connected."""
+    """The values of a scanned label, which fill templates."""
 
     serial: str
     day: date
-    """The day of production, where the station stands."""
+    """The day of production, in the station's time zone."""
     lot: str = ""
     groups: Mapping[str, str] = field(default_factory=dict)
     """The named groups of the serial number's pattern."""
 
 
 def fill(template: str, scan: Scan) -> str:
-    """The text of a template. Raises ValueError for a word that it does not know."""
+    """Fill in a template. Raises ValueError for an unknown placeholder."""
     return "".join(_part(part, scan) for part in _PART.finditer(template))
 
 
 def check_template(template: str, groups: Collection[str]) -> None:
-    """Raises ValueError for a template that cannot be filled with these groups of the pattern."""
+    """Raises ValueError for a template that these groups of the pattern cannot fill."""
     fill(template, Scan("", date(2000, 1, 1), "", dict.fromkeys(groups, "")))
 
 
 def uses_lot(template: str) -> bool:
-    """True when the template needs a lot."""
+    """True when the template has a {lot}."""
     return any(part[1] == "lot" for part in _PART.finditer(template))
 
 
@@ -350,13 +351,13 @@ def _part(part: re.Match[str], scan: Scan) -> str:
     word = part[1]
     if word is None:
         if part[0] in ("{", "}"):
-            raise ValueError(f"a bracket {part[0]} stands alone; write it twice for itself")
+            raise ValueError(f"single {part[0]} in the template; write it twice for the character")
         return part[0][0] if part[0] in ("{{", "}}") else part[0]
     name, _, form = word.partition(":")
     if name == "date":
         form = form or DATE_DEFAULT
         if _DATE_FORM.fullmatch(form) is None:
-            raise ValueError(f"{{{word}}} is no date: use %Y %y %m %d %j %G %V %u")
+            raise ValueError(f"{{{word}}} is not a date: use %Y %y %m %d %j %G %V %u")
         return scan.day.strftime(form)
     if word == "serial":
         return scan.serial
@@ -365,4 +366,4 @@ def _part(part: re.Match[str], scan: Scan) -> str:
     if word.startswith(_GROUP) and word.removeprefix(_GROUP) in scan.groups:
         return scan.groups[word.removeprefix(_GROUP)]
     known = ["{serial}", "{lot}", "{date:%Y%m%d}", *(f"{{match.{g}}}" for g in scan.groups)]
-    raise ValueError(f"{{{word}}} is not known: {', '.join(known)}")
+    raise ValueError(f"unknown placeholder {{{word}}}; known are {', '.join(known)}")

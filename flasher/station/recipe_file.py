@@ -1,8 +1,8 @@
-"""Reads a recipe with its images from disk, once; holds it against them, the protocol and a sample
-scan, before a shift and not in it; and tells later whether the disk still agrees.
+"""Loads a recipe with its images from disk, checks it against them, the protocol and a sample scan
+before a shift starts, and detects later changes of its files.
 
-A recipe reaches nothing outside of its own folder: no absolute path, no `..`, no link that leads
-out of it.
+The files of a recipe are in its own folder: absolute paths, `..` and links that lead out of it are
+refused.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ _SAMPLE_LOT: Final = "LOT1"
 
 @dataclass(frozen=True)
 class LoadedTarget:
-    """A target of a recipe, with its image and what its maker states of it."""
+    """A target of a recipe, with its image, manifest and profile."""
 
     firmware: Firmware
     image: Image = field(repr=False)
     release: Release
     profile: Profile
     required: Verified
-    """How far it must be verified to pass."""
+    """The verification that it needs to pass."""
 
     @property
     def target(self) -> Target:
@@ -68,40 +68,40 @@ class LoadedTarget:
 
     @property
     def version(self) -> str:
-        """The version inside the image, or that the manifest states; empty when nobody says it."""
+        """The version in the image, else the one in the manifest; empty when neither has one."""
         return self.image.version or self.release.firmware_version or ""
 
 
 @dataclass(frozen=True)
 class LoadedRecipe:
-    """A recipe as it was read, frozen, with the hash of its file."""
+    """A recipe with its images, as they were loaded."""
 
     recipe: Recipe
     path: Path
     sha256: str
-    """Of the file's bytes."""
+    """SHA-256 of the recipe file."""
     content: str
-    """The file's text."""
+    """Text of the recipe file."""
     targets: tuple[LoadedTarget, ...]
     files: Mapping[Path, str] = field(repr=False)
-    """Every file that it was made of, with its SHA-256."""
+    """SHA-256 of each loaded file: recipe, images, manifests and profile."""
 
     @cached_property
     def required(self) -> Verified:
-        """The weakest verification that any of its targets needs."""
+        """The lowest of the verifications that its targets need."""
         return min(target.required for target in self.targets)
 
     def is_unchanged(self) -> bool:
-        """True while recipe, images, manifests and profile on disk are those that were read."""
+        """True while its files on disk are those that were loaded."""
         try:
             return all(_sha256(path) == sha256 for path, sha256 in self.files.items())
         except FlasherError:
             return False
 
     def scan(self, serial: str, day: date, lot: str = "") -> Scan:
-        """What a scanned serial number says. The lot in it goes before the one given.
+        """Read a scanned serial number. `lot` is used when the serial number has no lot.
 
-        Raises ValueError saying why it is no serial number of this recipe.
+        Raises ValueError for a serial number that this recipe does not accept, or of another lot.
         """
         rule = self.recipe.serial_number
         groups = rule.read(serial)
@@ -111,7 +111,7 @@ class LoadedRecipe:
         return Scan(serial, day, own_lot or lot, groups)
 
     def write_plan(self, write: Write, scan: Scan) -> WritePlan:
-        """What one `[[write]]` comes to. Raises UsageError for a value that does not fit."""
+        """Plan the write of one `[[write]]`. Raises UsageError for a value that does not fit."""
         try:
             values = [fill(template, scan) for template in write.values]
         except ValueError as error:
@@ -123,10 +123,9 @@ class LoadedRecipe:
 
 
 def load_recipe(path: Path) -> LoadedRecipe:
-    """The recipe at `path` with its images.
+    """Load a recipe with its images, without trying its values, as `load_checked` does.
 
-    Raises UsageError with all that is wrong with the file, or with files that it names. It does not
-    try values: `load_checked` does.
+    Raises UsageError with all problems of the file and of the files that it names.
     """
     raw = read(path, TOML_MAX_SIZE, what="recipe")
     recipe = RECIPE.parse(raw, path)
@@ -137,7 +136,7 @@ def load_recipe(path: Path) -> LoadedRecipe:
         try:
             target, its_files = _load_target(path, recipe, firmware)
         except ValueError as error:
-            remedy = "Copy it there, and name it by its name."
+            remedy = "Copy the file into the recipe's folder, and use its name there."
             faults.append(Fault(f"target[{number}]", f"{error}.", remedy))
         except FlasherError as error:
             faults.append(Fault(f"target[{number}]", error.what, error.remedy))
@@ -150,8 +149,9 @@ def load_recipe(path: Path) -> LoadedRecipe:
 
 
 def load_checked(path: Path, day: date) -> LoadedRecipe:
-    """A recipe with its images that everything agrees with that can be known without a device;
-    `day` is the sample's. Raises UsageError with all that is wrong.
+    """Load a recipe with its images, and check everything that can be checked without a device.
+
+    `day`: the day of production of the sample scan. Raises UsageError with all problems.
     """
     loaded = load_recipe(path)
     faults = [
@@ -178,15 +178,15 @@ def _sha256(path: Path) -> str:
 
 
 def inside(recipe_path: Path, name: str) -> Path:
-    """The file `name` in the folder of the recipe. Raises ValueError for one that is outside."""
+    """Path of a file in the recipe's folder. Raises ValueError for a name that leads out of it."""
     windows, posix = PureWindowsPath(name), PurePosixPath(name)
     if windows.anchor or windows.drive or posix.is_absolute() or ".." in windows.parts:
-        raise ValueError(f"{name!a:.80} does not stay in the recipe's folder")
+        raise ValueError(f"{name!a:.80} is outside of the recipe's folder")
     folder = recipe_path.parent.resolve()
     try:
         path = (folder / name).resolve()
     except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"{name!a:.80} names no file") from error
+        raise ValueError(f"{name!a:.80} is not a file name") from error
     if not path.is_relative_to(folder):
         raise ValueError(f"{name!a:.80} is a link that leads out of the recipe's folder")
     return path
@@ -195,16 +195,18 @@ def inside(recipe_path: Path, name: str) -> Path:
 def _load_target(
     path: Path, recipe: Recipe, firmware: Firmware
 ) -> tuple[LoadedTarget, dict[Path, str]]:
-    """The target with its files. Raises ValueError, FlasherError for what is wrong with them."""
+    """Load the target with its files. Raises ValueError for a file outside of the folder, and
+    FlasherError for an unusable one.
+    """
     image_path = inside(path, firmware.image)
     manifest = inside(path, firmware.manifest or str(manifest_path(firmware.image)))
     profile_path = inside(path, recipe.profile) if recipe.profile else None
     files = [image_path, manifest, *([profile_path] if profile_path else [])]
-    # Before and after loading: what was loaded is what was hashed.
+    # Hashed before and after loading: the hashes are those of the loaded bytes.
     hashes = {file: _sha256(file) for file in files}
     image = load(image_path, base=firmware.base)
     release = read_release(manifest)
-    # Without a profile of its own: what lies about on the computer must not matter.
+    # os.devnull: a profile of the user must not change the recipe.
     profile = load_profile(profile_path or os.devnull, firmware.device)
     if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
         raise UsageError("a file changed while it was read.", remedy="Try again.")
@@ -233,9 +235,9 @@ def _check_target(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Ite
         )
     try:
         identity = target.profile.identity(release=target.release)
-        for found in prepare(target.image, target.profile, identity=identity).checks:
-            if found.ending is not None:
-                yield Fault(where, f"{found.text}.", _REMEDIES.get(found.check, ""))
+        for check in prepare(target.image, target.profile, identity=identity).checks:
+            if check.ending is not None:
+                yield Fault(where, f"{check.text}.", _REMEDIES.get(check.check, ""))
     except FlasherError as error:
         yield Fault(where, error.what, error.remedy)
     yield from _check_level(loaded, target, where)
@@ -246,7 +248,7 @@ def _check_level(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iter
         if not loaded.recipe.allow_completed_not_read_back:
             yield Fault(
                 where,
-                "nothing of it is read back, and allow_completed_not_read_back is false.",
+                "its version is not read back, and allow_completed_not_read_back is false.",
                 "Name a profile with its version_query, or allow it.",
             )
         return
@@ -265,7 +267,7 @@ def _check_level(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iter
     elif target.image.version is None:
         yield Fault(
             where,
-            "the image names no version that could be compared.",
+            "the image names no version to compare.",
             "Verify the memory, or verify = 'completed'.",
         )
 
@@ -284,12 +286,12 @@ def _check_scan(loaded: LoadedRecipe, day: date) -> Iterator[Fault]:
             yield Fault(where, error.what, error.remedy)
         if not has_lot and any(map(uses_lot, write.values)):
             yield Fault(
-                where, "{lot} is used, but a unit may have none.", "Set lot.required = true."
+                where, "{lot} is used, but units may have no lot.", "Set lot.required = true."
             )
         if any(
             (write.target, write.item) == (each.target, each.item) for each in recipe.write[:number]
         ):
-            yield Fault(where, f"{write.item} is written twice.", "Leave one of them.")
+            yield Fault(where, f"{write.item} is written twice.", "Remove one of the two.")
 
 
 def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
@@ -297,12 +299,12 @@ def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
     written = {(write.target, write.item.lower()) for write in loaded.recipe.write}
     for number, unchanged in enumerate(loaded.recipe.unchanged):
         try:
-            found = readable_of(loaded, unchanged)
+            item = readable_of(loaded, unchanged)
         except UsageError as error:
             yield Fault(f"unchanged[{number}]", error.what, error.remedy)
             continue
-        if (unchanged.target, found.name) in written:
-            yield Fault(f"unchanged[{number}]", f"{found.name} is written by this recipe.")
+        if (unchanged.target, item.name) in written:
+            yield Fault(f"unchanged[{number}]", f"{item.name} is written by this recipe.")
     for number, limit in enumerate(loaded.recipe.limit):
         where = f"limit[{number}]"
         try:
@@ -318,13 +320,13 @@ def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
                 kind = (
                     "a number: give low or high"
                     if isinstance(codec, NumberField)
-                    else "no number: give expected"
+                    else "not a number: give expected"
                 )
                 yield Fault(where, f"{limit.field} is {kind}.")
 
 
 def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
-    """What a table of the recipe wants to read. Raises UsageError for what cannot be."""
+    """The item that a table of the recipe reads. Raises UsageError for an unreadable one."""
     target = next(each for each in loaded.targets if each.name == part.target)
     return find_item(
         part.item, readable(target.target, target.profile.dialect), target.target, "read"
@@ -332,13 +334,13 @@ def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
 
 
 def codec_of(loaded: LoadedRecipe, limit: Limit) -> Codec:
-    """The field that a limit is for; its name is `limit.field`. Raises UsageError without one."""
-    found = readable_of(loaded, limit)
-    fields = dict(meaningful_fields(found.content))
+    """The field that a limit measures. Raises UsageError for an unknown item or field."""
+    item = readable_of(loaded, limit)
+    fields = dict(meaningful_fields(item.content))
     if limit.field not in fields:
         raise UsageError(
-            f"{found.name} has no field {limit.field!a:.40}.",
-            remedy=f"There are: {', '.join(fields)}.",
+            f"{item.name} has no field {limit.field!a:.40}.",
+            remedy=f"Its fields are {', '.join(fields)}.",
         )
     return fields[limit.field]
 

@@ -67,20 +67,20 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
             lambda t: t.replace("image =", "imge ="),
             "target[0].imge: unknown key. Did you mean image",
         ),
-        (lambda t: t.replace('"bms"', '"bmx"'), "there is no target 'bmx'"),
+        (lambda t: t.replace('"bms"', '"bmx"'), "unknown target 'bmx'"),
         (lambda t: t.replace("[0-9]{3}", "[0-9]*"), "is not allowed here"),
         (lambda t: t.replace('"W2605002"', '"W26"'), "does not fit the pattern"),
         (lambda t: t.replace("bms.bin", "none.bin"), "none.bin"),
         (lambda t: t.replace(IMAGES[BMS].sha256, "0" * 64), "the image has"),
         (lambda t: t + target_table(BMS), "a target is named twice"),
         (lambda t: t + "verify = 'memory'\n", "only with its base"),
-        (lambda t: t + SERIAL_WRITE.replace("{serial}", "{seral}"), "{seral} is not known"),
+        (lambda t: t + SERIAL_WRITE.replace("{serial}", "{seral}"), "unknown placeholder {seral}"),
         (lambda t: t + SERIAL_WRITE.replace("{serial}", "{serial}" * 3), "longer than 15"),
         (lambda t: t + SERIAL_WRITE.replace("manufacturer = true", ""), "for the manufacturer"),
         (lambda t: t + SERIAL_WRITE.replace("serial-", "seral-"), "Did you mean serial-number"),
-        (lambda t: t + SERIAL_WRITE.replace('"bms"', '"wmc"'), "which is no [[target]]"),
+        (lambda t: t + SERIAL_WRITE.replace('"bms"', '"wmc"'), "which has no [[target]]"),
         (lambda t: t + SERIAL_WRITE + SERIAL_WRITE, "written twice"),
-        (lambda t: t + SERIAL_WRITE.replace("{serial}", "{lot}"), "a unit may have none"),
+        (lambda t: t + SERIAL_WRITE.replace("{serial}", "{lot}"), "units may have no lot"),
         (
             lambda t: t + SERIAL_WRITE + '[[unchanged]]\ntarget="bms"\nitem="serial-number"\n',
             "is written by this recipe",
@@ -95,7 +95,7 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
             lambda t: (
                 t + '[[limit]]\ntarget="bms"\nitem="version-information"\nfield="model"\nlow=1\n'
             ),
-            "no number: give expected",
+            "not a number: give expected",
         ),
         (lambda t: t + "[golden]\nserial_numbers=['X']\nevery_h=8\n", "does not fit the pattern"),
         (lambda t: t + "[golden]\nserial_numbers=['W2600001']\n", "shift_starts or every_h"),
@@ -122,7 +122,7 @@ def test_all_findings_are_told_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["/etc/passwd", "../bms.bin", "a/../../b", "C:\\x", "\\\\h\\x"])
 def test_a_recipe_reaches_nothing_outside_of_its_folder(tmp_path: Path, name: str) -> None:
     text = USUAL.replace('image = "bms.bin"', f"image = '{name}'")
-    assert "does not stay in the recipe's folder" in said(tmp_path, text)
+    assert "is outside of the recipe's folder" in said(tmp_path, text)
 
 
 def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:

@@ -346,9 +346,9 @@ SOCKETS = '[[socket]]\nname = "A"\nmock = {}\n'
 @each(
     "text, why",
     [
-        ('name = "x"', "input, usb_path or port"),
-        ('name = "x"\ninput = "/dev/a"\nport = "/dev/b"', "input, usb_path or port"),
-        ('name = "x"\ninput = "/dev/a"\nsocket = "B"', "there is no socket 'B'"),
+        ('name = "x"', "input, usb_path and port"),
+        ('name = "x"\ninput = "/dev/a"\nport = "/dev/b"', "input, usb_path and port"),
+        ('name = "x"\ninput = "/dev/a"\nsocket = "B"', "names the unknown socket 'B'"),
         ('name = "x"\nport = "/dev/a"\nbaudrate = 1', "from 300"),
         (
             'name = "x"\nport = "/dev/a"\n[[scanner]]\nname = "y"\nport = "/dev/a"',
