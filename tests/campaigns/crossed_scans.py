@@ -1,9 +1,9 @@
 """A station's process, units that keep their paper label, contents and numbers, and people who
 scan cards and labels while units change places: the part of `pulled_units` that has a line.
 
-Each `Line` has its own station, its own units and two scanners on serial ports (pseudo terminals),
-each of them a source of its own. `Scenario` names what crosses. A trial takes two units with new
-labels, plays its scenario, lets all end, and says what each label ended as.
+Each `Line` has its own station, its own units, two scanners on serial ports (pseudo terminals) and
+two browsers at its page, each of them a source of its own. `Scenario` names what crosses. A trial
+takes two units with new labels, plays its scenario, lets all end, and says what each ended as.
 """
 
 from __future__ import annotations
@@ -13,18 +13,23 @@ import json
 import os
 import queue
 import random
+import re
 import time
 import tty
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
+import httpx2
+
 from flasher.cli.main import main as flasher
 from flasher.image.image import Image
+from flasher.web.guard import TOKEN_HEADER
 from tests.campaigns.scripted_units import NEW_VERSION, Units, free_port
 from tests.campaigns.station_kill import write_files
 from tests.campaigns.station_operator import Fault, Station, misbound
@@ -155,12 +160,13 @@ class Line:
         data = b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(_IMAGE_BYTES))
         self._image = Image.from_bytes(data)
         self._words = write_files(self.folder, self.ports, "records.sqlite", self._image)
-        self._scanners: dict[str, int] = {}
+        self._sources: dict[str, Callable[[str], object]] = {}
+        """Scanners and browsers, by the names that the station gives them, and how they scan."""
         lines = []
         for name in ("left", "right"):
             ours, theirs = os.openpty()
             tty.setraw(theirs)
-            self._scanners[f"scanner {name}"] = ours
+            self._sources[f"scanner {name}"] = partial(_type_in, ours)
             lines += ["", "[[scanner]]", f'name = "{name}"', f'port = "{os.ttyname(theirs)}"']
         with (self.folder / "sockets.toml").open("a", encoding="utf-8") as sockets:
             sockets.write("\n".join(lines) + "\n")
@@ -169,17 +175,33 @@ class Line:
         self.units = self._stack.enter_context(
             Units(self.ports, self.folder / "units.log", _PACKET_S)
         )
-        self.station = Station(self.folder, *self._words)
+        self.station = Station(self.folder, *self._words, "--web", "0")
         names = {str(at) for at in range(1, len(self.ports) + 1)}
         self._sat = {name: [] for name in names}
         ready: set[str] = set()
 
         def is_ready() -> bool:
             ready.update(e["scanner"] for e in self._shown if e["event"] == "ScannerChanged")
-            return len(ready) == len(self._scanners) and self._are_free(names)
+            return len(ready) == len(self._sources) and self._are_free(names)
 
         self._await(is_ready, "the station starts")
+        for _ in range(2):
+            self._open_page()
         return self
+
+    def _open_page(self) -> None:
+        """Open the station's page in another browser; its first scan gives the name that it has."""
+        url = re.search(r"http://127\.0\.0\.1:\d+", (self.folder / "stderr").read_text())
+        assert url is not None
+        browser = self._stack.enter_context(httpx2.Client(base_url=url[0], timeout=_ANSWER_S))
+        token = re.search(r'name="flasher-token" content="(.*?)"', browser.get("/line").text)
+        assert token is not None
+        browser.headers.update({"origin": url[0], TOKEN_HEADER: token[1]})
+        before = len(self._shown)
+        _scan_on_page(browser, "CANCEL")
+        self._await(lambda: self._has_answered("page", "CANCEL", before), "a page is opened")
+        name = next(each["source"] for each in self._shown[before:] if "source" in each)
+        self._sources[name] = partial(_scan_on_page, browser)
 
     def __exit__(self, *_: object) -> None:
         self.station.stop()
@@ -248,16 +270,18 @@ class Line:
         """Scan, and wait for the answer."""
         before = len(self._shown)
         self.station.story.note(scan=text, source=source)
-        os.write(self._scanners[source], text.encode() + b"\r")
+        self._sources[source](text)
+        self._await(
+            lambda: self._has_answered(source, text, before), f"{source} scans {text}", _ANSWER_S
+        )
 
-        def is_answered() -> bool:
-            return any(
-                each["event"] in ("ScanAccepted", "ScanRefused")
-                and (each["source"], each["text"]) == (source, text)
-                for each in self._shown[before:]
-            )
-
-        self._await(is_answered, f"{source} scans {text}", _ANSWER_S)
+    def _has_answered(self, source: str, text: str, since: int) -> bool:
+        return any(
+            each["event"] in ("ScanAccepted", "ScanRefused")
+            and each["source"].startswith(source)
+            and each["text"] == text
+            for each in self._shown[since:]
+        )
 
     def _is_at(self, socket: str, share: float) -> bool:
         """The run in this socket has come so far in its flash, or has ended."""
@@ -279,7 +303,7 @@ class Line:
             self._own[label] = f"MK{self._count:07d}" if plan.has_number else ""
             self._plans[label] = plan
             labels.append(label)
-        people = self.chance.sample(sorted(self._scanners), 2)
+        people = self.chance.sample(sorted(self._sources), 2)
         trial = _Trial(self, plan, labels, sockets, people)
         trial.begin()
         trial.cross()
@@ -313,7 +337,7 @@ class Line:
     def _clear(self, sockets: Sequence[str]) -> None:
         self._pump(_GONE_S)
         for socket in sockets:
-            self._scan(f"FREE {socket}", next(iter(self._scanners)))
+            self._scan(f"FREE {socket}", next(iter(self._sources)))
         self._await(lambda: self._are_free(sockets), "the sockets are empty", _ANSWER_S)
 
     # -- at the end -------------------------------------------------------------------------------
@@ -428,6 +452,14 @@ class _Trial:
         self.line._pump(self.plan.gap_s)
         for label, socket in zip(self.labels, reversed(self.sockets), strict=True):
             self.line._put(label, socket)
+
+
+def _type_in(scanner: int, text: str) -> None:
+    os.write(scanner, text.encode() + b"\r")
+
+
+def _scan_on_page(browser: httpx2.Client, text: str) -> None:
+    browser.post("/line/scan", json={"text": text}).raise_for_status()
 
 
 def line_of(folder: Path, sockets: int, seed: int) -> Line:

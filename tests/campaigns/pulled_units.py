@@ -5,7 +5,7 @@ others are put in, in the middle of a run or between the scans of cards and labe
 
 The units are the scripted ones (`scripted_units`), in a process of their own on udp_multicast, one
 bus for each socket. `--count` trials are single runs that are disturbed, `--lines` trials belong to
-a station's process with cards, labels and two scanners (`crossed_scans`); two stations
+a station's process with cards, labels, two scanners and two pages (`crossed_scans`); two stations
 work at a time, one with two sockets and one with three. A table tells what each scenario ended as.
 The exit code is 1 when a label ended on another unit: a PASS of a unit with another paper label, a
 unit with the number of another one's label, or one that was flashed or written in a run of another
