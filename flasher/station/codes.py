@@ -111,7 +111,10 @@ UNIT_CHANGED: Final = _error(
 )
 NOT_OBSERVED: Final = _error(
     "NOT_OBSERVED",
-    text("this computer stood still, so that it did not see whether the unit stayed in the socket"),
+    text(
+        "this computer stood still, or its adapter was away, so that it did not see whether the"
+        " unit stayed in the socket"
+    ),
     text("Scan the unit again; it is not judged."),
 )
 TWO_DEVICES: Final = _error(

@@ -171,7 +171,8 @@ class Continuity:
     def complete(self) -> None:
         """Note a complete image on a target that cannot be asked: it may start."""
         self.is_told_to_update = False
-        self._burst_until = self._now + self._timings.application_start_timeout_s
+        if self._awaits_application:
+            self._burst_until = self._now + self._timings.application_start_timeout_s
 
     def cycle_power(self) -> None:
         """Note that the run switches its power off and on."""
@@ -199,9 +200,17 @@ class Continuity:
         if passed_s <= self._blind_s:
             self._listened_s += passed_s
         elif passed_s < inf:
-            self._missed_s += passed_s
-            self.watcher.miss(passed_s)
+            self._miss(passed_s)
         self._now = now
+
+    def was_away(self, away_s: float) -> None:
+        """Note that the adapter was away for so long up to now."""
+        self._listened_s -= away_s
+        self._miss(away_s)
+
+    def _miss(self, missed_s: float) -> None:
+        self._missed_s += missed_s
+        self.watcher.miss(missed_s)
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         self.listened(now)
@@ -280,12 +289,7 @@ class Continuity:
                 # A burst that the reset before it has caused may still come: it was lost then.
                 self._requested_s = None
             elif found.command == Command.END_OF_TRANSFER:
-                # The burst before the transfer is over.
-                self._announced_s = self._announced_s if self._requested_s is None else None
-                self._requested_s = None
-                self._burst_until, self._awaits_complete = inf, True
-                self._awaits_application = True
-                self._announced_on = _ANNOUNCED_ON
+                self._end_transfer()
 
     @property
     def is_announcing(self) -> bool:
@@ -296,6 +300,14 @@ class Continuity:
     def _pause_s(self) -> float:
         """Time since the last announcement of a burst that may continue."""
         return inf if self._announced_s is None else self._listened_s - self._announced_s
+
+    def _end_transfer(self) -> None:
+        if self._requested_s is not None:
+            # The burst before the transfer is over, and the unit has stayed: it went on with it.
+            self._requested_s = self._announced_s = None
+            self._missed_s = 0.0
+        self._burst_until, self._awaits_complete, self._awaits_application = inf, True, True
+        self._announced_on = _ANNOUNCED_ON
 
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = self._awaits_complete = False
@@ -365,8 +377,8 @@ class Continuity:
         """Judge whether the announcement may be of another unit that came in unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
-            is_after_reset = not goes_on and self._announced_on < _ANNOUNCED_ON
-            could_be_other = is_after_reset and missed_s >= _EXCHANGE_S
+            was_sent = self._announced_on < _ANNOUNCED_ON or self.is_told_to_update
+            could_be_other = was_sent and not goes_on and missed_s >= _EXCHANGE_S
         else:
             could_be_other = goes_on and missed_s > 0.0 and since_s + missed_s >= self._gap_s
         if could_be_other and not self._goes_on and not self.unobserved:

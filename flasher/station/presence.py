@@ -102,6 +102,8 @@ class TargetWatcher:
         self._paused_s = 0.0
         """The last pause between announcements, 0 before one, and when it ended."""
         self._paused_at = float("-inf")
+        self._awaits_pause = False
+        """The last pause was taken for one of its pace, so the next one has to come soon."""
         self._is_pace_unknown = False
         """There was only one announcement before the last pause, the first one."""
         self._missed_s = 0.0
@@ -151,7 +153,8 @@ class TargetWatcher:
                 self.completions += 1
 
     def _hear_application(self) -> None:
-        if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
+        has_none = self._announcing_s > self._announcing_on_s or self._awaits_pause
+        if self.is_in_bootloader and has_none:
             self._powered_up()  # a device without an application does not start one
         self.has_application = True
         self.application_frames += 1
@@ -159,6 +162,7 @@ class TargetWatcher:
     def miss(self, missed_s: float) -> None:
         """Add unobserved time: it counts neither as a pause of the device nor as silence."""
         self._missed_s += missed_s
+        self._paused_at += missed_s
         if self.heard_at is not None:
             self.heard_at += missed_s
 
@@ -175,15 +179,19 @@ class TargetWatcher:
         # After one announcement, a pause may be the pace of this bootloader: the next one shows it.
         is_first_pause = self._announcing_s == 0.0 and pause_s < _RHYTHM_S
         is_sooner = self._is_pace_unknown and not is_rhythm
+        # It announces itself without the pause that would recur: the last one was no pace.
+        has_no_rhythm = self._awaits_pause and not is_pause and now - self._paused_at > _RHYTHM_S
         if (
             not self.is_in_bootloader
             or is_sooner
+            or has_no_rhythm
             or (is_pause and not is_rhythm and not is_first_pause)
         ):
             self._powered_up()
             is_first_pause = False
         else:
             self._announcing_s += pause_s
+            self._awaits_pause = is_rhythm if is_pause else self._awaits_pause
         self._is_pace_unknown = is_pause and is_first_pause
         if is_pause:
             self._paused_s, self._paused_at = pause_s, now
@@ -194,6 +202,7 @@ class TargetWatcher:
         """Discard the earlier answers: they may be of another unit."""
         self.power_ups += 1
         self._announcing_s = 0.0
+        self._awaits_pause = False
         self.serial = self.answer = None
 
     def _take(self, message: Message) -> None:

@@ -92,6 +92,8 @@ class LastRun:
     action: str = ""
     has_talked: bool = False
     """Its unit has sent something after the run."""
+    has_answered: bool = False
+    """It has answered, with or without a serial number."""
     has_said: bool = False
     """Its unit has reported its serial number after the run."""
 
@@ -237,7 +239,7 @@ class Socket:
         if last is None:
             return before is not Occupancy.THERE
         if self.own == last.serial:
-            self.last = replace(last, has_talked=True, has_said=True)
+            self.last = replace(last, has_talked=True, has_answered=True, has_said=True)
             self.is_last_there = True
             return False
         says_other = self.own is not None and (last.has_said or self.is_own_known)
@@ -245,7 +247,8 @@ class Socket:
             # Another unit; or one that was silent for a while, and does not say who it is.
             was_last, self.is_last_there = self.is_last_there, False
             return was_last or before is not Occupancy.THERE
-        self.last = replace(last, has_talked=True)
+        has_answered = last.has_answered or self.own is not None
+        self.last = replace(last, has_talked=True, has_answered=has_answered)
         return False
 
     def _forget_note(self) -> None:
@@ -257,12 +260,13 @@ class Socket:
         """Note that no unit is detected any more, or certainly none is there. True when one was."""
         before = self.occupancy
         last = self.last
-        # One that has passed has answered at the end of its run: it does not sleep, it was pulled.
-        # Nor does one that has reported its number since, whatever happened to the adapter.
+        # One that has passed has answered at the end of its run: it does not sleep, it was pulled,
+        # in the middle of its next answer perhaps. Nor does one that has reported its number since,
+        # whatever happened to the adapter.
         is_pulled = (
             last is not None
             and self.has_passed
-            and (not last.has_talked or (last.has_said and self.is_last_there))
+            and (not last.has_answered or (last.has_said and self.is_last_there))
         )
         is_out = is_certain or self.is_own_known or is_pulled or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT

@@ -283,24 +283,21 @@ class UnitSteps:
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""
         limit_s = self._recipe.recipe.rule(StepName.FLASH).time_limit_s
-        was_away = False
+        lost_at, completions_when_lost = 0.0, -1
 
         def hear(event: object) -> None:
-            nonlocal was_away
+            nonlocal lost_at, completions_when_lost
             match event:
                 case events.AdapterLost():
-                    was_away = True
+                    lost_at = target.clock.now()
+                    completions_when_lost = target.watcher.completions
+                case events.AdapterBack():
+                    for each in self.targets:
+                        each.continuity.was_away(target.clock.now() - lost_at)
                 case events.PacketAcknowledged(number, total):
                     self._progress(number / total)
                 case events.PowerCycleAwaited(wait_s) if not target.continuity.is_announcing:
-                    if self._power is not None:
-                        self._power.begin_cycle()
-                    else:
-                        name = target.name.upper()
-                        sentence = text(
-                            "Switch the {target} off, wait 3 s, and on again.", target=name
-                        )
-                        self._prompt(sentence, wait_s)
+                    self._cycle_power(target, wait_s)
 
         is_in_bootloader = self._identified[target.name].is_in_bootloader
         options = replace(target.job.options, at_power_up=at_power_up)
@@ -322,11 +319,8 @@ class UnitSteps:
         self.left_behind = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()
         if result.ok:
-            if was_away and not result.outcome.is_completed and not target.goes_on:
-                raise StepFailedError(
-                    codes.UNIT_CHANGED,
-                    f"The adapter was away, and the {target.name} did not go on where it stood.",
-                )
+            if target.watcher.completions == completions_when_lost and not target.goes_on:
+                raise self._of_lost_adapter(target, result)
             return result
         code = _OF_VERDICT.get(result.verification.verdict)
         error = result.error()
@@ -335,6 +329,28 @@ class UnitSteps:
             code or codes.OF_ENDING.get(result.outcome.ending, codes.TRANSFER_FAILED),
             f"{words} {self.left_behind}".strip(),
             needs_rescue=left in (DeviceLeft.NO_APPLICATION, DeviceLeft.PERHAPS_ERASED),
+        )
+
+    def _cycle_power(self, target: UnitTarget, wait_s: float) -> None:
+        if self._power is not None:
+            self._power.begin_cycle()
+            return
+        name = target.name.upper()
+        sentence = text("Switch the {target} off, wait 3 s, and on again.", target=name)
+        self._prompt(sentence, wait_s)
+
+    @staticmethod
+    def _of_lost_adapter(target: UnitTarget, result: Result) -> StepFailedError:
+        """The error for a device that confirmed no image after the adapter was lost."""
+        if result.outcome.is_completed:
+            return StepFailedError(
+                codes.NOT_OBSERVED,
+                f"The adapter was away before the {target.name} started its new application:"
+                " another unit could have come.",
+            )
+        return StepFailedError(
+            codes.UNIT_CHANGED,
+            f"The adapter was away, and the {target.name} did not go on where it stood.",
         )
 
     # -- writing ----------------------------------------------------------------------------------

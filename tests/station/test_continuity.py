@@ -62,12 +62,9 @@ class Watched:
             self.hear(now + 0.05 * number, ANNOUNCEMENT)
 
 
-@each("silence_s", [0.35, 1.0])
-def test_a_second_burst_after_the_complete_image_is_of_another_unit(
-    tmp_path: Path, silence_s: float
-) -> None:
-    """A small image is stored before the burst that preceded it could be over."""
-    run = Watched(tmp_path)
+def flashed(folder: Path) -> Watched:
+    """A battery whose image is complete at 1.24 s."""
+    run = Watched(folder)
     run.identify()
     run.send(1.1, ResetCommand())
     run.hear(1.11, GeneralFeedbackMessage())
@@ -76,10 +73,51 @@ def test_a_second_burst_after_the_complete_image_is_of_another_unit(
     run.hear(1.22, RequestTransfer())
     run.send(1.23, EndOfTransfer())
     run.hear(1.24, Complete())
+    return run
+
+
+@each("silence_s", [0.35, 1.0])
+def test_a_second_burst_after_the_complete_image_is_of_another_unit(
+    tmp_path: Path, silence_s: float
+) -> None:
+    """A small image is stored before the burst that preceded it could be over."""
+    run = flashed(tmp_path)
     run.announce(1.45)
     assert not run.continuity.lost, "it may start by its bootloader"
     run.announce(1.6 + silence_s)
     assert "announced its bootloader" in run.continuity.lost
+
+
+@each("missed_s", [0.2, 0.5])
+@each("is_away", [False, True])
+def test_a_burst_after_an_unobserved_time_may_be_of_another_unit(
+    tmp_path: Path, missed_s: float, is_away: bool
+) -> None:
+    run = flashed(tmp_path)
+    if is_away:
+        run.go_to(run.now + missed_s)
+        run.continuity.was_away(missed_s)
+    else:
+        run.now += missed_s
+        run.continuity.listened(run.now)
+    run.announce(run.now + 0.1)
+    assert not run.continuity.lost
+    assert bool(run.continuity.unobserved) == (missed_s > 0.25)
+
+
+def test_an_adapter_that_was_away_in_the_transfer_accuses_nobody(tmp_path: Path) -> None:
+    run = Watched(tmp_path)
+    run.identify()
+    run.send(1.1, ResetCommand())
+    run.announce(1.2, 1)
+    run.send(1.21, UpdateCommand(BMS.update_text, 256))
+    run.hear(1.22, RequestTransfer())
+    run.go_to(3.22)
+    run.continuity.was_away(2.0)
+    run.send(3.23, EndOfTransfer())
+    run.hear(3.24, Complete())
+    run.announce(3.3)
+    assert (run.continuity.lost, run.continuity.unobserved) == ("", "")
 
 
 @each("confirms_late", [False, True])
@@ -134,15 +172,7 @@ def test_a_unit_that_is_pulled_in_its_first_announcement_has_announced_itself(
 
 @each("frames", [0, 1, 3])
 def test_a_unit_that_is_pulled_in_its_first_answer_has_started(tmp_path: Path, frames: int) -> None:
-    run = Watched(tmp_path)
-    run.identify()
-    run.send(1.1, ResetCommand())
-    run.hear(1.11, GeneralFeedbackMessage())
-    run.announce(1.2, 1)
-    run.send(1.21, UpdateCommand(BMS.update_text, 256))
-    run.hear(1.22, RequestTransfer())
-    run.send(1.23, EndOfTransfer())
-    run.hear(1.24, Complete())
+    run = flashed(tmp_path)
     for frame in version_answer("NONE")[:frames]:
         run.continuity(frame, sent=False, now=run.now)
     run.announce(2.0)

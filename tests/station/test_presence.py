@@ -224,6 +224,23 @@ def test_a_pause_after_one_announcement_is_judged_by_the_next_one(presence: Pres
     assert announce(presence, 1.45) == [(True, True)], "its pace is another one: another unit"
 
 
+def test_a_pause_like_the_last_one_is_judged_by_whether_it_recurs(presence: Presence) -> None:
+    announce(presence, 1.0, 1.05, 1.1)
+    assert announce(presence, 1.7) == [(True, True)], "one unit for another"
+    steady = [1.75 + 0.05 * at for at in range(14)]
+    assert announce(presence, *steady) == []
+    assert announce(presence, 3.0) == [], "that may be its pace"
+    assert announce(presence, *(3.05 + 0.05 * at for at in range(20))) == []
+    assert announce(presence, 4.05) == [(True, True)], "it has none"
+
+
+def test_a_bootloader_may_pause_after_each_burst(presence: Presence) -> None:
+    announce(presence, 1.0, 1.05, 1.1, 1.15)
+    assert announce(presence, 1.75) == [(True, True)]
+    for begin in (1.8, 2.55, 3.3, 4.05):
+        assert announce(presence, begin, begin + 0.05, begin + 0.1, begin + 0.7) == []
+
+
 def test_time_in_which_nobody_listened_is_no_silence(presence: Presence) -> None:
     hear(presence, version_answer("W2605002"), 1.0)
     presence.miss(4.0)

@@ -320,8 +320,17 @@ def test_the_unit_of_an_interrupted_run_is_asked_for_where_it_was(bench: Bench) 
     assert line.order("B").kind is RunKind.RECHECK, "also where nothing is heard of it"
 
 
+def test_green_goes_when_a_unit_that_has_passed_falls_silent_in_its_next_answer(
+    line: LineBench,
+) -> None:
+    line.make("A", SERIAL)
+    line.fall_silent("A")
+    assert line.state("A") is SocketState.EMPTY
+
+
 def test_green_goes_when_it_may_be_another_unit(line: LineBench) -> None:
     line.make("A", SERIAL)
+    line.arrive("A", "")
     line.fall_silent("A")
     assert line.state("A") is SocketState.PASS, "it may sleep"
     line.arrive("A", "")

@@ -20,6 +20,7 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
+from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import COMMAND_SIZE, HEADER, MODE_SIZE, PREFIX_SIZE, WELLING, Mode
 from flasher.station.messages import Ask, FromWorker, RunResult, ToWorker, WorkerSetup
@@ -58,6 +59,10 @@ class SocketBus(SimulatedBus):
         ):
             command = frame.data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE]
             self.on_command(int.from_bytes(command, "big"), self._sending_ends_at)
+        if frame is not None:
+            for sender in senders:
+                if isinstance(part := getattr(sender, "engine", None), _Part):
+                    part.was_sent(self._sending_ends_at)
         super()._deliver(senders, frame)
 
     def idle(self, until: float) -> None:
@@ -210,7 +215,12 @@ class PaperUnit:
         self.engine = devices[0]
         """The battery where there is one."""
         self.sleeps_until = float("-inf")
+        self.gave_up_at = float("-inf")
+        """When a device ended a transfer that nobody continued, and began to announce itself."""
         self.on_sent: Callable[[float], None] = lambda _now: None
+        self.sent_in: BootloaderState | None = None
+        """The state of `engine` when its last frame was on the bus, at this time."""
+        self.sent_at = 0.0
         self._seen = self.memory
 
     @property
@@ -221,6 +231,11 @@ class PaperUnit:
             if isinstance(part.engine.application, BmsApplication):
                 number = part.engine.application.kept["serial number"]
         return number, self.operations
+
+    @property
+    def is_in_transfer(self) -> bool:
+        """A device waits for the next message of a transfer."""
+        return any(part.engine.state is BootloaderState.TRANSFER for part in self.parts)
 
     @property
     def operations(self) -> int:
@@ -257,8 +272,12 @@ class _Part:
             self.engine.receive(frame, now)
 
     def tick(self, now: float) -> None:
-        if now >= self._unit.sleeps_until:
-            self.engine.tick(now)
+        if now < self._unit.sleeps_until:
+            return
+        before = self.engine.state
+        self.engine.tick(now)
+        if (before, self.engine.state) == (BootloaderState.TRANSFER, BootloaderState.ANNOUNCING):
+            self._unit.gave_up_at = now
 
     def deadline(self) -> float | None:
         due_at = self.engine.deadline()
@@ -270,6 +289,11 @@ class _Part:
     def frame_sent(self, now: float) -> None:
         self.engine.frame_sent(now)
         self._unit.on_sent(now)
+
+    def was_sent(self, now: float) -> None:
+        """A frame of it has been carried."""
+        if self.engine is self._unit.engine:
+            self._unit.sent_in, self._unit.sent_at = self.engine.state, now
 
     def cancel(self, now: float) -> None:
         pass

@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 from flasher.mock.table import BootloaderState
 from flasher.protocol.timing import DEFAULT_TIMINGS
-from flasher.station.records.model import StepName
 from tests.campaigns.line_world.promises import Violation
 
 _LABEL: Final = re.compile(r"\bW2605\d{3}\b")
@@ -30,12 +30,11 @@ class Pulled:
     at_s: float
     state: BootloaderState
     """Of its device."""
-    step: StepName | None
-    """Of the run; None: none went on."""
     was_silent: bool
     """It had sent nothing for some time, before the run began if there was one."""
-    is_mute: bool = False
-    """Its application answers no question."""
+    sent_in: BootloaderState | None = None
+    """The state of its device when its last frame was on the bus; None: it has sent nothing."""
+    sent_at_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -51,16 +50,15 @@ class Exchange:
     """The other one runs the version of the recipe already."""
     is_alike: bool
     """What the other one answers is no evidence."""
+    is_observed: bool = True
+    """The station has observed the socket since the last frame of the first one."""
 
 
 def _awaits_its_answer(pulled: Pulled) -> bool:
-    """It has confirmed its image, and its new application has not answered."""
-    is_mute = (
-        pulled.is_mute
-        and pulled.state is BootloaderState.APPLICATION
-        and pulled.step is StepName.FLASH
-    )
-    return is_mute or pulled.state is BootloaderState.STARTING
+    """It has confirmed its image, and its new application has sent nothing."""
+    is_started = pulled.state is BootloaderState.APPLICATION
+    is_silent = is_started and pulled.sent_in is BootloaderState.STARTING
+    return is_silent or pulled.state is BootloaderState.STARTING
 
 
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
@@ -73,6 +71,7 @@ UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
         _awaits_its_answer(each.pulled)
         and each.is_new
         and each.is_alike
+        and each.is_observed
         and each.gap_s <= DEFAULT_TIMINGS.application_start_timeout_s
     ),
 }
@@ -90,11 +89,23 @@ class Exchanges:
     def pull(self, socket: str, pulled: Pulled) -> None:
         self._pulled[socket] = pulled
 
-    def put(self, socket: str, label: str, now: float, *, is_new: bool, is_alike: bool) -> None:
+    def put(
+        self,
+        socket: str,
+        label: str,
+        now: float,
+        *,
+        is_new: bool,
+        is_alike: bool,
+        unobserved_until_s: float = -inf,
+    ) -> None:
+        """`unobserved_until_s`: when the socket was not observed last, for so long that a unit can
+        be exchanged.
+        """
         pulled = self._pulled.get(socket)
         if pulled is not None and pulled.label != label:
-            gap_s = now - pulled.at_s
-            self._all.append(Exchange(pulled, socket, label, gap_s, is_new, is_alike))
+            gap_s, is_observed = now - pulled.at_s, unobserved_until_s <= pulled.sent_at_s
+            self._all.append(Exchange(pulled, socket, label, gap_s, is_new, is_alike, is_observed))
 
     def reason_of(self, violation: Violation) -> str:
         """Why nobody could detect what a violation comes from; empty where somebody could. It comes

@@ -118,6 +118,8 @@ class Bay:
     """Since when the same unit is in it, and the station runs."""
     blind_until: float = float("-inf")
     """Its process stands still, or has no adapter."""
+    unobserved_until: float = float("-inf")
+    """The same, when that takes so long that a unit can be exchanged."""
     emptied_at: float = float("-inf")
     disturbed_at: float = 0.0
     """When a hand, a failure or sleep last touched its unit or its process."""
@@ -128,6 +130,8 @@ class Bay:
     run: str = ""
     """The label of the run that the station works on."""
     run_at: float = 0.0
+    began_in_transfer: bool = False
+    """When the run began, its unit waited in a transfer that another run had left."""
     step: StepName | None = None
     """The step that its process began last."""
     is_complete: bool = False
@@ -146,6 +150,12 @@ class Bay:
     heard: dict[str, None] = field(default_factory=dict)
     """Labels of the units that sent something in the run."""
     shown: SocketChanged | None = None
+
+    def blind(self, until: float, seconds: float) -> None:
+        """Nobody observes it until then, for so long."""
+        self.blind_until = max(self.blind_until, until)
+        if seconds > HAND_S:
+            self.unobserved_until = max(self.unobserved_until, until)
 
 
 @dataclass
@@ -363,6 +373,7 @@ class World:
             case RunStarted():
                 bay = self.bays[event.socket]
                 bay.run, bay.run_at = event.serial, self.now
+                bay.began_in_transfer = bay.unit is not None and bay.unit.is_in_transfer
                 self.seen["runs"] += 1
                 for person in self.people.values():
                     if person.label is not None and label_of(person.label) == event.serial:
@@ -427,7 +438,14 @@ class World:
             number = _stored(unit).number
             is_other = number.startswith("W") and number != bay.run
             is_alike = number in known if known else not is_other
-            self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new, is_alike=is_alike)
+            self.exchanges.put(
+                bay.name,
+                unit.label,
+                self.now,
+                is_new=is_new,
+                is_alike=is_alike,
+                unobserved_until_s=bay.unobserved_until,
+            )
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.spoke_at = float("-inf")
         bay.put_at = self.now
@@ -478,9 +496,9 @@ class World:
             unit.label,
             self.now,
             unit.engine.state,
-            bay.step if bay.is_working else None,
             was_silent=bay.spoke_at < awaited_at - SILENCE_S,
-            is_mute=not self._setup_of(act.unit).answers,
+            sent_in=unit.sent_in,
+            sent_at_s=unit.sent_at,
         )
         was_noticed = bay.has_spoken or not bay.is_working or bay.put_at < bay.run_at
         if was_noticed:  # else the unit before it is the one that the run has heard
@@ -660,7 +678,7 @@ class World:
         if bay is None or bay.process is None or bay.process.is_over:
             return False
         bay.process.stalled_until = self.now + act.seconds
-        bay.blind_until = max(bay.blind_until, bay.process.stalled_until)
+        bay.blind(bay.process.stalled_until, act.seconds)
         if bay.disturbed_at > self.now - CALM_S:
             bay.disturbed_at = bay.process.stalled_until  # it hears what came before only then
         self.promises.touched(bay.name)
@@ -690,7 +708,7 @@ class World:
         if bay is None or not bay.bus.faults.is_plugged:
             return False
         bay.bus.unplug(back_after_s=act.seconds)
-        bay.blind_until = max(bay.blind_until, self.now + act.seconds)
+        bay.blind(self.now + act.seconds, act.seconds)
         self.promises.touched(bay.name)
         bay.disturbed_at = max(bay.disturbed_at, self.now + act.seconds)
         return True
@@ -758,8 +776,7 @@ class World:
         self.seen[self._last_end] += 1
         if event.code == "INTERNAL":
             raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
-        is_calm = _is_calm(bay)
-        if event.code == "UNIT_CHANGED" and is_calm:
+        if event.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay):
             raise Violation(
                 "ACCUSED",
                 f"{event.serial} in {bay.name} was touched by nobody, and is said to be another"
@@ -997,6 +1014,13 @@ def _make(setup: stories.UnitSetup, none: str, line: stories.LineSetup) -> Paper
 def _is_calm(bay: Bay) -> bool:
     """Nobody had touched anything for some time before the run."""
     return bay.disturbed_at < bay.run_at - CALM_S
+
+
+def _has_given_up(bay: Bay) -> bool:
+    """Its unit waited in a transfer that another run had left, and has announced itself since, as
+    one does that is switched on.
+    """
+    return bay.began_in_transfer and bay.unit is not None and bay.unit.gave_up_at >= bay.run_at
 
 
 def _stored(unit: PaperUnit) -> _Stored:
