@@ -42,6 +42,8 @@ _ANNOUNCEMENT: Final = (
     + Command.BOOT_VERSION.to_bytes(COMMAND_SIZE, "big")
 )
 """Begins the first frame of an announcement."""
+_LATE_LOOKS: Final = 2
+"""Calls of `Presence.change` after which all frames that came in unobserved time have been read."""
 _RHYTHM_S: Final = 1.0
 """Pauses of a bootloader that keeps announcing recur within this time."""
 _ALIKE: Final = 1.5
@@ -262,6 +264,8 @@ class Presence:
         self._told_serial: str | None = None
         self._told_power_ups = 0
         self._was_missed = False
+        """Another unit may have come in unobserved time."""
+        self._late_looks = 0
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """Handle one frame of an idle bus."""
@@ -273,8 +277,8 @@ class Presence:
 
     def miss(self, missed_s: float) -> None:
         """Add unobserved time."""
-        if missed_s > PAUSE_S and any(each.is_in_bootloader for each in self.watchers):
-            self._was_missed = True
+        if missed_s > PAUSE_S:
+            self._late_looks = _LATE_LOOKS
         for watcher in self.watchers:
             watcher.miss(missed_s)
         if self._heard_at is not None:
@@ -296,23 +300,28 @@ class Presence:
         if self._began_at is None:
             self._began_at = now
         heard = self._heard_at is not None and now - self._heard_at < SILENCE_S
+        in_bootloader = heard and self._is_in_bootloader(now)
+        if self._late_looks:
+            self._late_looks -= 1
+            self._was_missed |= in_bootloader
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not heard:
             return None
         is_power_up = heard and self._power_ups > self._told_power_ups
-        in_bootloader = heard and self._is_in_bootloader(now)
         # The serial number that the unit reports; None before its first answer.
         said = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, said), "") if said else None
         told = (self.is_there, self._told_serial, self._told_in_bootloader)
-        was_missed, self._was_missed = heard and self._was_missed, False
+        # A unit is reported first, and then that it may be two.
+        was_missed = heard and self._was_missed and self.is_there is True
+        self._was_missed &= heard and not was_missed
         if (heard, serial, in_bootloader) == told and not (is_power_up or was_missed):
             return None
         self._number += 1
         is_other = None not in (self._told_serial, serial) and self._told_serial != serial
         if self.is_there and (is_power_up or is_other or not heard):
             self.exchanged_number = self._number
-        if self.is_there and was_missed:
+        if was_missed:
             self.missed_number = self._number
         self.is_there, self._told_in_bootloader = heard, in_bootloader
         self._told_power_ups = self._power_ups

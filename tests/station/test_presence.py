@@ -270,6 +270,26 @@ def test_a_bootloader_that_nobody_listened_to_may_be_another_one(presence: Prese
     assert presence.change(3.5) is None, "an application would announce its restart"
 
 
+def test_announcements_that_are_read_late_may_be_of_two_units(presence: Presence) -> None:
+    """One was pulled, and another one put in, while this computer stalled: no pause is seen."""
+    assert presence.change(0.0) is None
+    assert presence.change(2.0) is not None, "empty"
+    presence.miss(0.4)
+    assert presence.change(2.4) is None, "nothing was read yet"
+    assert announce(presence, 2.41) == [(True, True)]
+    announce(presence, 2.42)
+    assert presence.missed_number > 1
+
+
+def test_announcements_long_after_a_stall_are_of_one_unit(presence: Presence) -> None:
+    presence.change(2.0)
+    presence.miss(0.4)
+    for now in (2.4, 2.45, 2.5):
+        presence.change(now)
+    announce(presence, 2.55, 2.6)
+    assert presence.missed_number == 0
+
+
 @each(
     "cadence_s",
     [0.05, 0.24, 0.4, 1.0],
