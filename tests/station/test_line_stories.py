@@ -17,7 +17,8 @@ import pytest
 from flasher.mock.table import BootloaderState
 from flasher.station import codes
 from flasher.station.continuity import Continuity
-from flasher.station.presence import Presence
+from flasher.station.presence import Presence, TargetWatcher
+from flasher.station.records.model import StepName
 from flasher.station.socket import Socket
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
@@ -448,6 +449,14 @@ UNDETECTABLE = {
             " @43.15 put unit=1 socket=B ; @43.25 put unit=2 socket=A"
         ),
     ),
+    "pulled in the first frame of its announcement": (
+        RESET,
+        (
+            "line sockets=1 recipe=plain ; unit label=2 ; unit label=5 application=new ;"
+            " person name=jo ; @2.0 card by=jo unit=2 socket=A ; @2.1 label by=jo unit=2 ;"
+            " @2.74 put unit=2 socket=A ; @4.0564 pull unit=2 ; @5.0 put unit=5 socket=A"
+        ),
+    ),
     "starts, and answers nothing": (
         COMPLETE,
         (
@@ -580,9 +589,25 @@ def trust_every_run(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(codes, "OF_ANOTHER", frozenset())
 
 
+def count_whole_announcements(patch: pytest.MonkeyPatch) -> None:
+    counted = property(lambda self: self.announcements, lambda *_: None)
+    patch.setattr(TargetWatcher, "begun_announcements", counted, raising=False)
+
+
+def expect_a_start_until_the_first_answer(patch: pytest.MonkeyPatch) -> None:
+    counted = property(lambda _: 0, lambda *_: None)
+    patch.setattr(TargetWatcher, "application_frames", counted, raising=False)
+
+
 @pytest.mark.parametrize(
     ("plant", "story", "kind"),
     [
+        (count_whole_announcements, STORIES["pulled in its first announcement"], "FALSE PASS"),
+        (
+            expect_a_start_until_the_first_answer,
+            STORIES["pulled in its first answer"],
+            "FALSE PASS",
+        ),
         (report_nobody_after_a_run, PASSED_AND_EXCHANGED, "GREEN"),
         (accuse_everybody, PASSED_AND_EXCHANGED, "ACCUSED"),
         (write_and_fail, PASSED_AND_EXCHANGED, "STUCK"),

@@ -22,7 +22,15 @@ from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import COMMAND_SIZE, HEADER, MODE_SIZE, PREFIX_SIZE, WELLING, Mode
+from flasher.protocol.spec import (
+    COMMAND_SIZE,
+    FRAME_DATA_SIZE,
+    HEADER,
+    MODE_SIZE,
+    PREFIX_SIZE,
+    WELLING,
+    Mode,
+)
 from flasher.station.messages import Ask, FromWorker, RunResult, ToWorker, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.worker import StationGoneError, StationPipe, work_on
@@ -59,10 +67,10 @@ class SocketBus(SimulatedBus):
         ):
             command = frame.data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE]
             self.on_command(int.from_bytes(command, "big"), self._sending_ends_at)
-        if frame is not None:
-            for sender in senders:
-                if isinstance(part := getattr(sender, "engine", None), _Part):
-                    part.was_sent(self._sending_ends_at)
+        for part in (getattr(sender, "engine", None) for sender in senders):
+            if isinstance(part, _Part) and frame is not None:
+                is_received = bool(self._hosts) and self.faults.takes_part
+                part.frame_carried(frame, self._sending_ends_at, is_received=is_received)
         super()._deliver(senders, frame)
 
     def idle(self, until: float) -> None:
@@ -218,9 +226,12 @@ class PaperUnit:
         self.gave_up_at = float("-inf")
         """When a device ended a transfer that nobody continued, and began to announce itself."""
         self.on_sent: Callable[[float], None] = lambda _now: None
-        self.sent_in: BootloaderState | None = None
-        """The state of `engine` when its last frame was on the bus, at this time."""
+        self.last_word: BootloaderState | None = None
+        """State of its `engine` when its last message was received since its power came; None while
+        it has sent none, or is in the middle of one.
+        """
         self.sent_at = 0.0
+        """When its last frame was received."""
         self._seen = self.memory
 
     @property
@@ -248,6 +259,7 @@ class PaperUnit:
         return before[0] is self._seen[0] and before[1] == self._seen[1]
 
     def power_on(self, now: float) -> None:
+        self.last_word = None
         for part in self.parts:
             if not part.engine.has_power:
                 part.engine.power_on(now)
@@ -288,12 +300,14 @@ class _Part:
 
     def frame_sent(self, now: float) -> None:
         self.engine.frame_sent(now)
-        self._unit.on_sent(now)
 
-    def was_sent(self, now: float) -> None:
-        """A frame of it has been carried."""
-        if self.engine is self._unit.engine:
-            self._unit.sent_in, self._unit.sent_at = self.engine.state, now
+    def frame_carried(self, frame: Frame, now: float, *, is_received: bool) -> None:
+        """Its frame has been on the bus to its end, and an adapter has received it."""
+        if is_received and self.engine is self._unit.engine:
+            is_last = len(frame.data) < FRAME_DATA_SIZE
+            self._unit.last_word = self.engine.state if is_last else None
+            self._unit.sent_at = now
+        self._unit.on_sent(now)
 
     def cancel(self, now: float) -> None:
         pass

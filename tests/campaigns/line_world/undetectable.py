@@ -28,13 +28,15 @@ class Pulled:
 
     label: str
     at_s: float
-    state: BootloaderState
-    """Of its device."""
+    last_word: BootloaderState | None
+    """State of its device when its last message was received; None: since then it has begun another
+    one, or its power came."""
+    step: StepName | None
+    """Of the run; None: none went on."""
     was_silent: bool
     """It had sent nothing for some time, before the run began if there was one."""
-    sent_in: BootloaderState | None = None
-    """The state of its device when its last frame was on the bus; None: it has sent nothing."""
     sent_at_s: float = 0.0
+    """When its last frame was received."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +56,16 @@ class Exchange:
     """The station has observed the socket since the last frame of the first one."""
 
 
-def _awaits_its_answer(pulled: Pulled) -> bool:
-    """It has confirmed its image, and its new application has sent nothing."""
-    is_started = pulled.state is BootloaderState.APPLICATION
-    is_silent = is_started and pulled.sent_in is BootloaderState.STARTING
-    return is_silent or pulled.state is BootloaderState.STARTING
-
-
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
     "silent when its label was scanned": lambda each: each.pulled.was_silent,
     "between the confirmed reset and the announcement": lambda each: (
-        each.pulled.state is BootloaderState.RESTARTING
+        each.pulled.last_word is BootloaderState.RESTARTING
+        and each.is_observed
         and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
     ),
     "between the complete image and the first answer": lambda each: (
-        _awaits_its_answer(each.pulled)
+        each.pulled.last_word is BootloaderState.STARTING
+        and each.pulled.step is StepName.FLASH
         and each.is_new
         and each.is_alike
         and each.is_observed

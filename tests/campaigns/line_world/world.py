@@ -495,9 +495,9 @@ class World:
         pulled = Pulled(
             unit.label,
             self.now,
-            unit.engine.state,
+            unit.last_word,
+            bay.step if bay.is_working else None,
             was_silent=bay.spoke_at < awaited_at - SILENCE_S,
-            sent_in=unit.sent_in,
             sent_at_s=unit.sent_at,
         )
         was_noticed = bay.has_spoken or not bay.is_working or bay.put_at < bay.run_at
