@@ -46,8 +46,10 @@ _LATE_LOOKS: Final = 2
 """Calls of `Presence.change` after which all frames that came in unobserved time have been read."""
 _RHYTHM_S: Final = 1.0
 """Pauses of a bootloader that keeps announcing recur within this time."""
-_ALIKE: Final = 1.5
+_ALIKE: Final = 1.2
 """Two pauses within this factor of each other are alike."""
+_RECURRENCES: Final = 2
+"""Units that are exchanged one after the other make alike pauses once, but hardly so often."""
 
 
 class Watched(Protocol):
@@ -101,11 +103,12 @@ class TargetWatcher:
         self._announcing_on_s = timings.announcing_on_s
         self._announcing_s = 0.0
         """Duration of the announcements so far."""
-        self._paused_s = 0.0
-        """The last pause between announcements, 0 before one, and when it ended."""
+        self._burst = self._recurrences = 0
+        """Announcements since the last pause, and how often an alike pause has recurred."""
+        self._paused = (0.0, 0)
+        """The last pause between announcements, 0 before one, and the number of those before it."""
         self._paused_at = float("-inf")
-        self._awaits_pause = False
-        """The last pause was taken for one of its pace, so the next one has to come soon."""
+        """When it ended."""
         self._is_pace_unknown = False
         """There was only one announcement before the last pause, the first one."""
         self._missed_s = 0.0
@@ -155,8 +158,7 @@ class TargetWatcher:
                 self.completions += 1
 
     def _hear_application(self) -> None:
-        has_none = self._announcing_s > self._announcing_on_s or self._awaits_pause
-        if self.is_in_bootloader and has_none:
+        if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
             self._powered_up()  # a device without an application does not start one
         self.has_application = True
         self.application_frames += 1
@@ -174,37 +176,44 @@ class TargetWatcher:
             pause_s = now - self.announced_at - self._missed_s
         self._missed_s = 0.0
         is_pause = pause_s > PAUSE_S
-        is_rhythm = (
-            self._paused_s / _ALIKE < pause_s < self._paused_s * _ALIKE
-            and now - pause_s - self._paused_at < _RHYTHM_S
-        )
+        is_rhythm = is_pause and self._recurs(now, pause_s)
         # After one announcement, a pause may be the pace of this bootloader: the next one shows it.
         is_first_pause = self._announcing_s == 0.0 and pause_s < _RHYTHM_S
         is_sooner = self._is_pace_unknown and not is_rhythm
-        # It announces itself without the pause that would recur: the last one was no pace.
-        has_no_rhythm = self._awaits_pause and not is_pause and now - self._paused_at > _RHYTHM_S
         if (
             not self.is_in_bootloader
             or is_sooner
-            or has_no_rhythm
             or (is_pause and not is_rhythm and not is_first_pause)
         ):
             self._powered_up()
             is_first_pause = False
         else:
             self._announcing_s += pause_s
-            self._awaits_pause = is_rhythm if is_pause else self._awaits_pause
         self._is_pace_unknown = is_pause and is_first_pause
         if is_pause:
-            self._paused_s, self._paused_at = pause_s, now
+            self._paused, self._paused_at, self._burst = (pause_s, self._burst), now, 0
+        self._burst += 1
         self.announcements += 1
         self.announced_at, self.has_application = now, False
+
+    def _recurs(self, now: float, pause_s: float) -> bool:
+        """True for a pause of a bootloader that announces itself at a pace of its own: at once
+        where one announcement is between two alike pauses, else when such a burst recurs again.
+        """
+        before_s, burst = self._paused
+        is_alike = (
+            self.is_in_bootloader
+            and before_s / _ALIKE < pause_s < min(before_s * _ALIKE, SILENCE_S)
+            and now - pause_s - self._paused_at < _RHYTHM_S
+            and self._burst == burst
+        )
+        self._recurrences = self._recurrences + 1 if is_alike else 0
+        return self._recurrences >= (1 if self._burst == 1 else _RECURRENCES)
 
     def _powered_up(self) -> None:
         """Discard the earlier answers: they may be of another unit."""
         self.power_ups += 1
         self._announcing_s = 0.0
-        self._awaits_pause = False
         self.serial = self.answer = None
 
     def _take(self, message: Message) -> None:

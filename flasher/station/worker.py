@@ -307,7 +307,7 @@ class Worker:
                     watchers = presence.watchers
                     was_exchanged = presence.exchanged_number > claim.presence
                     was_missed = presence.missed_number > claim.presence
-                    was_silent = presence.sees_units and presence.is_there is False
+                    was_silent = presence.is_there is False
                 run = UnitRun(
                     claim,
                     self._recipe,

@@ -281,6 +281,31 @@ STORIES = {
         " @58.9 label by=al unit=5 ; @64.3 pull unit=5 ; @65.0 put unit=5 socket=B ;"
         " @66.0 worker socket=B ; @71.297 label by=jo unit=5 ; @76.297 pull unit=5 ; @81.0 look"
     ),
+    "bootloaders that change places after equal pauses": (
+        "line sockets=2 ; unit label=2 pace=slow ; unit label=3 number=other application=none ;"
+        " person name=al source=al ; @2.0 put unit=2 socket=A ; @6.0 card by=al unit=2 ;"
+        " @9.5 label by=al unit=2 ; @11.5 pull unit=2 ; @16.0 put unit=3 socket=B ;"
+        " @19.2 pull unit=3 ; @19.5 put unit=2 socket=B ; @20.0 card by=al unit=2 ;"
+        " @20.1 pull unit=2 ; @20.4 put unit=3 socket=B ; @20.5 label by=al unit=2"
+    ),
+    "a bootloader that was away for some seconds": (
+        "line sockets=1 ; unit label=1 ; unit label=2 application=none pace=slow ; person name=jo ;"
+        " @3.0 put unit=1 socket=A ; @5.0 label by=jo unit=1 ; @11.0 pull unit=1 ;"
+        " @12.0 put unit=1 socket=A ; @16.5 pull unit=1 ; @17.0 put unit=2 socket=A ;"
+        " @17.17 card by=jo unit=2 ; @17.2 label by=jo unit=2 ; @18.0 pull unit=2 ;"
+        " @22.0 put unit=2 socket=A ; @23.5 pull unit=2 ; @24.0 put unit=1 socket=A"
+    ),
+    "put in while the process of the socket stands still": (
+        "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
+        " @3.0 stall socket=A seconds=4.0 ; @4.0 label by=jo unit=1 ; @5.0 put unit=2 socket=A"
+    ),
+    "erases still when its next run begins": (
+        "line sockets=1 recipe=bicycle ; unit label=1 application=new ;"
+        " unit label=2 number=other application=none pace=slow ; person name=jo source=mounted ;"
+        " @1.0 put unit=2 socket=A ; @1.6 label by=jo unit=2 ; @4.8 pull unit=2 ;"
+        " @5.1 put unit=1 socket=A ; @6.0 pull unit=1 ; @6.5 put unit=2 socket=A ;"
+        " @7.0 label by=jo unit=2"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
@@ -531,7 +556,7 @@ def test_each_reason_is_of_a_story() -> None:
 @pytest.mark.parametrize("state", list(BootloaderState))
 def test_a_unit_that_answers_something_else_can_be_detected(state: BootloaderState) -> None:
     exchanges = undetectable.Exchanges()
-    pulled = undetectable.Pulled("W2605001", 3.0, state, was_silent=False)
+    pulled = undetectable.Pulled("W2605001", 3.0, state, StepName.FLASH, was_silent=False)
     for socket, is_alike in (("A", True), ("B", False)):
         exchanges.pull(socket, pulled)
         exchanges.put(socket, "W2605002", 3.5, is_new=True, is_alike=is_alike)

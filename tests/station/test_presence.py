@@ -15,7 +15,7 @@ from flasher.protocol.spec import BMS, WMC, Mode
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
 from flasher.station.messages import PresenceChanged
-from flasher.station.presence import Presence
+from flasher.station.presence import Presence, TargetWatcher
 from tests.loops import each
 from tests.station.unit_bench import UnitBench
 
@@ -224,21 +224,11 @@ def test_a_pause_after_one_announcement_is_judged_by_the_next_one(presence: Pres
     assert announce(presence, 1.45) == [(True, True)], "its pace is another one: another unit"
 
 
-def test_a_pause_like_the_last_one_is_judged_by_whether_it_recurs(presence: Presence) -> None:
+def test_a_pause_like_the_last_one_is_no_pace_after_a_longer_burst(presence: Presence) -> None:
     announce(presence, 1.0, 1.05, 1.1)
-    assert announce(presence, 1.7) == [(True, True)], "one unit for another"
-    steady = [1.75 + 0.05 * at for at in range(14)]
-    assert announce(presence, *steady) == []
-    assert announce(presence, 3.0) == [], "that may be its pace"
-    assert announce(presence, *(3.05 + 0.05 * at for at in range(20))) == []
-    assert announce(presence, 4.05) == [(True, True)], "it has none"
-
-
-def test_a_bootloader_may_pause_after_each_burst(presence: Presence) -> None:
-    announce(presence, 1.0, 1.05, 1.1, 1.15)
-    assert announce(presence, 1.75) == [(True, True)]
-    for begin in (1.8, 2.55, 3.3, 4.05):
-        assert announce(presence, begin, begin + 0.05, begin + 0.1, begin + 0.7) == []
+    assert announce(presence, 1.7) == [(True, True)]
+    assert announce(presence, *(1.75 + 0.05 * at for at in range(14))) == []
+    assert announce(presence, 3.0) == [(True, True)]
 
 
 def test_time_in_which_nobody_listened_is_no_silence(presence: Presence) -> None:
@@ -304,3 +294,46 @@ def test_a_bootloader_that_goes_on_announcing_powers_up_once(
     # Of a very slow one the first pause may be an exchange.
     assert len(changes) <= (1 if cadence_s < 1.0 else 2)
     assert announce(presence, times[-1] + cadence_s + 0.65) == [(True, True)], "another one"
+
+
+def bursts(count: int, pause_s: float, announcements: int = 4) -> list[float]:
+    """Times of announcements 50 ms apart, in bursts with pauses of this length between them."""
+    cycle_s = 0.05 * (announcements - 1) + pause_s
+    return [
+        1.0 + cycle_s * burst + 0.05 * at for burst in range(count) for at in range(announcements)
+    ]
+
+
+@each("pause_s", [0.3, 0.6, 1.4])
+@each("announcements", [2, 4, 10])
+def test_units_that_are_exchanged_at_equal_intervals_are_no_bootloader_with_pauses(
+    tmp_path: Path, pause_s: float, announcements: int
+) -> None:
+    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    changes = announce(presence, *bursts(3, pause_s, announcements))
+    assert changes == [(True, True)] * 3
+
+
+@each("pause_s", [0.3, 0.6, 1.4])
+def test_a_bootloader_that_announces_itself_in_bursts_is_one_unit_in_the_end(
+    tmp_path: Path, pause_s: float
+) -> None:
+    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    times = bursts(20, pause_s)
+    assert announce(presence, *times) == [(True, True)] * 3
+    assert announce(presence, times[-1] + 1.25 * pause_s) == [(True, True)], "another one"
+
+
+def test_a_pause_in_which_an_application_has_sent_is_no_pace(presence: Presence) -> None:
+    announce(presence, 1.0, 1.05)
+    hear(presence, version_answer(""), 1.5)
+    assert announce(presence, 2.0, 2.05) == [(True, True)]
+    assert announce(presence, 3.0) == [(True, True)]
+
+
+def test_a_pause_that_is_a_silence_is_no_pace(tmp_path: Path) -> None:
+    watcher = TargetWatcher(UnitBench(tmp_path).recipe.targets[0])
+    for now in bursts(5, 4.0, 1):
+        for frame in split(BMS.answer_id, encode(BootVersion("BMS", "V1.0.0").to_message(0x725))):
+            watcher(frame, sent=False, now=now)
+    assert watcher.power_ups == 5

@@ -52,17 +52,22 @@ class _Run:
     operations: list[tuple[PaperUnit, int]]
     """All units that were in its socket, and how often each had been erased or written then."""
     is_identified: bool = False
+    has_commanded: bool = False
+    """It has sent a command after which a unit erases or writes. What a unit does without one was
+    commanded before the run."""
     was_running: bool = False
     """It was pulled after it had answered and before its flash, while its application ran."""
 
     @property
     def is_flashed(self) -> bool:
-        return self.unit.operations != self.operations[0][1]
+        return self.has_commanded and self.unit.operations != self.operations[0][1]
 
     @property
     def has_flashed(self) -> bool:
         """A unit was flashed in it, perhaps another one."""
-        return any(unit.operations != before for unit, before in self.operations)
+        return self.has_commanded and any(
+            unit.operations != before for unit, before in self.operations
+        )
 
 
 class Promises:
@@ -156,6 +161,11 @@ class Promises:
         self.touched(socket)
         if socket in self._runs:
             self._runs[socket].operations.append((unit, unit.operations))
+
+    def flashes(self, socket: str) -> None:
+        """A command left after which what is in a socket erases or writes its flash."""
+        if socket in self._runs:
+            self._runs[socket].has_commanded = True
 
     def pulled(self, socket: str, *, was_calm: bool) -> None:
         """`was_calm`: it was in the socket and heard for some time before the run."""

@@ -14,6 +14,7 @@ from typing import Final
 
 from flasher.mock.table import BootloaderState
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.station.records.model import StepName
 from tests.campaigns.line_world.promises import Violation
 
 _LABEL: Final = re.compile(r"\bW2605\d{3}\b")

@@ -81,6 +81,7 @@ _RECIPES: Final = {
 }
 _TARGETS: Final = {"bicycle": (BMS, WMC), "wmc": (WMC,), "obc": (OBC,)}
 """What a unit consists of; the battery alone for the other recipes."""
+_FLASHES: Final = (Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 _ANNOUNCES_S: Final = 0.3
 """So long after its power came a unit announces itself for the first time, or sooner."""
 OLD_VERSION: Final = DeviceProfile().factory_version
@@ -196,9 +197,8 @@ class World:
         if setup.line.recipe != "plain":
             self.bench.use(_RECIPES[setup.line.recipe])
         self.bays = {name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]}
-        if not setup.line.tells:
-            for bay in self.bays.values():
-                bay.bus.on_command = partial(_note_command, bay)
+        for bay in self.bays.values():
+            bay.bus.on_command = partial(self._note_command, bay)
         none = NONE if setup.line.writes else ""
         self.units = {each.label: _make(each, none, setup.line) for each in setup.units}
         self._allowed = {
@@ -770,6 +770,11 @@ class World:
 
     # -- the oracle -------------------------------------------------------------------------------
 
+    def _note_command(self, bay: Bay, command: int, now: float) -> None:
+        bay.commanded_at.setdefault(command, now)
+        if command in _FLASHES:
+            self.promises.flashes(bay.name)
+
     def _end(self, bay: Bay, event: RunEnded) -> None:
         bay.run = ""
         self._last_end = f"{event.outcome.value} {event.code}"
@@ -968,10 +973,6 @@ class World:
                 running = [f"{bay.run} in {bay.name}" for bay in self.bays.values() if bay.run]
                 raise Violation(STUCK, f"no end of the run of {_words(running)}")
             self._wait(0.5)
-
-
-def _note_command(bay: Bay, command: int, now: float) -> None:
-    bay.commanded_at.setdefault(command, now)
 
 
 def _find_no_room(_cursor: object, statement: str, _values: object, _context: object) -> None:
