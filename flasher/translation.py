@@ -27,14 +27,14 @@ _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
 _LETTERS_MIN: Final = 4
 """In an entry without its values: fewer would match anything."""
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
-_JOINTS: Final = (
-    re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL),
-    re.compile(r"(.+?)(; )(.+)()", re.DOTALL),
-    re.compile(r"(.+?)(: )(.+)()", re.DOTALL),
-)
+_CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
+_BRACKETS: Final = re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL)
+_COLON: Final = re.compile(r"(.+?)(: )(.+)()", re.DOTALL)
 """Where a text is joined from several ones."""
-_OF_ONE_SENTENCE: Final = re.compile(r"(?:(?![.!?] [A-Z]).)*", re.DOTALL)
+_WHOLE: Final = re.compile(r"(?:(?![.!?] [A-Z]|; ).)*", re.DOTALL)
+"""Values that are not joined themselves."""
 _ANY: Final = re.compile(r".*", re.DOTALL)
+_STOPS: Final = {"zh": "\N{IDEOGRAPHIC FULL STOP}"}
 
 
 class _Entry(NamedTuple):
@@ -81,10 +81,14 @@ class Translator(Formatter):
         if said != sentence or " " not in sentence or not self._entries:
             return said
         return (
-            self._matched(sentence, _OF_ONE_SENTENCE)
+            self._matched(sentence, _WHOLE)
             or self._split(sentence, _SENTENCES)
+            or self._split(sentence, _CLAUSES)
             or self._matched(sentence, _ANY)
-            or next(filter(None, (self._split(sentence, joint) for joint in _JOINTS)), sentence)
+            or self._stopped(sentence)
+            or self._split(sentence, _BRACKETS)
+            or self._split(sentence, _COLON)
+            or sentence
         )
 
     def _matched(self, sentence: str, values: re.Pattern[str]) -> str:
@@ -105,6 +109,12 @@ class Translator(Formatter):
         said = "".join([self._plain(first), between, self._plain(second), end])
         return said if said != sentence else ""
 
+    def _stopped(self, sentence: str) -> str:
+        """Translate a sentence that the catalogue has without its full stop; "" otherwise."""
+        bare = sentence.removesuffix(".")
+        said = self._plain(bare) if bare != sentence else bare
+        return "" if said == bare else said + _STOPS.get(self.code, ".")
+
     # -- filling in values ------------------------------------------------------------------------
 
     def format_field(self, value: Any, format_spec: str) -> str:
@@ -112,17 +122,15 @@ class Translator(Formatter):
             return self(value)
         if isinstance(value, _Shown):
             text = str(value)
-            return self.numbers(text) if format_spec else self._with_edges(text)
+            bare = text.strip()
+            return self.numbers(text) if format_spec else text.replace(bare, self._plain(bare))
         text = format(value, format_spec)
-        return self._with_edges(text) if isinstance(value, str) else self.numbers(text)
+        if isinstance(value, str):
+            return self._plain(text) if " " in text else text
+        return self.numbers(text)
 
     def convert_field(self, value: Any, conversion: Any) -> Any:
         return value if isinstance(value, _Shown) else super().convert_field(value, conversion)
-
-    def _with_edges(self, text: str) -> str:
-        """Translate a value of several words, and keep the spaces around it."""
-        bare = text.strip()
-        return text.replace(bare, self._plain(bare)) if " " in bare else text
 
 
 def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:
@@ -155,6 +163,9 @@ def translator(code: str) -> Translator:
         write_mo(compiled, read_po(file, locale=code))
     compiled.seek(0)
     return Translator(code, gettext.GNUTranslations(compiled))
+
+
+ENGLISH: Final = translator("en")
 
 
 def chosen(wanted: str | None, accepted: Iterable[str]) -> Translator:

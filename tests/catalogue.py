@@ -5,7 +5,9 @@ it has one; a sentence that nobody says any more is dropped.
 
 from __future__ import annotations
 
+import errno
 import itertools
+import os
 import string
 import sys
 from collections.abc import Iterator
@@ -26,20 +28,29 @@ from flasher.host.outcome import (
     DeviceLeft,
     _late,
 )
-from flasher.host.table import Ending
-from flasher.host.verify import Verdict
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.contents import BatteryFault
 from flasher.protocol.fields import flag_names, label
+from flasher.report.chart import MarkKind
+from flasher.station.records.errors import NOT_SAVED
+from flasher.station.records.model import RunKind, StepName, StepState, Verified
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
 from flasher.translation import NAMES
-from flasher.wording import wording
+from flasher.wording import _EXPLANATIONS as _CAUSES
+from flasher.wording import _TEXTS
+from tests.sentences import spoken
 
+_SYSTEM: Final = (
+    errno.EACCES, errno.EADDRINUSE, errno.EAFNOSUPPORT, errno.EBUSY, errno.ECONNREFUSED,
+    errno.EHOSTUNREACH, errno.EISDIR, errno.ENETDOWN, errno.ENODEV, errno.ENOENT, errno.ENOSPC,
+    errno.ENXIO, errno.EPERM, errno.EROFS, errno.ETIMEDOUT,
+)  # fmt: skip
+"""Errors of Linux that users meet."""
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "locale"
 LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
-_PAGES: Final = "web/templates/**.html"
+_PAGES: Final = "**/templates/*.html"
 _METHODS: Final = {"text": ("**.py", "python"), "_": (_PAGES, "jinja2.ext:babel_extract")}
 _OPTIONS: Final = {_PAGES: {"trimmed": "true"}}
 
@@ -54,7 +65,16 @@ def sentences() -> Iterator[str]:
             if keyword == "_" or "flasher.i18n" in (ROOT / name).read_text("utf-8"):
                 assert isinstance(message, str)
                 yield message
-    yield from (wording(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
+    yield from spoken()
+    yield from (text for texts in _TEXTS.values() for text in texts.values())
+    yield from (text for each in _CAUSES.values() for text in each if text)
+    yield from (each.value for kind in (RunKind, StepName, StepState, MarkKind) for each in kind)
+    yield from (each.short for each in MarkKind)
+    yield from (each.words for each in Verified)
+    yield from ("flash {target}", "once", "twice", NOT_SAVED, "[Errno {number}] {error}")
+    yield from map(os.strerror, _SYSTEM)
+    for word in ("model", "serial number", "hardware version", "firmware version"):
+        yield f"{{target}} {word}"
     explained = [
         *_EXPLANATIONS.values(),
         _NO_SESSION_EITHER,
@@ -85,8 +105,8 @@ def catalogue(language: str) -> Catalog:
 
 
 def fields(text: str) -> set[str]:
-    """The names in braces of a sentence."""
-    return {name for _, name, _, _ in string.Formatter().parse(text) if name}
+    """The names in braces of a sentence, without the plural's s of English."""
+    return {name for _, name, _, _ in string.Formatter().parse(text) if name} - {"s"}
 
 
 def messages(language: str) -> dict[str, str]:

@@ -53,8 +53,11 @@ def progress_line(event: object) -> tuple[str, int] | None:
             return f"{reason_text(reason)}: beginning again, attempt {attempt}{left}", 0
         case events.UpgradeLeftOpen(at, image, has_end):
             left = "left the device without an application" if has_end else "has no end"
-            text = f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
-            return f"{text}update command if it stays silent", 0
+            line = (
+                f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
+                "update command if it stays silent"
+            )
+            return line, 0
         case events.MessageRepeated(what, reason, tries):
             level = 1 if tries % _TRIES_SHOWN else 0
             return f"{reason_text(reason, what)}: sending {what} again, try {tries}", level

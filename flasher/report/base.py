@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import unicodedata
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 
 from flasher.report import scale
+from flasher.translation import Translator, translator
 from flasher.wording import wording
 
 TEXT_LIMIT: Final = 400
@@ -64,12 +66,12 @@ def percent(share: float) -> str:
     return f"{value:.1f} %" if 0.05 <= value < 9.95 else f"{value:.0f} %"
 
 
-def render_page(template: str, **context: Any) -> str:
-    """Render `template` (a file in `templates/`) with `context`.
+def render_page(template: str, language: str = "en", **context: Any) -> str:
+    """Render `template` (a file in `templates/`) with `context` in a language.
 
     Raises jinja2.UndefinedError for a name missing from `context`.
     """
-    return _ENVIRONMENT.get_template(template).render(**context)
+    return _environment(language).get_template(template).render(**context)
 
 
 def _finalize(value: object) -> object:
@@ -77,8 +79,10 @@ def _finalize(value: object) -> object:
     return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
-def environment(loader: BaseLoader) -> Environment:
-    """The template environment for `loader`; its templates raise what `render_page` does."""
+def environment(loader: BaseLoader, translate: Translator) -> Environment:
+    """The template environment for `loader` in a language; its templates raise what `render_page`
+    does. They have `_` (translation) and `lang`.
+    """
     made = Environment(
         loader=loader,
         autoescape=True,
@@ -87,13 +91,17 @@ def environment(loader: BaseLoader) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters["duration"] = scale.duration_text
-    made.filters["counted"] = counted
-    made.filters["wording"] = wording
-    made.filters["percent"] = percent
+    made.filters["duration"] = lambda seconds: translate.numbers(scale.duration_text(seconds))
+    made.filters["counted"] = lambda number: translate.numbers(counted(number))
+    made.filters["wording"] = lambda word: translate(wording(word))
+    made.filters["percent"] = lambda share: translate.numbers(translate(percent(share)))
+    made.filters["fixed"] = lambda value, digits: translate.numbers(f"{value:.{digits}f}")
+    made.filters["number"] = translate.numbers
     made.filters["shortened"] = shortened
-    made.globals["Status"] = Status
+    made.globals.update(Status=Status, _=translate, lang=translate.code)
     return made
 
 
-_ENVIRONMENT: Final = environment(PackageLoader("flasher.report"))
+@cache
+def _environment(language: str) -> Environment:
+    return environment(PackageLoader("flasher.report"), translator(language))

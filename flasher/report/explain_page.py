@@ -27,6 +27,7 @@ from flasher.trace.story import (
     StoryLine,
     UpgradeStory,
 )
+from flasher.translation import ENGLISH, Translator
 from flasher.wording import wording
 
 UPGRADES_SHOWN: Final = 8
@@ -117,11 +118,11 @@ class UpgradeView:
 
 def render(story: Story) -> str:
     """The whole page as HTML text."""
-    return render_page("explain.html", **story_context(story))
+    return render_page("explain.html", **story_context(story, ENGLISH))
 
 
-def story_context(story: Story) -> dict[str, Any]:
-    """Data for the page's template."""
+def story_context(story: Story, translate: Translator) -> dict[str, Any]:
+    """Data for the page's template. `translate`: for texts that are laid out here."""
     shown = story.upgrades[:UPGRADES_SHOWN]
     room = _Room.for_upgrades(len(shown))
     status = status_of(story.verdict.cause)
@@ -130,12 +131,12 @@ def story_context(story: Story) -> dict[str, Any]:
         "status": status,
         "word": _WORDS[status],
         "started": _wall_text(story.started_at),
-        "upgrades": [_view(upgrade, room) for upgrade in shown],
+        "upgrades": [_view(upgrade, room, translate) for upgrade in shown],
         "more_upgrades": [
             (upgrade, status_of(upgrade.verdict.cause))
             for upgrade in story.upgrades[UPGRADES_SHOWN:]
         ],
-        "outside": _drawn(story.steps, "", room.items),
+        "outside": _drawn(story.steps, "", room.items, translate),
         "talkers": story.talkers[:TALKERS_SHOWN],
         "talkers_left_out": story.talkers_left_out + max(0, len(story.talkers) - TALKERS_SHOWN),
     }
@@ -160,7 +161,7 @@ def _wall_text(seconds: float | None) -> str:
         return ""
 
 
-def _view(upgrade: UpgradeStory, room: _Room) -> UpgradeView:
+def _view(upgrade: UpgradeStory, room: _Room, translate: Translator) -> UpgradeView:
     status = status_of(upgrade.verdict.cause)
     troubled = [each for each in upgrade.packets if not each.is_clean or each.answered_at_s is None]
     more = len(upgrade.remarks) - REMARKS_SHOWN
@@ -170,7 +171,7 @@ def _view(upgrade: UpgradeStory, room: _Room) -> UpgradeView:
         status=status,
         word=_WORDS[status],
         phases=tuple(_phases(upgrade)),
-        sequence=_drawn(upgrade.steps, upgrade.target, room.items),
+        sequence=_drawn(upgrade.steps, upgrade.target, room.items, translate),
         latencies=tuple(_latencies(upgrade.packets, room.attempts)),
         spreads=tuple(_spreads(upgrade)),
         histogram=_histogram(upgrade.packets),
@@ -235,12 +236,15 @@ def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
 # -- steps as a sequence diagram ------------------------------------------------------------------
 
 
-def _drawn(lines: Sequence[StoryLine], target: str, most: int) -> dict[str, list[sequence.Part]]:
+def _drawn(
+    lines: Sequence[StoryLine], target: str, most: int, translate: Translator
+) -> dict[str, list[sequence.Part]]:
     """The diagram of these steps for each width."""
     participants = _participants(lines, target)
     items = sequence.thinned([_item(line, participants) for line in lines], most)
     return {
-        name: sequence.diagram(items, participants, width) for name, width in chart.WIDTHS.items()
+        name: sequence.diagram(items, participants, width, translate)
+        for name, width in chart.WIDTHS.items()
     }
 
 

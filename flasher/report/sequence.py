@@ -8,13 +8,15 @@ so that a printer can break between them.
 from __future__ import annotations
 
 import textwrap
+import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, NamedTuple
 
 from flasher.report.base import shortened, visible
 from flasher.report.scale import duration_text
+from flasher.translation import ENGLISH, Translator
 
 ITEMS_SHOWN: Final = 240
 """At most this many items in one diagram."""
@@ -127,7 +129,12 @@ def _left_out(items: Sequence[DiagramItem]) -> DiagramItem:
     return DiagramItem(ItemKind.BLOCK, items[0].at_s, title, text, is_trouble=bool(troubles))
 
 
-def diagram(items: Sequence[DiagramItem], participants: Sequence[str], width: float) -> list[Part]:
+def diagram(
+    items: Sequence[DiagramItem],
+    participants: Sequence[str],
+    width: float,
+    translate: Translator = ENGLISH,
+) -> list[Part]:
     """Lay out the diagram in parts, from top to bottom, `width` CSS pixels wide; none without
     items.
 
@@ -139,7 +146,7 @@ def diagram(items: Sequence[DiagramItem], participants: Sequence[str], width: fl
     parts: list[Part] = []
     rows: list[DiagramRow] = []
     top = float(_HEAD_HEIGHT)
-    for item in _with_pauses(items):
+    for item in _with_pauses(items, translate):
         row = _row(item, lifelines, top, width)
         if rows and row.y > _PART_HEIGHT:
             parts.append(_part(rows, lifelines, width))
@@ -169,16 +176,16 @@ def _lifelines(participants: Sequence[str], width: float) -> tuple[Lifeline, ...
     )
 
 
-def _with_pauses(items: Iterable[DiagramItem]) -> Iterable[DiagramItem]:
-    """Insert a block for each long silence before an arrow."""
+def _with_pauses(items: Iterable[DiagramItem], translate: Translator) -> Iterable[DiagramItem]:
+    """Insert a block for each long silence before an arrow, and translate."""
     previous_s: float | None = None
     for item in items:
         # A block without an end is a pause itself, or replaces steps that are not drawn.
         is_open = item.kind is ItemKind.BLOCK and item.end_s is None
         if previous_s is not None and not is_open and item.at_s - previous_s >= _QUIET_S:
-            quiet = duration_text(item.at_s - previous_s)
-            yield DiagramItem(ItemKind.BLOCK, previous_s, f"{quiet} later")
-        yield item
+            quiet = translate.numbers(duration_text(item.at_s - previous_s))
+            yield DiagramItem(ItemKind.BLOCK, previous_s, translate(f"{quiet} later"))
+        yield replace(item, title=translate(item.title), text=translate(item.text))
         previous_s = None if is_open else item.end_s or item.at_s
 
 
@@ -220,7 +227,9 @@ def _block(item: DiagramItem, top: float, width: float) -> DiagramRow:
 
 def _label(item: DiagramItem, room: float) -> tuple[str, tuple[str, ...]]:
     """The bold part of the first line, and all lines: the title, then the text."""
-    columns = max(8, int(room / _CHAR_WIDTH))
+    said = f"{item.title}{item.text}"
+    wide = sum(unicodedata.east_asian_width(char) in "WF" for char in said)
+    columns = max(8, int(room / _CHAR_WIDTH / (1 + wide / max(1, len(said)))))
     title = visible(shortened((_MARK if item.is_trouble else "") + item.title))
     said = f"{title}: {item.text}" if item.text else title
     lines = textwrap.wrap(

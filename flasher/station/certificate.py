@@ -41,15 +41,19 @@ _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
 _ROW: Final = ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
 UNIT_WORDS: Final = {
-    UnitState.PASS: (Status.GOOD, text("PASS"), "This unit passed."),
-    UnitState.FAIL: (Status.BAD, text("FAIL"), "This unit did not pass: it is no good unit."),
+    UnitState.PASS: (Status.GOOD, text("PASS"), text("This unit passed.")),
+    UnitState.FAIL: (Status.BAD, text("FAIL"), text("This unit did not pass: it is no good unit.")),
     UnitState.RECHECK: (
         Status.WARNING,
         text("RECHECK"),
-        "The last run of this unit did not come to a result. It has to be checked.",
+        text("The last run of this unit did not come to a result. It has to be checked."),
     ),
-    UnitState.RUNNING: (Status.NEUTRAL, text("RUNNING"), "This unit is being made: no result yet."),
-    UnitState.NEW: (Status.NEUTRAL, text("NEW"), "Nothing was done to this unit."),
+    UnitState.RUNNING: (
+        Status.NEUTRAL,
+        text("RUNNING"),
+        text("This unit is being made: no result yet."),
+    ),
+    UnitState.NEW: (Status.NEUTRAL, text("NEW"), text("Nothing was done to this unit.")),
 }
 RUN_WORDS: Final = {
     RunState.RUNNING: (text("RUNNING"), Status.NEUTRAL),
@@ -108,11 +112,13 @@ def proven(store: Store, life: UnitLife) -> Proof:
     )
 
 
-def render_certificate(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> str:
+def render_certificate(
+    life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0, language: str = "en"
+) -> str:
     """The page. Raises UsageError for a unit without any run. `left_out`: how many earlier runs are
     not in `life`.
     """
-    return render_page("certificate.html", **sheet(life, made_at, proof, left_out))
+    return render_page("certificate.html", language, **sheet(life, made_at, proof, left_out))
 
 
 def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> dict[str, Any]:
@@ -214,21 +220,28 @@ def code_lines(last: RunDetails, record_sha256: str, head: ChainHead) -> tuple[s
 def limits_of(each: Measurement) -> str:
     """What a measurement may be, in words."""
     if each.value is None:
-        return each.expected if each.expected is not None else "any"
-    bounds = [
-        f"{word} {number(bound)}"
-        for word, bound in (("from", each.low), ("to", each.high))
+        return each.expected if each.expected is not None else text("any")
+    bounds = {
+        name: round(bound, 3)
+        for name, bound in (("low", each.low), ("high", each.high))
         if bound is not None
-    ]
-    return f"{' '.join(bounds)} {each.unit}".strip() if bounds else "any"
+    }
+    if not bounds:
+        return text("any")
+    unit = f" {each.unit}".rstrip()
+    if len(bounds) > 1:
+        return text("from {low:,.10g} to {high:,.10g}{unit}", unit=unit, **bounds)
+    if "low" in bounds:
+        return text("from {low:,.10g}{unit}", unit=unit, **bounds)
+    return text("to {high:,.10g}{unit}", unit=unit, **bounds)
 
 
 def verdict_of(each: Measurement) -> str:
     """Whether it is within its limits, where it has any."""
     if not each.is_within:
-        return "outside"
+        return text("outside")
     has_limits = any(limit is not None for limit in (each.low, each.high, each.expected))
-    return "within" if has_limits else ""
+    return text("within") if has_limits else ""
 
 
 def number(value: float) -> str:

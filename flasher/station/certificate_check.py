@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from html.parser import HTMLParser
 from typing import Final
@@ -26,9 +26,11 @@ from flasher.station.records.model import RunId
 from flasher.station.records.signatures import fingerprint, is_signed
 from flasher.station.records.store import Store
 from flasher.station.sealed import CheckedCertificate, Sealed, as_text, plain, sealed_in
+from flasher.translation import NAMES
 
 _PDF: Final = b"%PDF-"
 _CODE: Final = re.compile(r"flasher record 1\n(?:[^\n]+\n){7}key [0-9a-f]{64}")
+_LANGUAGE: Final = re.compile(r'<html lang="(\w+)">')
 _AROUND: Final = 24
 _EDGE_LINES: Final = 4
 _HIDDEN: Final = frozenset({"style", "script", "title", "svg"})
@@ -57,20 +59,17 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
             sealed.examined_at,
             seal=as_text(sealed),
         )
-        page = render_certificate(life, made_at, proof, sealed.earlier_left_out)
+        left_out = sealed.earlier_left_out
+        for language in _languages(page_text):
+            page = render_certificate(life, made_at, proof, left_out, language)
+            where = _difference_of_page(page, data, pages)
+            if not where:
+                break
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
             text("The certificate was changed: what it carries is no run."),
             remedy=text("Request the certificate again."),
         ) from error
-    if is_pdf:
-        where = _difference_of_print(page, pages)
-    elif "<html" in page_text:
-        where = (
-            "" if page.encode("utf-8") == data else _difference(_text_of(page), _text_of(page_text))
-        )
-    else:
-        where = ""  # the signed lines alone
     if where:
         problems.append(text("its page was changed: {where}", where=where))
         if sealed.flasher != __version__:
@@ -193,6 +192,23 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
 
 
 # -- the page --------------------------------------------------------------------------------------
+
+
+def _languages(page_text: str) -> Iterable[str]:
+    """In which languages the page may be; a print does not name its own."""
+    named = _LANGUAGE.search(page_text)
+    return (named[1],) if named and named[1] in NAMES else NAMES
+
+
+def _difference_of_page(page: str, data: bytes, prints: list[str]) -> str:
+    """Where the file, or the pages of a PDF, differ from the page; empty where they do not, and for
+    signed lines alone.
+    """
+    if prints:
+        return _difference_of_print(page, prints)
+    if page.encode("utf-8") == data or b"<html" not in data:
+        return ""
+    return _difference(_text_of(page), _text_of(data.decode("utf-8", "replace")))
 
 
 class _Text(HTMLParser):

@@ -74,16 +74,14 @@ class HealthWatch:
             free = shutil.disk_usage(self._folder).free
         except OSError as error:
             return HealthCheck(text("disk"), is_good=False, text=error.strerror or str(error))
-        size = f"{free / 1024**3:.1f} GiB"
-        return HealthCheck(
-            text("disk"), is_good=free >= LITTLE_BYTES, text=text("{size} free", size=size)
-        )
+        sentence = text("{size:.1f} GiB free", size=free / 1024**3)
+        return HealthCheck(text("disk"), is_good=free >= LITTLE_BYTES, text=sentence)
 
     def _clock(self) -> HealthCheck:
         shift_s = self._utc().timestamp() - self._monotonic_s() - self._offset_s
         if abs(shift_s) <= CLOCK_SHIFT_MAX_S:
             return HealthCheck(text("clock"), is_good=True, text=text("not set since the start"))
-        sentence = text("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
+        sentence = text("set by {seconds:+.0f} s since the start", seconds=shift_s)
         return HealthCheck(text("clock"), is_good=False, text=sentence)
 
 

@@ -309,8 +309,10 @@ class _StoryBuilder:
         bus = self._bus
         if self._announcements:
             cause = Cause.QUERIES_ONLY
-            text = f"A bootloader announced itself {self._announcements} time(s), and no tool began"
-            text += " an upgrade."
+            text = (
+                f"A bootloader announced itself {self._announcements} time(s), and no tool began "
+                "an upgrade."
+            )
         elif self._has_nodes:
             cause = Cause.QUERIES_ONLY
             text = "No tool began an upgrade; the trace holds messages of the drive system."

@@ -132,8 +132,10 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
         return _Found(Cause.COMPLETE_TOO_EARLY, text)
     if upgrade.shutdown_at_s is not None:
         after_s = upgrade.shutdown_at_s - upgrade.begin_s
-        text = f"The battery sent SHUTDOWN {after_s:.2f} s after the begin of the upgrade, "
-        text += "which was not completed."
+        text = (
+            f"The battery sent SHUTDOWN {after_s:.2f} s after the begin of the upgrade, which was "
+            "not completed."
+        )
         return _Found(Cause.SHUTDOWN, text)
     if upgrade.errors_now >= _ERRORS:
         text = f"{upgrade.errors_now:,} error frames came since the last progress."
@@ -205,18 +207,28 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
         if _is_other(upgrade):
             return _other_version(upgrade)
         if upgrade.image_versions:
-            text = f"The {node} did not report complete; the new application answers its version, "
-            return _Found(Cause.CONFIRMED_BY_VERSION, f"{text}{upgrade.running_version}.")
+            text = (
+                f"The {node} did not report complete; the new application answers its version, "
+                f"{upgrade.running_version}."
+            )
+            return _Found(Cause.CONFIRMED_BY_VERSION, text)
     if upgrade.end_naks:
-        text = f"The {node} has every packet and answered the end of the transfer with NAK, "
-        return _Found(Cause.REFUSED, f"{text}{_times(upgrade.end_naks)}.")
-    text = f"Every packet is acknowledged, the end was sent {_times(upgrade.ends)}, "
-    text += "and neither complete nor NAK came."
+        text = (
+            f"The {node} has every packet and answered the end of the transfer with NAK, "
+            f"{_times(upgrade.end_naks)}."
+        )
+        return _Found(Cause.REFUSED, text)
+    text = (
+        f"Every packet is acknowledged, the end was sent {_times(upgrade.ends)}, and neither "
+        "complete nor NAK came."
+    )
     if upgrade.boots_after_end:
         text += f" The bootloader announced itself {_times(upgrade.boots_after_end)} after it."
     if upgrade.running_version is not None:
-        text += f" An application answers, version {upgrade.running_version}; the packets hold "
-        text += "no version to compare it with."
+        text += (
+            f" An application answers, version {upgrade.running_version}; the packets hold no "
+            "version to compare it with."
+        )
     return _Found(Cause.UNCONFIRMED, text)
 
 

@@ -114,7 +114,9 @@ class Archive:
             error.what = error.what.replace(printable(str(path)), printable(path.name))
             raise
         named = replace(story, source=visible(path.name))
-        return self._page(question, "explain.html", **story_context(named))
+        return self._page(
+            question, "explain.html", **story_context(named, translator(question.language))
+        )
 
     def bundle(self, question: Question) -> Answer:
         """A bundle as one file."""

@@ -112,7 +112,7 @@ class ScreenHeader:
             "shift": _counted(self.output.shift, translate),
             "first": "-"
             if self.output.first_pass_share is None
-            else f"{int(self.output.first_pass_share * 1000) / 10:g} %",
+            else translate.numbers(f"{int(self.output.first_pass_share * 1000) / 10:g} %"),
             "causes": [f"{code} {count}" for code, count in self.output.causes],
             "health": [
                 {

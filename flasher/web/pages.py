@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import AsyncIterator
+from functools import cache
 from typing import Any, Final
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader
@@ -14,7 +15,7 @@ from starlette.responses import HTMLResponse, Response, StreamingResponse
 
 from flasher import __version__
 from flasher.report.base import environment
-from flasher.translation import NAMES, Translator, chosen
+from flasher.translation import NAMES, Translator, chosen, translator
 
 _PART: Final = "part_"
 
@@ -31,6 +32,17 @@ def streamed(messages: AsyncIterator[dict[str, Any]]) -> Response:
     return StreamingResponse(lines(), media_type="text/event-stream", headers=headers)
 
 
+@cache
+def _environment(language: str) -> Environment:
+    folders = [
+        ("flasher.web", "templates"),
+        ("flasher.web", "static"),
+        ("flasher.report", "templates"),
+    ]
+    loader = ChoiceLoader([PackageLoader(*each) for each in folders])
+    return environment(loader, translator(language))
+
+
 class Pages:
     """Renders pages. `language`: the default; None: the browser's. With `remembers_language` a
     chosen language applies to later pages of the session.
@@ -39,15 +51,6 @@ class Pages:
     def __init__(self, language: str | None = None, *, remembers_language: bool = False) -> None:
         self._language = language
         self._remembers_language = remembers_language
-        self._environment: Environment = environment(
-            ChoiceLoader(
-                [
-                    PackageLoader("flasher.web"),
-                    PackageLoader("flasher.web", "static"),
-                    PackageLoader("flasher.report"),
-                ]
-            )
-        )
 
     def translator_of(self, request: Request) -> Translator:
         accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
@@ -58,9 +61,7 @@ class Pages:
 
     def parts(self, translate: Translator, template: str, **context: Any) -> dict[str, str]:
         """Output of each macro `part_...` of a template, by name."""
-        found = self._environment.get_template(template).make_module(
-            {"_": translate, "lang": translate.code, **context}
-        )
+        found = _environment(translate.code).get_template(template).make_module(context)
         return {
             name.removeprefix(_PART): str(macro())
             for name, macro in vars(found).items()
@@ -78,12 +79,14 @@ class Pages:
         )
 
     def text(self, template: str, translate: Translator, token: str, **context: Any) -> str:
-        """Render a page. Templates have `_` (translation), `token`, `languages` and `version`."""
-        return self._environment.get_template(template).render(
-            _=translate,
-            lang=translate.code,
-            languages=NAMES,
-            token=token,
-            version=__version__,
-            **context,
+        """Render a page. Templates have `token`, `languages` and `version`."""
+        return (
+            _environment(translate.code)
+            .get_template(template)
+            .render(
+                languages=NAMES,
+                token=token,
+                version=__version__,
+                **context,
+            )
         )

@@ -184,7 +184,12 @@ class Supervisor:
         found = self._story(details)
         if not isinstance(found, Story):
             raise NotFoundError(f"There is no story of run {question.run}.", cause=found)
-        return self._page(question, "explain.html", path="/units", **story_context(found))
+        return self._page(
+            question,
+            "explain.html",
+            path="/units",
+            **story_context(found, translator(question.language)),
+        )
 
     def _story(self, details: RunDetails) -> Story | str:
         for file in details.attachments:
@@ -224,7 +229,9 @@ class Supervisor:
             shown=shown,
             story=story if isinstance(story, Story) else None,
             no_story=story if isinstance(story, str) else "",
-            drawn=None if isinstance(story, str) else story_context(story),
+            drawn=None
+            if isinstance(story, str)
+            else story_context(story, translator(question.language)),
             story_status=status_of(story.verdict.cause) if isinstance(story, Story) else None,
             has_trace=lambda details: any(map(_is_trace, details.attachments)),
             limits_of=limits_of,
@@ -242,7 +249,8 @@ class Supervisor:
         """The certificate as a file for later verification."""
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
-        made = render_certificate(life, datetime.now(UTC), proven(self.store, life))
+        proof = proven(self.store, life)
+        made = render_certificate(life, datetime.now(UTC), proof, language=question.language)
         name = re.sub(r"[^\w.-]", "_", life.serial, flags=re.ASCII)
         return Answer(made.encode("utf-8"), file_name=f"{name}.html")
 

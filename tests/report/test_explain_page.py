@@ -109,7 +109,7 @@ def test_a_trace_without_an_upgrade_says_so_and_shows_who_talked() -> None:
 def test_an_empty_trace_is_a_page_too() -> None:
     page = Page(render(EVERY_KIND["empty"]))
     assert "There is no frame in this trace." in page.text
-    assert "Nobody spoke." in page.text
+    assert "There is no sender." in page.text
     assert page.drawings == []
 
 
