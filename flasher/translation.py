@@ -24,7 +24,7 @@ _COMMA: Final = str.maketrans(",.", ".,")
 _COMMA_LANGUAGES: Final = frozenset({"de"})
 """They write 1.234,5."""
 _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
-_LETTERS_MIN: Final = 4
+_MARKS_MIN: Final = 4
 """In an entry without its values: fewer would match anything."""
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
 _CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
@@ -110,10 +110,12 @@ class Translator(Formatter):
         return said if said != sentence else ""
 
     def _stopped(self, sentence: str) -> str:
-        """Translate a sentence that the catalogue has without its full stop; "" otherwise."""
-        bare = sentence.removesuffix(".")
-        said = self._plain(bare) if bare != sentence else bare
-        return "" if said == bare else said + _STOPS.get(self.code, ".")
+        """Translate what the catalogue has without its full stop, or with one; "" otherwise."""
+        stop = _STOPS.get(self.code, ".")
+        if not sentence.endswith("."):
+            return self._matched(f"{sentence}.", _ANY).removesuffix(stop)
+        said = self._plain(sentence[:-1])
+        return "" if said == sentence[:-1] else f"{said}{stop}"
 
     # -- filling in values ------------------------------------------------------------------------
 
@@ -135,15 +137,15 @@ class Translator(Formatter):
 
 def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:
     for template in getattr(catalogue, "_catalog", ()):
-        pattern, landmark, letters, names = "", "", 0, set[str]()
+        pattern, landmark, marks, names = "", "", 0, set[str]()
         for literal, name, _, _ in Formatter().parse(template):
             pattern += re.escape(literal)
             landmark = max(landmark, literal, key=len)
-            letters += sum(map(str.isalpha, literal))
+            marks += len(literal) - literal.count(" ")
             if name is not None:
                 pattern += f"(?P={name})" if name in names else f"(?P<{name}>.*?)"
                 names.add(name)
-        if names and letters >= _LETTERS_MIN:
+        if names and marks >= _MARKS_MIN:
             yield _Entry(template, re.compile(pattern, re.DOTALL), landmark)
 
 

@@ -82,7 +82,11 @@ def _check(pages: Mapping[str, str], *, shows: str) -> None:
     english = _texts(pages["en"]) - _NAMES
     assert any(shows in text for text in english), (shows, english)
     for language in FOREIGN:
-        left = {text for text in _texts(pages[language]) - _NAMES if _ENGLISH.search(_COMMAND.sub("", text))}
+        left = {
+            text
+            for text in _texts(pages[language]) - _NAMES
+            if _ENGLISH.search(_COMMAND.sub("", text))
+        }
         if language == "de":  # its words are of the same letters
             left &= english
         assert left == set(), language
