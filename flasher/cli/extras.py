@@ -11,8 +11,8 @@ from flasher.errors import ErrorCode, UsageError
 
 _PACKAGES: Final = {
     "mf4": ("asammdf",),
-    "station": ("alembic", "argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
-    "web": ("babel", "itsdangerous", "pygal", "starlette", "uvicorn"),
+    "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),
+    "web": ("itsdangerous", "pygal", "starlette", "uvicorn"),
 }
 """By extra."""
 

@@ -53,9 +53,10 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made.store.close()
 
 
-def page(bench: Bench, serial: str = SERIAL) -> str:
+def page(bench: Bench, serial: str = SERIAL, language: str = "en") -> str:
     life = bench.store.read.unit(serial)
-    return render_certificate(life, bench.clock.utc(), proven(bench.store, life))
+    proof = proven(bench.store, life)
+    return render_certificate(life, bench.clock.utc(), proof, language=language)
 
 
 def checked(bench: Bench, text: str) -> CheckedCertificate:
@@ -90,6 +91,18 @@ def test_a_certificate_as_it_was_written_is_proven(plant: Bench, serial: str) ->
     assert found.remarks == ()
     assert (found.serial, found.state, found.station) == (serial, RunState.PASS, "line-2")
     assert found.fingerprint == checked(plant, page(plant)).fingerprint
+
+
+@pytest.mark.parametrize(("language", "measured"), [("de", "36,25 V"), ("zh", "36.25 V")])
+def test_a_certificate_in_another_language_is_checked(
+    plant: Bench, language: str, measured: str
+) -> None:
+    text = page(plant, "W2605003", language)
+    assert measured in text
+    assert "Written to the unit" not in text
+    assert checked(plant, text).problems == ()
+    assert is_refused(plant, text.replace(measured, "36.9 V"))
+    assert is_refused(plant, text.replace(f'lang="{language}"', 'lang="en"'))
 
 
 def test_its_signed_lines_alone_are_enough(plant: Bench) -> None:
