@@ -104,6 +104,13 @@ WRONG_UNIT: Final = _error(
     text("the unit's own serial number is not the one on the label"),
     text("Compare label and unit: scan the label of the unit that is in the socket."),
 )
+NO_CARD: Final = _error(
+    "NO_CARD",
+    text(
+        "the unit cannot identify itself, and its label was scanned without the card of its socket"
+    ),
+    text("Scan the card of the socket that the unit is in, then the label again."),
+)
 UNIT_CHANGED: Final = _error(
     "UNIT_CHANGED",
     text("the unit in the socket may be another one than at the beginning of the run"),

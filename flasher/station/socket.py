@@ -290,6 +290,11 @@ class Socket:
         return self.is_there and self.is_own_known and self.own != label
 
     @property
+    def has_card(self) -> bool:
+        """True when its label was scanned with its card, or its unit is virtual."""
+        return self.binding is Binding.SAID or self.is_virtual
+
+    @property
     def is_unidentified(self) -> bool:
         """True when its label was scanned without its card, and the unit does not identify itself:
         it does not answer, or is in its bootloader.

@@ -430,8 +430,8 @@ class Station:
             return self._not_saved(socket, order.serial, None, error)
         claim = with_history(claim, life, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
-        number = self.line.sockets[socket].presence_number
-        claim = replace(claim, trace=trace, presence=number)
+        at = self.line.sockets[socket]
+        claim = replace(claim, trace=trace, presence=at.presence_number, has_card=at.has_card)
         self._runs[socket] = ActiveRun(claim, self._now)
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 

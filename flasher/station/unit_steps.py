@@ -164,6 +164,9 @@ class UnitSteps:
                 raise StepFailedError(
                     codes.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
                 )
+            must_answer = target.version_request is not None and not self._claim.has_card
+            if must_answer and found.seen.version is None:
+                raise StepFailedError(codes.NO_CARD, f"The {target.name} does not answer.")
             target.continuity.begin(found.seen.version)
             target.check_cancelled()
             measured += identity_measurements(target, found)

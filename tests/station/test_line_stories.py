@@ -306,6 +306,11 @@ STORIES = {
         " @5.1 put unit=1 socket=A ; @6.0 pull unit=1 ; @6.5 put unit=2 socket=A ;"
         " @7.0 label by=jo unit=2"
     ),
+    "silent in a transfer that was aborted, and its label alone": (
+        "line sockets=1 recipe=held ; unit label=3 pace=slow ; person name=jo ; person name=al ;"
+        " @1.0 put unit=3 socket=A ; @2.0 label by=jo unit=3 ; @3.5 abort by=al socket=A ;"
+        " @4.0 label by=al unit=3"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

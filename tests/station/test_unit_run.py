@@ -400,6 +400,20 @@ def test_a_silent_unit_is_reached_by_its_power(tmp_path: Path) -> None:
     assert bench.step(StepName.RESTART).text == "by power"
 
 
+@pytest.mark.parametrize("has_card", [False, True])
+def test_a_silent_unit_without_application_is_flashed_only_with_the_card_of_its_socket(
+    tmp_path: Path, has_card: bool
+) -> None:
+    bench = UnitBench(tmp_path)
+    bench.power = SwitchedPower(bench)
+    device = MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False)
+    device.power_cut(0.0)
+    bench.put(device)
+    result = bench.run(has_card=has_card)
+    assert result.code == ("OK" if has_card else "NO_CARD"), result.text
+    assert (device.operations_done > 0) == has_card
+
+
 # -- codes ----------------------------------------------------------------------------------------
 
 

@@ -123,6 +123,7 @@ class UnitBench:
         known_before: Mapping[str, str] | None = None,
         flashed_before: frozenset[str] = frozenset(),
         written_before: Mapping[str, str] | None = None,
+        has_card: bool = True,
     ) -> RunResult:
         claim = Claim(
             RunId(1),
@@ -133,6 +134,7 @@ class UnitBench:
             known_before or {},
             flashed_before,
             written_before or {},
+            has_card=has_card,
         )
         self.unit_run = UnitRun(
             claim,

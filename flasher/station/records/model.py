@@ -192,6 +192,9 @@ class Claim:
     """`PresenceChanged.number` of the unit that the label was assigned to: the run ends when
     another unit is in the socket.
     """
+    has_card: bool = True
+    """The card of the socket was scanned with the label, or the unit is virtual: one that cannot
+    identify itself may be flashed."""
 
 
 @dataclass(frozen=True)
