@@ -37,7 +37,7 @@ from tests.campaigns.station_operator import Fault, Station, misbound
 GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
 _IMAGE_BYTES: Final = 80 * 128
 _PACKET_S: Final = 0.05
-"""A unit takes so long for a packet: what is to happen in a flash has to find its share of it."""
+"""A unit takes so long for each message: in a flash a share of it has to be met."""
 _ANSWER_S: Final = 20.0
 _LIMIT_S: Final = 90.0
 _QUIET_S: Final = 2.5
@@ -408,7 +408,7 @@ class _Trial:
             case Scenario.ARRIVAL:
                 self._pair(0)
                 line._put(self.labels[0], self.sockets[0])
-                line._pump(plan.delay_s)
+                line._pump(_PACKET_S + plan.delay_s)  # it has announced itself by then
                 line._pull(self.labels[0])
                 line._pump(plan.gap_s)
                 line._put(self.labels[1], self.sockets[0])
