@@ -19,7 +19,7 @@ from tests.campaigns.line_world.world import HAND_S, Bay, World, label_of, last_
 
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
-_RECIPES: Final = {"writes": 10, "plain": 3, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
+_RECIPES: Final = {"writes": 10, "plain": 5, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
 _GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -86,12 +86,14 @@ class Teller:
     def _opening(self) -> Iterator[Step]:
         """What takes several things at once, while nobody else is at the line."""
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
-        if people and self.chance.random() < 0.75:
-            scenes = [self._scan_at_once, self._lose_station, *2 * [self._be_interrupted]]
+        if people and self.chance.random() < 0.9:
+            scenes = [self._scan_at_once, self._lose_station]
+            scenes += 2 * [self._be_interrupted, self._go_on_in_an_outage]
             if any(each.number == "other" for each in self.world.setup.units):
                 scenes += 3 * [self._scan_another_number]
-            yield from self.chance.choice(scenes)(self.chance.choice(people))
-            yield 3.0, None
+            for scene in self.chance.sample(scenes, 2):
+                yield from scene(self.chance.choice(people))
+                yield 3.0, None
 
     # -- what is there ----------------------------------------------------------------------------
 
@@ -327,6 +329,22 @@ class Teller:
             yield self.chance.uniform(0.2, 1.5), stories.KillStation(seconds=1.0)
             yield 5.0, None
 
+    def _go_on_in_an_outage(self, name: str) -> Iterator[Step]:
+        """A socket stops to work after a PASS, and somebody goes on with the next unit there."""
+        for bay in (yield from self._bring(2)):
+            unit = self._number(bay)
+            yield self._pause(), stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
+            yield 0.5, None
+            give_up_at = self.world.now + 15.0
+            while bay.run and self.world.now < give_up_at:
+                yield 0.5, None
+            if label_of(unit) in self.world.passed:
+                yield self._pause(), None
+                yield from self._outage(bay.name)
+                yield 12.0, None  # nobody scans the next unit at once
+                return
+
     def _scan_another_number(self, name: str) -> Iterator[Step]:
         """Scan a unit that reports another number than its label."""
         odd = [e.label for e in self.world.setup.units if e.number == "other"]
@@ -435,12 +453,18 @@ class Teller:
                 yield wait, stories.KillStation(seconds=1.0 + seconds)
 
     def _outage(self, socket: str) -> Iterator[Step]:
-        """A process that dies again and again, and a unit that is exchanged meanwhile."""
+        """An adapter that is away, or a process that dies again and again, and a unit that is
+        exchanged meanwhile.
+        """
         bays = self.world.bays
         green = [e for e in bays.values() if e.shown and e.shown.state is SocketState.PASS]
         bay = self.chance.choice(green or [bays[socket]])
-        yield 0.0, stories.KillWorker(socket=bay.name)
-        yield 1.3, stories.KillWorker(socket=bay.name)
-        yield 2.3, stories.KillWorker(socket=bay.name)
+        if self.chance.random() < 0.5:
+            yield 0.0, stories.Unplug(socket=bay.name, seconds=8.0)
+            yield self.chance.uniform(0.0, 4.0), None
+        else:
+            yield 0.0, stories.KillWorker(socket=bay.name)
+            yield 1.3, stories.KillWorker(socket=bay.name)
+            yield 2.3, stories.KillWorker(socket=bay.name)
         if bay.unit is not None:
             yield from self._put_another(bay)
