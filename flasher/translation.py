@@ -26,6 +26,9 @@ _COMMA_LANGUAGES: Final = frozenset({"de"})
 _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
 _MARKS_MIN: Final = 4
 """In an entry without its values: fewer would match anything."""
+_QUANTITY: Final = re.compile(r"-?[\d,]+(?:\.\d+)? [A-Za-z%\N{MICRO SIGN}]{1,4}")
+_LEADING: Final = re.compile(r"(?<![^.!? \N{IDEOGRAPHIC FULL STOP}])\{\w+\} ?")
+_BETWEEN: Final = re.compile(r"(?<=[.!?]) (?=\S)|(?<=\N{IDEOGRAPHIC FULL STOP})(?=\S)")
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
 _CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
 _BRACKETS: Final = re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL)
@@ -58,6 +61,8 @@ class Translator(Formatter):
         self.code = code
         self._gettext = catalogue.gettext
         self._entries = sorted(_entries(catalogue), key=lambda entry: -len(entry.landmark))
+        self._stop = _STOPS.get(code, ".")
+        self._sentences = dict(_sentences(catalogue))
         self._plain = lru_cache(4096)(self._translate_plain)
 
     def __call__(self, sentence: str, **values: object) -> str:
@@ -77,25 +82,43 @@ class Translator(Formatter):
         return _NUMBER.sub(lambda number: number[0].translate(_COMMA), text)
 
     def _translate_plain(self, sentence: str) -> str:
-        said = self._gettext(sentence) if sentence else ""
-        if said != sentence or " " not in sentence or not self._entries:
-            return said
+        said = self._known(sentence)
+        if said or " " not in sentence or not self._entries:
+            return said or sentence
+        if _QUANTITY.fullmatch(sentence):
+            return self.numbers(sentence)
         return (
-            self._matched(sentence, _WHOLE)
+            self._labelled(sentence)
+            or self._matched(sentence, _WHOLE)
             or self._split(sentence, _SENTENCES)
             or self._split(sentence, _CLAUSES)
             or self._matched(sentence, _ANY)
-            or self._stopped(sentence)
+            or self._matched(f"{sentence}.", _ANY).removesuffix(self._stop)
             or self._split(sentence, _BRACKETS)
             or self._split(sentence, _COLON)
+            or self._without_stop(sentence)
             or sentence
         )
+
+    def _known(self, sentence: str) -> str:
+        """Translate a whole entry, with or without its full stop; "" if it is none."""
+        if sentence in self._sentences:
+            return self._sentences[sentence]
+        bare = sentence.removesuffix(".")
+        return f"{self._sentences[bare]}{self._stop}" if bare in self._sentences else ""
+
+    def _labelled(self, sentence: str) -> str:
+        """Translate after a known word and a colon; "" without one."""
+        label, colon, rest = sentence.partition(": ")
+        said = self._sentences.get(label, "")
+        return f"{said}{colon}{self._plain(rest)}" if rest and said else ""
 
     def _matched(self, sentence: str, values: re.Pattern[str]) -> str:
         """Translate by the entry that matches with such values; "" without one."""
         for entry in self._entries:
             found = entry.pattern.fullmatch(sentence) if entry.landmark in sentence else None
-            if found is not None and all(map(values.fullmatch, found.groups())):
+            is_odd = values is _WHOLE and sentence[-1:] == "." != entry.template[-1:]
+            if found is not None and not is_odd and all(map(values.fullmatch, found.groups())):
                 shown = {name: _Shown(text) for name, text in found.groupdict().items()}
                 return self.vformat(self._gettext(entry.template), (), shown)
         return ""
@@ -109,13 +132,11 @@ class Translator(Formatter):
         said = "".join([self._plain(first), between, self._plain(second), end])
         return said if said != sentence else ""
 
-    def _stopped(self, sentence: str) -> str:
-        """Translate what the catalogue has without its full stop, or with one; "" otherwise."""
-        stop = _STOPS.get(self.code, ".")
-        if not sentence.endswith("."):
-            return self._matched(f"{sentence}.", _ANY).removesuffix(stop)
-        said = self._plain(sentence[:-1])
-        return "" if said == sentence[:-1] else f"{said}{stop}"
+    def _without_stop(self, sentence: str) -> str:
+        """Translate what the catalogue has without its full stop; "" otherwise."""
+        bare = sentence.removesuffix(".")
+        said = self._plain(bare) if bare != sentence else bare
+        return "" if said == bare else f"{said}{self._stop}"
 
     # -- filling in values ------------------------------------------------------------------------
 
@@ -133,6 +154,16 @@ class Translator(Formatter):
 
     def convert_field(self, value: Any, conversion: Any) -> Any:
         return value if isinstance(value, _Shown) else super().convert_field(value, conversion)
+
+
+def _sentences(catalogue: gettext.NullTranslations) -> Iterator[tuple[str, str]]:
+    """Each sentence of an entry with several; then the entries, which count more."""
+    entries = {key: said for key, said in getattr(catalogue, "_catalog", {}).items() if key}
+    for entry, said in entries.items():
+        english, other = (_BETWEEN.split(_LEADING.sub("", each)) for each in (entry, said))
+        if len(english) == len(other) > 1:
+            yield from (pair for pair in zip(english, other, strict=True) if "{" not in pair[0])
+    yield from entries.items()
 
 
 def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:

@@ -19,6 +19,7 @@ from babel.messages.extract import extract_from_dir
 from babel.messages.pofile import read_po, write_po
 
 from flasher.events import Phase
+from flasher.host.identity import IdentityCheck
 from flasher.host.items import meaningful_fields
 from flasher.host.outcome import (
     _EXPLANATIONS,
@@ -31,6 +32,7 @@ from flasher.host.outcome import (
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.contents import BatteryFault
 from flasher.protocol.fields import flag_names, label
+from flasher.protocol.messages import BootVersion, Packet, UpdateCommand
 from flasher.report.chart import MarkKind
 from flasher.station.records.errors import NOT_SAVED
 from flasher.station.records.model import RunKind, StepName, StepState, Verified
@@ -71,10 +73,23 @@ def sentences() -> Iterator[str]:
     yield from (each.value for kind in (RunKind, StepName, StepState, MarkKind) for each in kind)
     yield from (each.short for each in MarkKind)
     yield from (each.words for each in Verified)
-    yield from ("flash {target}", "once", "twice", NOT_SAVED, "[Errno {number}] {error}")
+    yield from (
+        "flash {target}",
+        "once",
+        "twice",
+        "Then",
+        "Here the tool ended",
+        "silence",
+        "reason",
+        "data",
+        "not answered",
+    )
+    yield from (NOT_SAVED, "[Errno {number}] {error}")
     yield from map(os.strerror, _SYSTEM)
-    for word in ("model", "serial number", "hardware version", "firmware version"):
-        yield f"{{target}} {word}"
+    named = ("model", "serial number", "hardware version", "firmware version")
+    yield from (f"{{target}} {word}" for word in (*named, *(each.value for each in IdentityCheck)))
+    layouts = (BootVersion.LAYOUT, Packet.LAYOUT, UpdateCommand.LAYOUT)
+    yield from (label(*each) for layout in layouts for each in layout)
     explained = [
         *_EXPLANATIONS.values(),
         _NO_SESSION_EITHER,

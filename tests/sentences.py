@@ -29,8 +29,10 @@ _NOT_SHOWN: Final = (
     "typeerror", "runtimeerror", "assertionerror", "keyerror",
 )  # fmt: skip
 """Calls with strings that are in the catalogue already, or that no page shows."""
-_SENTENCE: Final = re.compile(r"[A-Za-z]{2,}.* .*[a-z]{2,}|^[A-Za-z]{3,}:? \{|\}:? [a-z]{3,}")
-_CODE: Final = re.compile(r"SELECT |<|\.\w+ |text/|chmod |cp ")
+_SENTENCE: Final = re.compile(
+    r"[A-Za-z]{2,}.* .*[a-z]{2,}|^[A-Za-z]{3,}:? \{|\}[:,;]? [A-Za-z]{3,}"
+)
+_CODE: Final = re.compile(r"SELECT |<|\.\w+ |text/|chmod |cp |\{\w+:%")
 
 
 def spoken() -> Iterator[str]:

@@ -241,7 +241,7 @@ def _drawn(
 ) -> dict[str, list[sequence.Part]]:
     """The diagram of these steps for each width."""
     participants = _participants(lines, target)
-    items = sequence.thinned([_item(line, participants) for line in lines], most)
+    items = sequence.thinned([_item(line, participants, translate) for line in lines], most)
     return {
         name: sequence.diagram(items, participants, width, translate)
         for name, width in chart.WIDTHS.items()
@@ -266,14 +266,16 @@ def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
     return [*first, *others]
 
 
-def _item(line: StoryLine, participants: Sequence[str]) -> sequence.DiagramItem:
+def _item(
+    line: StoryLine, participants: Sequence[str], translate: Translator
+) -> sequence.DiagramItem:
     if isinstance(line, PacketRun):
         some = f"packet {line.first}" if line.count == 1 else f"packets {line.first} to {line.last}"
         return sequence.DiagramItem(
             sequence.ItemKind.BLOCK,
             line.begin_s,
             f"{some} acknowledged",
-            f"in {duration_text(line.end_s - line.begin_s)}",
+            translate.numbers(translate(f"in {duration_text(line.end_s - line.begin_s)}")),
             end_s=line.end_s,
         )
     if not line.sender or line.kind not in (StepKind.MESSAGE, StepKind.DAMAGED):
@@ -289,11 +291,21 @@ def _item(line: StoryLine, participants: Sequence[str]) -> sequence.DiagramItem:
         sequence.ItemKind.ARROW,
         line.at_s,
         line.title,
-        line.text,
+        ", ".join(_field(part, translate) for part in line.text.split(", ")),
         _place(line.sender, participants),
         line.receiver if line.receiver == _BROADCAST else _place(line.receiver, participants),
         line.is_trouble,
     )
+
+
+def _field(text: str, translate: Translator) -> str:
+    """Translate the label of a field: "size 219 B"."""
+    words = text.split(" ")
+    for count in range(len(words), 0, -1):
+        label = " ".join(words[:count])
+        if (said := translate(label)) != label:
+            return " ".join([said, translate(" ".join(words[count:]))]).rstrip()
+    return text
 
 
 def _place(name: str, participants: Sequence[str]) -> str:

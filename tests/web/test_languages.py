@@ -15,6 +15,7 @@ import pytest
 from sqlalchemy import event
 
 from flasher.bus.opening import open_bus
+from flasher.cli.upgrade.bench_page import backup_folder
 from flasher.protocol.spec import BMS
 from flasher.station.board import Board
 from flasher.station.health import HealthWatch
@@ -23,12 +24,14 @@ from flasher.station.messages import Write
 from flasher.station.shift_counts import ShiftCounts
 from flasher.station.socket import Source
 from flasher.translation import NAMES, translator
+from flasher.web.archive import Archive
 from flasher.web.bench import Bench as BikeBench
 from flasher.web.bench_page import BenchPage
 from flasher.web.bench_state import BenchState
 from flasher.web.operator import CurrentLot, Screen
 from flasher.web.operator import _messages as messages
 from flasher.web.pages import Pages
+from flasher.web.query_processes import Question
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.loops import each
@@ -142,6 +145,13 @@ def test_an_upgrade_that_fails(place: BenchPlace, fault: BikeFault) -> None:
     state = place.do(order(BikeBench.upgrade, BMS.name, state.offer.sha256))
     assert state.done is not None
     _check(_bench_pages(place, state), shows="State of the device")
+    assert state.done.bundle is not None
+    archive = Archive(state.done.bundle.parent, backup_folder(), place.shelf.traces)
+    for path, shows in (("/kept/story", "How to read this page"), ("/kept", "Bundles")):
+        fields = {"bundle": state.done.bundle.name}
+        asked = {each: Question(path, fields, language=each) for each in NAMES}
+        pages = {each: archive.answer(asked[each]).body.decode() for each in NAMES}
+        _check(pages, shows=shows)
 
 
 # -- the line --------------------------------------------------------------------------------------

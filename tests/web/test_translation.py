@@ -67,6 +67,7 @@ def test_a_sentence_passes_from_process_to_process() -> None:
 
 def test_what_no_catalogue_knows_stays_as_it_is() -> None:
     assert translator("zh")("relay 3: no such file") == "relay 3: no such file"
+    assert [translator("zh")(each) for each in ("", ".", " ")] == ["", ".", " "]
 
 
 def test_plain_english_is_translated_by_the_sentence_that_it_matches() -> None:
