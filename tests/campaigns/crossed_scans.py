@@ -153,6 +153,8 @@ class Line:
     _plans: dict[str, Plan] = field(default_factory=dict)
     _pulled_in: dict[str, str] = field(default_factory=dict)
     """The state of each unit when it was pulled out first."""
+    _unheard: set[Plan] = field(default_factory=set)
+    """Trials whose unit was pulled in a moment in which nobody can detect that."""
     _count: int = 0
 
     def __post_init__(self) -> None:
@@ -261,7 +263,11 @@ class Line:
         self.units.put(label, self.ports[int(socket) - 1], self._own[label])
 
     def _pull(self, label: str) -> None:
-        self._pulled_in.setdefault(label, self.units.out(label)["state"])
+        seen = self.units.out(label)
+        if label not in self._pulled_in:
+            self._pulled_in[label] = seen["state"]
+            if seen["is_unheard"]:
+                self._unheard.add(self._plans[label])
         for sat in itertools.chain.from_iterable(self._sat.values()):
             if sat.label == label:
                 sat.until = min(sat.until, time.perf_counter())
@@ -310,6 +316,9 @@ class Line:
         self._end(people)
         self.problems[known:] = [f"{each} ({plan.title})" for each in self.problems[known:]]
         said = "; ".join(f"{at} {self._ending(label)}" for at, label in enumerate(labels, 1))
+        if plan in self._unheard:
+            del self.problems[known:]
+            said += " (undetectable)"
         for label in labels:
             self._pull(label)
         self._clear(sockets)
@@ -353,6 +362,8 @@ class Line:
             has_passed = any(r["serial"] == label and r["state"] == "pass" for r in runs)
             if has_passed and found["serial"] != label:
                 said.append(f"{Fault.UNTRUE.value}: {label} in the records: {found['serial']!r}")
+            if self._plans[label] in self._unheard:
+                continue
             others = [each for each, plan in self._plans.items() if plan is self._plans[label]]
             pulled = ", ".join(self._pulled_in.get(each, "no state") for each in others)
             title = f"{self._plans[label].title}, pulled in {pulled}"
@@ -408,7 +419,7 @@ class _Trial:
             case Scenario.ARRIVAL:
                 self._pair(0)
                 line._put(self.labels[0], self.sockets[0])
-                line._pump(_PACKET_S + plan.delay_s)  # it has announced itself by then
+                line._pump(plan.delay_s)
                 line._pull(self.labels[0])
                 line._pump(plan.gap_s)
                 line._put(self.labels[1], self.sockets[0])

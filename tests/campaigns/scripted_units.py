@@ -100,6 +100,23 @@ class Unit(ScriptedDevice):
         if self.state in ("erasing", "transfer") and left_s <= 0.0:
             self.power_on(now)
 
+    def power_on(self, now: float) -> None:
+        self.note("power", now)
+        super().power_on(now)
+
+    @property
+    def is_unheard(self) -> bool:
+        """It has sent nothing since it got power, or since it confirmed a reset: the announcement
+        of another unit cannot be told from its own then.
+        """
+        said: list[str] = []
+        for entry in reversed(self.log):
+            if entry.what in ("power", "reset"):
+                wanted = ["feedback"] if entry.what == "reset" else []
+                return said == wanted and not self._sent_frames
+            said += [entry.what] if entry.kind == "said" else []
+        return False
+
     def power_off(self) -> None:
         """What it was saying breaks off."""
         self.clear_alarms()
@@ -108,7 +125,13 @@ class Unit(ScriptedDevice):
     def look(self) -> dict[str, Any]:
         """What is in it, and what was done to it, whoever asks."""
         image = self.image.hex() if self.completed else ""
-        return {"serial": self.serial, "image": image, "state": self.state, "done": self._done}
+        return {
+            "serial": self.serial,
+            "image": image,
+            "state": self.state,
+            "done": self._done,
+            "is_unheard": self.is_unheard,
+        }
 
 
 class _Bench:
@@ -165,8 +188,10 @@ class _Bench:
                 unit.power_on(now)
             case {"out": name}:
                 unit = self._units[name]
+                seen = unit.look()
                 unit.power_off()
                 self._inside = {at: each for at, each in self._inside.items() if each is not unit}
+                return seen
             case {"look": name}:
                 unit = self._units[name]
             case _:
