@@ -4,12 +4,23 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from typing import Any
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from flasher.station.board import Board
+from flasher.station.events import StationEvent, StationStarted
+from flasher.station.health import HealthWatch
+from flasher.station.shift_counts import ShiftCounts
 from flasher.web import feed as module
-from flasher.web.feed import Batch, Feed
+from flasher.web.feed import Batch, Feed, _Follower
+from flasher.web.operator import Screen
 from tests.web.own_loop import in_own_loop
 
 
@@ -131,3 +142,41 @@ def test_a_closed_feed_ends_its_streams_after_the_last_state() -> None:
         return seen
 
     assert in_own_loop(follow()) == [1, 2]
+
+
+# -- any course of a station ----------------------------------------------------------------------
+
+
+STARTED = StationStarted("line-2", "BAT-36", "4", "BAT-36", ("A", "B"), ())
+
+
+def at_the_line(event: Any) -> StationEvent:
+    """The event, now and at a socket of this station."""
+    changes = {"socket": "AB"[len(event.socket) % 2]} if hasattr(event, "socket") else {}
+    return replace(event, at=datetime.now(UTC).isoformat(), **changes)  # type: ignore[no-any-return]
+
+
+KINDS = [each for each in get_args(StationEvent) if each is not StationStarted]
+EVENTS = st.lists(st.one_of(*map(st.from_type, KINDS)).map(at_the_line), max_size=12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(EVENTS, st.sets(st.integers(0, 12)))
+def test_a_page_that_was_open_shows_what_one_shows_that_is_opened_later(
+    events: list[StationEvent], looks: set[int]
+) -> None:
+    """It receives changes; the other one receives all states."""
+    watch = HealthWatch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0)
+    screen, board = Screen(ShiftCounts(), watch), Board()
+    screen.feed = Feed(Clock(), silence_limit_s=1.0)
+    shown: dict[str, Any] = {}
+    with closing(asyncio.new_event_loop()) as loop:
+        page, late_page = _Follower(loop), _Follower(loop)
+        screen.feed._followers.add(page)
+        for number, event in enumerate([STARTED, *events]):
+            board.apply(event)
+            screen.show(event, board)
+            if number in looks or number == len(events):
+                batch = screen.feed._take(page)
+                shown = dict(batch.changes) if batch.is_all else shown | dict(batch.changes)
+        assert shown == dict(screen.feed._take(late_page).changes)
