@@ -275,7 +275,7 @@ def mock_options(
         option("--mock", is_flag=True, panel="without hardware", brief=True, help=what),
         option(
             "--mock-speed", type=speed, default=1.0, metavar="X", panel="without hardware",
-            help="times as fast as a real bus; 0 takes no time",
+            help="speed relative to a real bus; 0: no delays",
         ),
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
-"""The certificate of a unit: one HTML page to print on one A4 sheet, and an annex, made of the
-records and nothing else.
+"""The certificate of a unit: an HTML page that prints on one A4 sheet, with an annex. It is made
+from the records alone.
 
-A unit that did not pass gets a page as well, and the page says so in its first line.
+A unit that did not pass gets a certificate too, whose first line states that.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ from flasher.station.records.store import Store
 from flasher.station.sealed import LEFT_OUT, Sealed, as_text, plain
 
 EARLIER_SHOWN: Final = 50
-"""Earlier runs in the table; the page says how many more there are."""
+"""Earlier runs in the table; the page gives the number of the others."""
 _WRITES_ON_SHEET: Final = 4
-"""With more of them, or longer ones, all stand in the annex in full."""
+"""With more or longer ones, the annex lists all in full."""
 _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
 _ROW: Final = ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
 UNIT_WORDS: Final = {
     UnitState.PASS: (Status.GOOD, text("PASS"), text("This unit passed.")),
-    UnitState.FAIL: (Status.BAD, text("FAIL"), text("This unit did not pass: it is no good unit.")),
+    UnitState.FAIL: (Status.BAD, text("FAIL"), text("This unit did not pass.")),
     UnitState.RECHECK: (
         Status.WARNING,
         text("RECHECK"),
-        text("The last run of this unit did not come to a result. It has to be checked."),
+        text("The last run of this unit ended without a verdict. It has to be checked."),
     ),
     UnitState.RUNNING: (
         Status.NEUTRAL,
         text("RUNNING"),
-        text("This unit is being made: no result yet."),
+        text("A run of this unit is active: no verdict yet."),
     ),
-    UnitState.NEW: (Status.NEUTRAL, text("NEW"), text("Nothing was done to this unit.")),
+    UnitState.NEW: (Status.NEUTRAL, text("NEW"), text("This unit has no run.")),
 }
 RUN_WORDS: Final = {
     RunState.RUNNING: (text("RUNNING"), Status.NEUTRAL),
@@ -70,25 +70,25 @@ class Proof:
     """Evidence for the last run of a unit."""
 
     head: ChainHead | None = None
-    """The signed audit row; None while the run goes on."""
+    """The signed audit row; None while the run is active."""
     record_sha256: str = ""
-    """Over the run and all that belongs to it."""
+    """SHA-256 over the run with its steps, writes, targets and attachments."""
     is_kept: bool = False
-    """The head of its row is kept in another place than beside the key."""
+    """The head of its audit row is stored in another place than beside the key."""
     is_beside: bool = False
-    """It was compared with those beside the key."""
+    """The head of its audit row is stored beside the key."""
     examined_at: str = ""
-    """When all records up to its row were examined; empty where they were not since."""
+    """When all records up to its audit row were last examined; empty: never."""
     content: Mapping[str, Any] = field(default_factory=dict)
-    """The rows of the run, which the page carries."""
+    """The rows of the run, which the certificate contains."""
     row: Mapping[str, Any] = field(default_factory=dict)
     """The signed audit row."""
     seal: str = ""
-    """What a page carries that was made before; empty to make it."""
+    """Signed lines of an existing certificate; empty: make them."""
 
 
 def proven(store: Store, life: UnitLife) -> Proof:
-    """Evidence for the last run. Raises UnprovenError when its records were changed."""
+    """Examine the last run of a unit. Raises UnprovenError when its records were changed."""
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
         return Proof()
@@ -97,7 +97,7 @@ def proven(store: Store, life: UnitLife) -> Proof:
         raise UnprovenError(
             f"No certificate for {printable(life.serial)}: its records were changed.",
             cause=f"{found.problems[0].where}: {found.problems[0].what}",
-            remedy="Look at all of it with flasher station verify.",
+            remedy="List all problems with flasher station verify.",
         )
     head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
     content, row = store.read.content_of(last.run_id)
@@ -115,17 +115,18 @@ def proven(store: Store, life: UnitLife) -> Proof:
 def render_certificate(
     life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0, language: str = "en"
 ) -> str:
-    """The page. Raises UsageError for a unit without any run. `left_out`: how many earlier runs are
-    not in `life`.
+    """Render a certificate as HTML. `left_out`: number of earlier runs that are not in `life`.
+
+    Raises UsageError for a unit without runs.
     """
     return render_page("certificate.html", language, **sheet(life, made_at, proof, left_out))
 
 
 def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> dict[str, Any]:
-    """What the template of the page needs. Raises UsageError for a unit without any run."""
+    """Values for the template certificate.html. Raises UsageError for a unit without runs."""
     last = life.last
     if last is None:
-        raise UsageError(f"Nothing was done to {life.serial}: there is nothing to certify.")
+        raise UsageError(f"{life.serial} has no run: there is nothing to certify.")
     status, word, sentence = UNIT_WORDS[life.state]
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed
@@ -195,7 +196,7 @@ def _seal(life: UnitLife, made_at: datetime, proof: Proof) -> str:
 
 
 def _code(last: RunDetails, record_sha256: str, head: ChainHead) -> Markup:
-    """What a reader of the paper can compare with the records, as a QR code."""
+    """QR code with which a printed certificate can be compared with the records."""
     lines = code_lines(last, record_sha256, head)
     drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
     return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
@@ -218,7 +219,7 @@ def code_lines(last: RunDetails, record_sha256: str, head: ChainHead) -> tuple[s
 
 
 def limits_of(each: Measurement) -> str:
-    """What a measurement may be, in words."""
+    """Limits of a measurement in words."""
     if each.value is None:
         return each.expected if each.expected is not None else text("any")
     bounds = {
@@ -237,7 +238,7 @@ def limits_of(each: Measurement) -> str:
 
 
 def verdict_of(each: Measurement) -> str:
-    """Whether it is within its limits, where it has any."""
+    """Returns "within" or "outside"; "" for a measurement without limits."""
     if not each.is_within:
         return text("outside")
     has_limits = any(limit is not None for limit in (each.low, each.high, each.expected))
@@ -245,7 +246,7 @@ def verdict_of(each: Measurement) -> str:
 
 
 def number(value: float) -> str:
-    """To a thousandth: times are not measured closer."""
+    """Format a number with at most three decimals, the precision of measured times."""
     return f"{round(value, 3):,.10g}"
 
 

@@ -1,7 +1,7 @@
-"""Checks a certificate: signed by which station, unchanged, and of a run that is in these records.
+"""Checks whether a certificate is signed by a station, unchanged, and of a run in the records.
 
-It may be the HTML file as flasher wrote it, a PDF that a browser printed of it, the lines of its
-signed content, or the text of its QR code.
+A certificate is given as the HTML file that flasher wrote, a PDF that a browser printed of it, the
+lines of its signed content, or the text of its QR code.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _HIDDEN: Final = frozenset({"style", "script", "title", "svg"})
 
 
 def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
-    """Check the bytes of a file. Raises UsageError for one that is no certificate, UnprovenError
-    for one whose signed content cannot be read any more; RecordError.
+    """Check the bytes of a file. Raises UsageError for a file that is not a certificate,
+    UnprovenError for signed content that cannot be read, and RecordError.
     """
     is_pdf = data.startswith(_PDF)
     pages = list(_pages_of_pdf(data)) if is_pdf else []
@@ -67,7 +67,7 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
                 break
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
-            text("The certificate was changed: what it carries is no run."),
+            text("The certificate was changed: its signed content is not a run."),
             remedy=text("Request the certificate again."),
         ) from error
     if where:
@@ -75,8 +75,8 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
         if sealed.flasher != __version__:
             problems.append(
                 text(
-                    "it was made by flasher {other}, and this is {version}: that version tells"
-                    " whether the page was changed",
+                    "it was made by flasher {other}, and this is {version}: check the page with"
+                    " that version",
                     other=printable(sealed.flasher),
                     version=__version__,
                 )
@@ -103,11 +103,11 @@ def _shown_key(key: str) -> str:
         return "none"
 
 
-# -- in these records ------------------------------------------------------------------------------
+# -- comparison with the records -------------------------------------------------------------------
 
 
 def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...]]:
-    """What of it is not so in the records, and what came after it."""
+    """Compare a certificate with the records. Returns problems, and remarks on later runs."""
     run_id = RunId(sealed.row["run_id"])
     head = store.read.head_of(run_id)
     if head is None or (head.station, head.number, head.hash) != (
@@ -123,16 +123,14 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
         return problems, ()
     last = store.read.run(run_id)
     if sealed.life().last != last:
-        problems.append(text("it does not say what the records say of the run"))
+        problems.append(text("its run differs from the run in the records"))
     runs = [each.run for each in store.read.unit(last.run.serial, last.run.part).runs]
     before = [plain(run) for run in runs if run.run_id < run_id]
-    carried = [dict(each) for each in sealed.earlier]
-    if before[-EARLIER_SHOWN:] != carried or sealed.earlier_left_out != max(
+    stated = [dict(each) for each in sealed.earlier]
+    if before[-EARLIER_SHOWN:] != stated or sealed.earlier_left_out != max(
         0, len(before) - EARLIER_SHOWN
     ):
-        problems.append(
-            text("it does not say what the records say of the earlier runs of the unit")
-        )
+        problems.append(text("its earlier runs of the unit differ from those in the records"))
     later = [run for run in runs if run.run_id > run_id]
     remarks: tuple[str, ...] = tuple(
         text(
@@ -147,7 +145,7 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
 
 
 def _check_code(store: Store, code_text: str) -> CheckedCertificate:
-    """Check the text of a QR code: it says which run, and its hashes and signature."""
+    """Check the text of a QR code, which has the number of the run, its hashes and signature."""
     run_line = re.search(r"\nrun (\d{1,18}) ", code_text)
     try:
         run_id = RunId(int(run_line[1])) if run_line else RunId(0)
@@ -155,7 +153,7 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
     except NotFoundError as error:
         raise UnprovenError(
             text("The run of this code is not in these records."),
-            cause="the code is of other records, or was changed",
+            cause="the code belongs to other records, or was changed",
         ) from error
     problems: list[str] = []
     head = store.read.head_of(run_id)
@@ -163,15 +161,15 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
         problems.append(text("the run is not signed in these records"))
     else:
         expected = code_lines(details, store.read.record_sha256(run_id), head)
-        found = code_text.split("\n")
+        lines = code_text.split("\n")
         problems += [
             text(
-                "the code says '{said}', the records '{line}'",
-                said=printable(said),
+                "the code has '{code}', the records have '{line}'",
+                code=printable(code),
                 line=printable(line),
             )
-            for line, said in zip(expected, found, strict=True)
-            if line != said
+            for line, code in zip(expected, lines, strict=True)
+            if line != code
         ]
         if not is_signed(head.hash, head.signature, head.key):
             problems.append(text("the signature in the records is not that of the station's key"))
@@ -212,7 +210,7 @@ def _difference_of_page(page: str, data: bytes, prints: list[str]) -> str:
 
 
 class _Text(HTMLParser):
-    """The text of a page that a reader sees, and the heads of its tables."""
+    """Extracts the visible text of a page, and the heads of its tables."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -245,26 +243,26 @@ def _text_of(page: str) -> str:
 
 
 def _bare(text: str) -> str:
-    """Text without what a printer may change: spaces, breaks of lines, ligatures."""
+    """Normalise a text: without spaces, line breaks and ligatures, which printing may change."""
     return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
 
 
 def _difference(expected: str, found: str) -> str:
-    """Where two texts differ first, in words."""
+    """Describe the first difference of two texts."""
     if expected == found:
-        return text("its text is the same, its markup is another")
+        return text("its text is the same, but its markup differs")
     at = next(
         (at for at, pair in enumerate(zip(expected, found, strict=False)) if pair[0] != pair[1]),
         min(len(expected), len(found)),
     )
     begin = max(0, at - _AROUND)
-    said, signed = (printable(each[begin : at + _AROUND]) for each in (found, expected))
-    return text("it says '{said}', the station signed '{signed}'", said=said, signed=signed)
+    shown, signed = (printable(each[begin : at + _AROUND]) for each in (found, expected))
+    return text("it shows '{shown}', the station signed '{signed}'", shown=shown, signed=signed)
 
 
 def _difference_of_print(page: str, pages: list[str]) -> str:
-    """Where a print differs from the page; empty where it does not. What a browser prints at the
-    edges of the paper and heads of tables that go on are no part of the page.
+    """Describe the first difference of a print from its page; "" without one. Lines that a browser
+    prints at the edges of the paper, and repeated heads of tables, are ignored.
     """
     parser = _Text()
     parser.feed(page)
@@ -290,9 +288,9 @@ def _difference_of_print(page: str, pages: list[str]) -> str:
 
 
 def _edge(title: str) -> re.Pattern[str]:
-    """What a browser prints at the edges of the paper: date, title, address, number of the page."""
-    said = re.escape(unicodedata.normalize("NFKC", title))
-    return re.compile(rf"(?:[\d/.,:\- ]+|AM|PM|{said}|about:blank|\w{{2,5}}://\S+|\d+/\d+|\s)+")
+    """Matches lines that a browser prints at the edges of the paper: date, title, address, page."""
+    escaped = re.escape(unicodedata.normalize("NFKC", title))
+    return re.compile(rf"(?:[\d/.,:\- ]+|AM|PM|{escaped}|about:blank|\w{{2,5}}://\S+|\d+/\d+|\s)+")
 
 
 def _pages_of_pdf(data: bytes) -> Iterator[str]:

@@ -1,5 +1,5 @@
-"""From the keys of a scanner to scans: the events of a Linux input device, by a US layout, which is
-what scanners type unless they are set up otherwise. Times are arguments, in seconds.
+"""Decodes the key events of a scanner (a Linux input device) into scans. Keys are read with the US
+layout, the default of scanners. Times are arguments, in seconds.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from typing import Final
 
 PAUSE_S: Final = 2.0
-"""A scanner makes no such pause within a scan: what came before it lacks its end."""
+"""A longer pause within a scan means that its end was lost."""
 LENGTH_MAX: Final = 300
 
 _ROWS: Final = (
@@ -22,7 +22,7 @@ _ROWS: Final = (
     (86, "\\", "|"),
     (98, "/", "/"),
 )
-"""Code of the first key, what the keys from there on type, and what they type with shift."""
+"""Code of the first key of a row, the characters of its keys, and those with shift."""
 _CHARS: Final = {
     first + at: pair for first, *both in _ROWS for at, pair in enumerate(zip(*both, strict=True))
 }
@@ -30,7 +30,7 @@ _ENDS: Final = frozenset({15, 28, 96})
 """Tab, Enter, and Enter of the number block."""
 _SHIFTS: Final = frozenset({42, 54})
 _SILENT: Final = frozenset({29, 97, 56, 100, 125, 126})
-"""Ctrl, Alt, Meta: what is typed with them is no text."""
+"""Ctrl, Alt and Meta: keys pressed with them type no characters."""
 _CAPS_LOCK: Final = 58
 _SYN, _KEY = 0, 1
 _SYN_REPORT, _SYN_DROPPED = 0, 3
@@ -38,8 +38,8 @@ _RELEASED, _PRESSED = 0, 1
 
 
 class ScanBuilder:
-    """Makes scans of characters. `submit` gets whole scans only; `damaged` is called where one is
-    not whole.
+    """Builds scans from characters. Calls `submit` with each complete scan, and `damaged` for each
+    incomplete one.
     """
 
     def __init__(self, submit: Callable[[str], None], damaged: Callable[[], None]) -> None:
@@ -59,7 +59,7 @@ class ScanBuilder:
             self._is_damaged = True
 
     def end(self, at_s: float) -> None:
-        """The scan is over."""
+        """End the scan."""
         if self._text and at_s - self._at_s > PAUSE_S:
             self._is_damaged = True
         if self._is_damaged:
@@ -69,18 +69,20 @@ class ScanBuilder:
         self._text = ""
 
     def damage(self) -> None:
-        """Something of the scan that comes is lost."""
+        """Mark the current scan as incomplete."""
         self._is_damaged = True
 
     def drop(self) -> None:
-        """Forget what has no end, and say so."""
+        """Discard an unfinished scan, and report it as damaged."""
         if self._text or self._is_damaged:
             self._damaged()
         self._text, self._is_damaged = "", False
 
 
 class KeyDecoder:
-    """Takes the events of an input device. `held` asks it for the keys that are held down."""
+    """Decodes the events of an input device. `held` returns the codes of keys held down now; it is
+    called after the device lost events.
+    """
 
     def __init__(self, builder: ScanBuilder, held: Callable[[], Collection[int]]) -> None:
         self._builder = builder
@@ -88,7 +90,7 @@ class KeyDecoder:
         self._held: set[int] = set()
         self._has_caps = False
         self._is_lost = False
-        """The device dropped events, up to the next report."""
+        """The device dropped events; those up to the next report are ignored."""
 
     def feed(self, kind: int, code: int, value: int, at_s: float) -> None:
         if kind == _SYN:
@@ -106,7 +108,7 @@ class KeyDecoder:
     def _key(self, code: int, value: int, at_s: float) -> None:
         if value == _RELEASED:
             self._held.discard(code)
-        if value != _PRESSED:  # a key that repeats is one key
+        if value != _PRESSED:  # repeats of a held key are ignored
             return
         self._held.add(code)
         if code in _ENDS:

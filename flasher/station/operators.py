@@ -6,8 +6,7 @@
     role = "rework"
     pin = "$argon2id$..."              # printed by `flasher station pin`
 
-`Crew` decides, and does nothing else: times are arguments, and the slow check of a PIN is made by
-the station.
+`Crew` only decides: times are arguments, and the station runs the slow check of a PIN.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from flasher.station.scans import Command, Label, Refused, Word, understand
 from flasher.station.socket import PAGE, Source
 
 PIN_LIMIT_S: Final = 30.0
-"""The PIN has to follow what it is for within this time."""
+"""Time limit for the PIN after the command that needs it."""
 HIDDEN: Final = "****"
-"""Stands for what was scanned or typed and may be a PIN."""
+"""Shown instead of scanned or typed text that may be a PIN."""
 
 
 class Role(StrEnum):
-    """Role of a person, with permissions."""
+    """Role of a person, which decides the commands that he or she may give."""
 
     OPERATOR = "operator"
     REWORK = "rework"
@@ -53,20 +52,20 @@ _ROLES: Final[Mapping[Word, frozenset[Role]]] = {
     Word.ABORT: _REWORK,
     Word.RESUME: frozenset({Role.SUPERVISOR}),
 }
-"""Who may give a command that overrides the station. The others are for everybody."""
+"""Roles that may give a command that overrides the station. Other commands are open to all."""
 
 
 class Person(TomlTable):
-    """Somebody with a badge."""
+    """A person with a badge."""
 
     name: ShortText
-    """As it stands in the records."""
+    """Name of the person in the records."""
     code: ShortText
-    """What the barcode of the badge says."""
+    """Text of the badge's barcode."""
     role: Role
-    """What this person may do."""
+    """Role of the person."""
     pin: str = Field(default="", repr=False)
-    """A hash of the PIN that overrides ask for; without it the badge is enough."""
+    """Hash of the PIN that overrides need, by `flasher station pin`; empty: no PIN is needed."""
 
     @field_validator("code")
     @classmethod
@@ -80,14 +79,14 @@ class Person(TomlTable):
     @field_validator("pin", mode="before")
     @classmethod
     def _check_pin(cls, value: Any) -> Any:
-        # Before its type is looked at: a message about that would show a PIN that stands there.
+        # Before pydantic checks the type: its message would show a PIN written here by mistake.
         if value != "":
             pins.check_hash(value if isinstance(value, str) else "")
         return value
 
 
 class BadgeTable(TomlTable):
-    """The whole file."""
+    """A badge table."""
 
     person: tuple[Person, ...] = Field(min_length=1, max_length=1000)
 
@@ -102,16 +101,16 @@ BADGES: Final = Reader(BadgeTable, "badge table")
 
 
 def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
-    """The people of a badge table. Raises UsageError with all that is wrong, and for badges that
+    """Load the people of a badge table. Raises UsageError with all problems, among them badges that
     could be labels of this recipe.
     """
     table = BADGES.load(path)
-    # A misread label may have a wrong check digit: its form is enough.
+    # Without the check digit: a label that was misread must not be taken for a badge.
     is_label = pattern_of(serial_number.pattern).match
     faults = [
         Fault(
             f"person[{number}].code",
-            f"{printable(person.code)} could be a label: it fits the pattern of the recipe's"
+            f"{printable(person.code)} could be a label: it matches the pattern of the recipe's"
             " serial numbers.",
             "Give the badge another code.",
         )
@@ -125,7 +124,7 @@ def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
 
 @dataclass(frozen=True)
 class Asked:
-    """An override that waits for the PIN of its person."""
+    """A command that waits for the PIN of its person."""
 
     person: Person
     word: Word
@@ -135,13 +134,13 @@ class Asked:
 
     @property
     def text(self) -> str:
-        """As it was scanned."""
+        """The command as it was scanned."""
         return f"{self.word.value} {self.argument}".strip()
 
 
 class Crew:
-    """Everybody with a badge, who works here, and the override that waits for a PIN. Where nobody
-    has a badge, people are taken at their word.
+    """The people of a station: who has a badge, who is the operator, and the command that waits for
+    a PIN. Without badges every command is allowed.
     """
 
     def __init__(self, people: Iterable[Person]) -> None:
@@ -149,11 +148,11 @@ class Crew:
         self.has_badges = bool(self._people)
         self.has_pins = any(each.pin for each in self._people.values())
         self.person: Person | None = None
-        """Who works here; None before the first badge."""
+        """The operator; None before the first badge is scanned."""
         self.asked: Asked | None = None
         self._tries: dict[tuple[str, str], BackOff] = {}
-        """PINs that were given, by the person's name and where: who guesses at a page does not stop
-        that person at the scanner.
+        """Tries of PINs by person and source: wrong PINs at a page do not lock the person out at
+        the scanner.
         """
 
     @property
@@ -168,7 +167,7 @@ class Crew:
         return self._people.get(text)
 
     def may_be_pin(self, text: str) -> bool:
-        """True for a text that may be a PIN, which somebody has typed too late."""
+        """True for a text that may be a PIN, for example one that was typed too late."""
         return self.has_pins and pins.is_form(text)
 
     def check_assigned(self) -> None:
@@ -179,8 +178,8 @@ class Crew:
             )
 
     def check_role(self, word: Word) -> Person | None:
-        """Who says a command that overrides the station; None for the other commands. Raises
-        Refused for a person whose role is another one.
+        """Check that the operator may give a command. Returns the operator if the command needs a
+        role, else None. Raises Refused when the operator's role may not give it.
         """
         if word not in _ROLES:
             return None
@@ -197,7 +196,7 @@ class Crew:
         return person
 
     def ask(self, person: Person, word: Word, argument: str, now: float, source: Source) -> Asked:
-        """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
+        """Wait for a person's PIN before a command. Raises Refused after too many wrong PINs."""
         if remedy := self.lock_words(person.name, source, now):
             name = printable(person.name)
             raise Refused("PIN_LOCKED", text("Too many wrong PINs of {name}.", name=name), remedy)
@@ -205,20 +204,20 @@ class Crew:
         return self.asked
 
     def lock_words(self, name: str, source: Source, now: float) -> str:
-        """How long this person has to wait after too many wrong PINs; "" where one is taken."""
+        """Remedy with the time to wait after too many wrong PINs; "" when a PIN is accepted."""
         wait_s = self._tries_of(name, source).wait_s(now)
         if wait_s == 0.0:
             return ""
         return text("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
 
     def count_try(self, name: str, source: Source, now: float) -> None:
-        """A PIN of this person is going to be checked."""
+        """Count a PIN of this person before it is checked."""
         self._tries_of(name, source).count(now)
 
     def was_right(self, name: str, source: Source) -> None:
         self._tries_of(name, source).reset()
 
     def _tries_of(self, name: str, source: Source) -> BackOff:
-        # Of all pages together: a browser can begin any number of sessions.
+        # All pages count together, since a browser can begin any number of sessions.
         place = PAGE if source.name.startswith(PAGE) else source.name
         return self._tries.setdefault((name, place), BackOff())

@@ -1,4 +1,4 @@
-"""PINs of badges: their form, and their hashes by argon2."""
+"""PINs of badges: their form and their argon2 hashes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _FORM: Final = re.compile(r"[0-9]{4,12}", re.ASCII)
 FORM_WORDS: Final = "4 to 12 digits"
 _MEMORY_MAX_KIB: Final = 1024 * 1024
 _ROUNDS_MAX: Final = 20
-"""A hash that takes more would hold the line up."""
+"""Hashes with higher parameters are refused: checking them would delay the line."""
 
 
 @dataclass(frozen=True)
 class Pin:
-    """What was typed as a PIN; nothing that shows an object shows it."""
+    """A typed PIN; its repr does not contain it."""
 
     text: str = field(repr=False)
 
@@ -31,17 +31,17 @@ def is_form(text: str) -> bool:
 
 
 def hash_of(pin: Pin) -> str:
-    """The hash for the badge table."""
+    """Hash a PIN for the badge table."""
     return PasswordHasher().hash(pin.text)
 
 
 def checker() -> Executor:
-    """Checks PINs in a thread of its own, one after the other: each takes some 64 MiB."""
+    """Make an executor that checks PINs one at a time, since each check takes 64 MiB."""
     return ThreadPoolExecutor(1, "pins")
 
 
 def is_right(pin: Pin, pin_hash: str) -> bool:
-    """True when the hash is of this PIN. It takes some 50 ms: it shall be slow to guess."""
+    """True when the hash is of this PIN. It takes about 50 ms, which slows down guessing."""
     try:
         return PasswordHasher().verify(pin_hash, pin.text)
     except VerificationError:
@@ -49,12 +49,12 @@ def is_right(pin: Pin, pin_hash: str) -> bool:
 
 
 def check_hash(pin_hash: str) -> None:
-    """Raises ValueError for a text that is no hash of a PIN; the message does not show it."""
+    """Raises ValueError for a text that is not the hash of a PIN; the message does not show it."""
     try:
         parameters = extract_parameters(pin_hash)
     except InvalidHashError:
         parameters = None
     if parameters is None or parameters.type is not Type.ID:
-        raise ValueError("it is no argon2id hash; flasher station pin makes one")
+        raise ValueError("must be an argon2id hash; flasher station pin makes one")
     if parameters.memory_cost > _MEMORY_MAX_KIB or parameters.time_cost > _ROUNDS_MAX:
-        raise ValueError("its hash takes too long; flasher station pin makes another one")
+        raise ValueError("takes too long to check; flasher station pin makes another hash")

@@ -1,4 +1,4 @@
-"""Reports over many runs: figures and rows, as JSON, CSV and JUnit. Data in, text out."""
+"""Reports of many runs: their figures and rows as JSON, CSV and JUnit XML."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCHEMA_VERSION: Final = 1
 
 @dataclass(frozen=True)
 class Report:
-    """Runs of a filter with their figures, read on first access. Raises RecordError."""
+    """The runs of a filter with their figures, read on first access, which raises RecordError."""
 
     records: Records
     chosen: RunFilter
@@ -39,11 +39,11 @@ class Report:
 
     @cached_property
     def runs(self) -> list[ReportedRun]:
-        """As `Records.table` gives them, the oldest first."""
+        """The runs, the oldest first."""
         return self.records.table(self.chosen)
 
     def to_dict(self) -> dict[str, Any]:
-        """The report in JSON's types; times are texts in UTC."""
+        """The report as types of JSON; times are texts in UTC."""
         shares = {
             "yield_share": self.figures.yield_share,
             "first_pass_share": self.figures.first_pass_share,
@@ -62,12 +62,12 @@ class Report:
         return json.dumps(self.to_dict(), indent=1) + "\n"
 
     def to_csv(self) -> str:
-        """One row a run under a line of headings, for a spreadsheet; empty without runs."""
+        """The runs as CSV: a line of headings, and a row for each run; empty without runs."""
         return csv_text([*map(vars, self.runs[:1]), *(vars(run).values() for run in self.runs)])
 
     def to_junit(self) -> str:
-        """One test case a run: FAIL is a failure, ERROR and INTERRUPTED are errors, ABORTED is
-        skipped. Golden units are left out, as in the figures; a run that goes on is no result.
+        """The runs as JUnit XML, one test case each: FAIL is a failure, ERROR and INTERRUPTED are
+        errors, ABORTED is skipped. Golden units and active runs are left out.
         """
         cases = [
             _junit_case(run)
@@ -78,14 +78,14 @@ class Report:
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows for a spreadsheet."""
+    """Format rows as CSV for a spreadsheet."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\r\n").writerows(map(csv_cell, row) for row in rows)
     return out.getvalue()
 
 
 def csv_cell(value: object) -> str:
-    """A cell that a spreadsheet takes for what it is."""
+    """Format a cell of CSV. A text that a spreadsheet would take for a formula is escaped."""
     if isinstance(value, str):
         return no_formula(value)
     if isinstance(value, bool):

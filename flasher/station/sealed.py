@@ -1,5 +1,5 @@
-"""What a certificate carries: the content of its run, canonical, with the audit row that states the
-digests of that content, and the station's signature of the row.
+"""Signed content of a certificate: the canonical content of its run, the audit row with the digests
+of that content, and the station's signature of the row.
 """
 
 from __future__ import annotations
@@ -27,41 +27,43 @@ from flasher.station.records.queries import details_of_content
 from flasher.station.records.signatures import is_signed
 
 CERTIFICATE_MAX_SIZE: Final = 8 * 1024 * 1024
-"""In bytes, of a file with a certificate."""
+"""Bytes of a file with a certificate."""
 _BEGIN: Final = "-----BEGIN FLASHER CERTIFICATE-----"
 _END: Final = "-----END FLASHER CERTIFICATE-----"
 _LINE: Final = 96
-_CARRIED: Final = re.compile(r"(?!\d+/\d+$)[A-Za-z0-9+/=]+")
-"""Other lines are what a browser printed where the paper ended, as "1/2"."""
+_CONTENT: Final = re.compile(r"(?!\d+/\d+$)[A-Za-z0-9+/=]+")
+"""Matches lines of the content, but not page numbers such as "1/2" that browsers print."""
 _MAX_SIZE: Final = 4 * 1024 * 1024
-"""In bytes, of what is carried."""
+"""Bytes of the unpacked content."""
 LEFT_OUT: Final = ("recipe", "claim")
-"""The text of the recipe is not given away with each certificate; a claim follows from the run."""
+"""Parts that certificates omit: the recipe is confidential, and the claim follows from the run."""
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """The content of a certificate."""
+    """The signed content of a certificate."""
 
     flasher: str
+    """Version of flasher that made it."""
     made_at: str
-    """When the page was made."""
+    """When the page was made (ISO 8601)."""
     is_kept: bool
     is_beside: bool
     examined_at: str
-    """As in `certificate.Proof`."""
+    """`is_kept`, `is_beside` and `examined_at`: see `certificate.Proof`."""
     content: dict[str, Any]
-    """The rows of the run and of all that it names, by what they are."""
+    """The rows of the run and of everything that it refers to, by table."""
     recipe: dict[str, str]
-    """Its name, revision and SHA-256; the rest of it is in the records."""
+    """Name, revision and SHA-256 of the recipe."""
     row: dict[str, Any]
     """The audit row."""
     station: str
     signature: str
     key: str
     earlier: tuple[dict[str, Any], ...]
-    """Earlier runs of the unit; the signature does not cover them, the records tell."""
+    """Earlier runs of the unit, which the signature does not cover."""
     earlier_left_out: int
+    """Number of earlier runs that are not in `earlier`."""
 
     @property
     def head(self) -> ChainHead:
@@ -72,16 +74,16 @@ class Sealed:
 
     @property
     def digests(self) -> Mapping[str, str]:
-        """What the audit row states."""
-        found = chain.data_of(self.row["data"]).get("digests")
-        return found if isinstance(found, dict) else {}
+        """Digests of the content in the audit row, by table."""
+        digests = chain.data_of(self.row["data"]).get("digests")
+        return digests if isinstance(digests, dict) else {}
 
     @property
     def record_sha256(self) -> str:
         return chain.digest(dict(self.digests))
 
     def wrong(self) -> list[str]:
-        """What of it is not as the station signed it, in words; empty where all is."""
+        """Lists the differences from the content that the station signed, in words."""
         row = self.row
         if chain.row_hash(row) != row["hash"]:
             return [text("the audit row in it was changed")]
@@ -104,7 +106,7 @@ class Sealed:
         )
 
     def life(self) -> UnitLife:
-        """The unit as the page shows it. Raises ValidationError, KeyError, TypeError."""
+        """The unit as the page shows it. Raises ValidationError, KeyError or TypeError."""
         details = details_of_content(self.content, self.recipe)
         runs = [RunDetails(_RUN.validate_python(run), (), (), (), ()) for run in self.earlier]
         state = UnitState.after(details.run.state)
@@ -113,22 +115,22 @@ class Sealed:
 
 @dataclass(frozen=True)
 class CheckedCertificate:
-    """What was found about a certificate."""
+    """Result of the check of a certificate."""
 
     serial: str
     part: str
     state: RunState
     run_id: int
     station: str
-    """Which signed it."""
+    """The station that signed it."""
     fingerprint: str
-    """Of the key."""
+    """Fingerprint of the station's key."""
     made_at: str
-    """Empty where it does not say."""
+    """Empty for a QR code, which does not have it."""
     problems: tuple[str, ...]
-    """Empty where it is signed by that station, unchanged, and in these records."""
+    """Empty when it is signed by that station, unchanged, and in these records."""
     remarks: tuple[str, ...]
-    """What a person should know, though nothing is wrong with it."""
+    """For people: notable, but no problem."""
 
 
 _TYPE: Final = TypeAdapter(Sealed)
@@ -136,7 +138,7 @@ _RUN: Final = TypeAdapter(RunRecord)
 
 
 def plain(run: RunRecord) -> dict[str, Any]:
-    """A run as values of JSON, from which it can be read again."""
+    """Convert a run to types of JSON, from which pydantic can read it again."""
     return {
         name: value.value
         if isinstance(value, Enum)
@@ -148,7 +150,7 @@ def plain(run: RunRecord) -> dict[str, Any]:
 
 
 def as_text(sealed: Sealed) -> str:
-    """Lines that survive printing."""
+    """Encode the content as lines of text that survive printing: compressed, in base64."""
     data = chain.canonical(_TYPE.dump_python(sealed, mode="json")).encode("ascii")
     text = base64.b64encode(zlib.compress(data, 9)).decode("ascii")
     lines = [text[at : at + _LINE] for at in range(0, len(text), _LINE)]
@@ -156,22 +158,24 @@ def as_text(sealed: Sealed) -> str:
 
 
 def sealed_in(document: str) -> Sealed:
-    """The sealed content of a text. Raises UsageError, UnprovenError."""
+    """Decode the signed content in a text. Raises UsageError when there is none, UnprovenError when
+    it is damaged.
+    """
     start = document.find(_BEGIN)
     stop = document.find(_END, start)
     if start < 0 or stop < 0:
         raise UsageError(
-            text("The file carries no signed certificate."),
+            text("The file contains no signed certificate."),
             remedy=text("Name a certificate as flasher wrote or printed it, with its annex."),
         )
     lines = (line.strip() for line in document[start + len(_BEGIN) : stop].splitlines())
-    carried = "".join(line for line in lines if _CARRIED.fullmatch(line))
+    encoded = "".join(line for line in lines if _CONTENT.fullmatch(line))
     try:
-        data = base64.b64decode(carried, validate=True)
-        found = zlib.decompressobj().decompress(data, _MAX_SIZE)
-        return _TYPE.validate_python(json.loads(found))
+        data = base64.b64decode(encoded, validate=True)
+        content = zlib.decompressobj().decompress(data, _MAX_SIZE)
+        return _TYPE.validate_python(json.loads(content))
     except (binascii.Error, zlib.error, ValueError, ValidationError, RecursionError) as error:
         raise UnprovenError(
-            text("The certificate was changed: what it carries cannot be read."),
+            text("The certificate was changed: its signed content cannot be read."),
             remedy=text("Request the certificate again."),
         ) from error

@@ -297,15 +297,15 @@ def test_sockets_that_can_never_work_end_the_station(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "either its sockets or virtual ones"),
+        ((), "either a station file or virtual sockets"),
         (("--mock-sockets", "65"), "1 to 64 sockets"),
-        (("--mock-sockets", "2", "--mock-bad", "0.9", "--mock-slow", "0.9"), "more than all"),
-        (("--mock-sockets", "2", "--units", "2", "--scans", "scans.txt"), "Leave one of them"),
+        (("--mock-sockets", "2", "--mock-bad", "0.9", "--mock-slow", "0.9"), "up to more than 1"),
+        (("--mock-sockets", "2", "--units", "2", "--scans", "scans.txt"), "Remove one of them"),
         (("--mock-sockets", "2", "--scans", "none.txt"), "cannot be read"),
-        (("--mock-sockets", "2", "--scans", "empty.txt"), "holds no scans"),
-        (("--mock-sockets", "2", "--scans", "other.txt"), "There is no socket 9"),
+        (("--mock-sockets", "2", "--scans", "empty.txt"), "contains no scans"),
+        (("--mock-sockets", "2", "--scans", "other.txt"), "The station has no socket 9"),
         (("--sockets", "real.toml", "--units", "2"), "is for virtual units"),
-        (("--mock-sockets", "2", "--badges", "badges.toml", "--operator", "Jo"), "a badge says"),
+        (("--mock-sockets", "2", "--badges", "badges.toml", "--operator", "Jo"), "scans a badge"),
         (("--mock-sockets", "2", "--badges", "badges.toml", "--units", "2"), "people scan"),
         (("--mock-sockets", "2", "--badges", "badges.toml"), "could be a label"),
         (("--sockets", "with_badges.toml"), "badges_of_nobody.toml"),
@@ -406,7 +406,7 @@ def test_a_pin_on_a_terminal_is_typed_twice_without_echo(
     monkeypatch.setattr("getpass.getpass", lambda _prompt: next(typed))
     run = flasher("station", "pin")
     assert run.code == ExitCode.USAGE
-    assert "not the same" in run.err
+    assert "PINs differ" in run.err
     run = flasher("station", "pin")
     assert is_right(Pin("470815"), run.out.strip())
 

@@ -21,8 +21,8 @@ from tests.station.factory import SERIAL, Bench
 from tests.station.records import old_records
 
 BESIDE = (
-    "NOT CHECKED as a whole against a head kept elsewhere: whoever can write beside the key could"
-    " have made records and heads anew"
+    "NOT CHECKED as a whole against heads stored elsewhere: whoever can write beside the key could"
+    " have forged records and heads"
 )
 
 
@@ -48,9 +48,9 @@ def test_verify_says_what_the_records_were_held_against(
     run = flasher("station", "verify", *place)
     assert run.code == ExitCode.OK
     assert run.out.splitlines() == [
-        f"nothing in the records differs; {BESIDE}",
+        f"no difference in the records; {BESIDE}",
         f"  line-2: rows 1 to 6 match the heads beside the key, in {bench.keys}",
-        "  line-2: no heads are kept elsewhere than beside the key",
+        "  line-2: heads are stored only beside the key",
         "  1 trace of runs that passed agree with the records",
     ]
     told = flasher("station", "verify", *place, "--json")
@@ -58,7 +58,7 @@ def test_verify_says_what_the_records_were_held_against(
     assert not told.document["is_checked_elsewhere"]
     shutil.copytree(bench.keys, bench.folder / "share", ignore=shutil.ignore_patterns("*.key"))
     again = flasher("station", "verify", *place)
-    assert again.out.startswith("nothing in the records since the examination of ")
+    assert again.out.startswith("no difference in the records since the examination of ")
     assert "--all examines everything again" in again.out
     two = flasher("station", "verify", *place, "--all", "--heads", bench.folder / "share")
     assert two.out.splitlines()[:3] == [
@@ -71,9 +71,9 @@ def test_verify_says_what_the_records_were_held_against(
     assert f"heads NOT REACHED: {bench.folder / 'gone'}: there is no such folder" in gone.out
     without = flasher("station", "verify", "--database", bench.path, "--keys", bench.folder)
     assert without.code == ExitCode.OK
-    assert "NOT CHECKED against a head kept elsewhere" in without.out
+    assert "NOT CHECKED against heads stored elsewhere" in without.out
     assert "as they were written" not in without.out
-    assert "line-2: no heads of it were found" in without.out
+    assert "line-2: no heads were found" in without.out
     for wrong in ("sqlite:///x.db", "mysql://x/y"):
         refused = flasher("station", "verify", *place, "--heads", wrong)
         assert refused.code == ExitCode.USAGE
@@ -102,7 +102,10 @@ def test_a_unit_whose_records_were_changed_gets_no_page(
     assert not (tmp_path / "bad.html").exists()
     both = flasher("station", "report", *place, "--certificates", tmp_path / "pages")
     assert both.code == ExitCode.VERIFICATION
-    assert "no page for W2605003: run 2: changed after it was recorded: the run itself" in both.out
+    assert (
+        "no certificate for W2605003: run 2: changed after it was recorded: the run itself"
+        in both.out
+    )
     assert [path.name for path in (tmp_path / "pages").iterdir()] == [f"{SERIAL}.html"]
 
 
@@ -124,11 +127,11 @@ def test_a_certificate_is_checked(
     page.write_text(text.replace("bms.bin", "bmw.bin", 1), encoding="utf-8")
     bad = flasher("station", "verify", *place, "--certificate", page, "--json")
     hold_output(schema, bad.out, ExitCode.VERIFICATION)
-    assert bad.document["problems"][0].startswith("its page was changed: it says ")
+    assert bad.document["problems"][0].startswith("its page was changed: it shows ")
     assert "unchanged" not in flasher("station", "verify", *place, "--certificate", page).out
     none = flasher("station", "verify", *place, "--certificate", bench.folder / "recipe.toml")
     assert none.code == ExitCode.USAGE
-    assert "carries no signed certificate" in none.err
+    assert "contains no signed certificate" in none.err
 
 
 def test_a_key_is_shown_rotated_and_replaced(

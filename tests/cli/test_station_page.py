@@ -158,7 +158,7 @@ def test_a_stopped_line_waits_for_the_people_at_its_page(
     [
         (("--web", "0.0.0.0:0"), "Other computers could reach"),
         (("--web", "0.0.0.0:0", "--web-insecure"), "without a password"),
-        (("--web", "0", "--web-key", RECIPE), "belong together"),
+        (("--web", "0", "--web-key", RECIPE), "need each other"),
         (("--web", "0", "--web-key", RECIPE, "--web-certificate", RECIPE), "cannot be used"),
         (("--web", "0", "--web-password", RECIPE.parent / "none"), "none"),
         (("--web", "70000"), "no address"),
@@ -177,7 +177,7 @@ def test_a_short_password_is_refused(flasher: Flasher, tmp_path: Path) -> None:
     (tmp_path / "short").write_text("1234\n")
     run = flasher(*RUN, "--units", "1", "--web", "0", "--web-password", tmp_path / "short")
     assert run.code == ExitCode.USAGE
-    assert "less than 8 characters" in run.err
+    assert "fewer than 8 characters" in run.err
 
 
 def test_a_port_that_is_taken_is_said(flasher: Flasher) -> None:

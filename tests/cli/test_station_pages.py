@@ -57,7 +57,7 @@ def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
             "nothing.sqlite. [E201]",
         ),
         (("--web", "0.0.0.0:0"), "--web-certificate"),
-        (("--web", "here"), "is no address"),
+        (("--web", "here"), "must be PORT or HOST:PORT"),
     ],
 )
 def test_what_cannot_be_served_is_said(

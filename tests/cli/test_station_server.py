@@ -63,7 +63,7 @@ def test_a_station_adds_records_and_a_reader_reads_them_and_no_more(
     assert flasher(*words, "--database", station).code == ExitCode.OK
     verified = flasher("station", "verify", "--database", reader, *files)
     assert verified.code == ExitCode.OK
-    assert verified.err.startswith("Name a second place of the heads")
+    assert verified.err.startswith("Name another place for the heads")
     run = flasher(*words, "--database", reader)
     assert "this user of the database may not do it" in run.err
     for url, statements in (

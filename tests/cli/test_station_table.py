@@ -298,7 +298,7 @@ def test_commands_keep_their_place_between_labels() -> None:
 
 def test_sockets_that_see_no_units_take_no_file() -> None:
     blind = socket_view("A", sees_units=False)
-    with pytest.raises(UsageError, match="sees whether"):
+    with pytest.raises(UsageError, match="can detect whether"):
         worked_off(["W1"], [blind], {})
 
 

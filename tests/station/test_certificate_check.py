@@ -140,7 +140,7 @@ def test_every_word_that_a_reader_sees_is_covered(plant: Bench) -> None:
     }.items():  # fmt: skip
         assert said in text
         found = checked(plant, text.replace(said, changed, 1))
-        assert any("its page was changed: it says" in each for each in found.problems), said
+        assert any("its page was changed: it shows" in each for each in found.problems), said
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {

@@ -179,7 +179,7 @@ def test_a_unit_that_did_not_pass_has_no_certificate(plant: Bench) -> None:
     assert "did not pass" in html
     assert "outside" in html
     assert "from 30 to 42 V" in html
-    for serial, text in (("W2605005", "no result yet"), ("W2600001", "golden unit")):
+    for serial, text in (("W2605005", "no verdict yet"), ("W2600001", "golden unit")):
         html = page(plant, serial)
         assert text in html
         assert "Flash certificate" not in html
@@ -205,7 +205,7 @@ def test_a_virtual_unit_has_no_certificate_and_is_marked_everywhere(bench: Bench
     html = page(bench, SERIAL)
     assert "Flash certificate" not in html
     assert ">VIRTUAL PASS<" in html
-    assert "no such product" in html
+    assert "it is not a product" in html
     made = Report(bench.store.read, RunFilter())
     assert made.figures.virtual_runs == 1
     (row,) = csv.DictReader(io.StringIO(made.to_csv()))

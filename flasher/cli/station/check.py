@@ -25,7 +25,7 @@ from flasher.station.recipe_file import LoadedRecipe, load_checked
 
 
 def check(output: Output, path: Path, station_file: Path | None) -> int:
-    # The day is the plant's: it goes into what is written.
+    # Local time: the day of production is written to units.
     day = datetime.now().astimezone().date()
     try:
         recipe = load_checked(path, day)
@@ -54,7 +54,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
             sockets[socket.config.name] = adapter
     for name, adapter in sockets.items():
         output.result(f"socket {printable(name)}: {printable(adapter)}")
-    output.result("nothing speaks against it")
+    output.result("no problem was found")
     return output.document(
         document_of(
             StationCheckDocument,
@@ -78,8 +78,8 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
 
 
 def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
-    said = recipe.recipe
-    yield printable(f"{recipe.path}: {said.name}, part {said.part}, revision {said.revision}")
+    rules = recipe.recipe
+    yield printable(f"{recipe.path}: {rules.name}, part {rules.part}, revision {rules.revision}")
     yield f"  sha256:   {recipe.sha256}"
     for target in recipe.targets:
         version = target.version or "no version named"
@@ -87,10 +87,10 @@ def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
             f"  flash:    {target.name.upper()}: {target.firmware.image}, {version}, "
             f"{byte_count(target.image.size_bytes)}; {target.required.words}"
         )
-    yield printable(f"  example:  {said.serial_number.example}")
-    scan = recipe.scan(said.serial_number.example, day)
-    for write in said.write:
+    yield printable(f"  example:  {rules.serial_number.example}")
+    scan = recipe.scan(rules.serial_number.example, day)
+    for write in rules.write:
         values = " ".join(fill(each, scan) for each in write.values)
         yield printable(f"  write:    {write.target.upper()} {write.item}: {values}")
-    for kept in said.unchanged:
+    for kept in rules.unchanged:
         yield printable(f"  keep:     {kept.target.upper()} {kept.item}")

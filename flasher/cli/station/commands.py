@@ -37,17 +37,18 @@ examples:
 """
 _RUN_NOTES: Final = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
-OPERATOR Jo, REASON text, REPRINT SERIAL, RESUME. They are read from stdin, a line each: a scanner
-is a keyboard. With --scans each label of the file goes to the next socket in which a unit waits.
-With --badges a scanned badge says who works here; REASON, ABORT and RESUME need a role that may.
+OPERATOR Jo, REASON text, REPRINT SERIAL, RESUME. They are read from stdin, one on each line, as a
+scanner types them. With --scans each label of the file goes to the next socket with a waiting unit.
+With --badges the operator is the person whose badge was scanned last; REASON, ABORT and RESUME
+depend on that person's role.
 
-Ctrl-C: no further unit is begun, and those that run are finished. A second one stops them at their
-next safe place; they have to be scanned again. Exit code 12 when a unit did not pass.
+Ctrl-C: no further unit starts, and running ones are finished. A second Ctrl-C stops them at their
+next safe point; scan them again. Exit code 12 if a unit did not pass.
 """
 
 _PAGES_NOTES: Final = """\
-Open the address that is shown: /runs, /units, /yield, /times, /images, /audit, /certificate. A
-station that runs with --web serves them too, beside its operator page.
+Open the printed address: /runs, /units, /yield, /times, /images, /audit, /certificate. A station
+that runs with --web serves these pages too, beside its operator page.
 """
 
 
@@ -66,15 +67,15 @@ def __getattr__(name: str) -> tuple[type, ...]:
     exit_codes=(ExitCode.BUS, ExitCode.VERIFICATION, ExitCode.PARTIAL, ExitCode.INTERRUPTED),
 )
 def station() -> None:
-    """Flash unit after unit at the end of a line, several sockets at a time, by a recipe. A PASS is
-    shown only when it is on disk; the records show years later which file was written to which
-    unit, and by whom. The guide is docs/how-to/station.md.
+    """Flash units at the end of a production line by a recipe, on several sockets at the same time.
+    A PASS is shown only after it is on disk; years later the records still show which file was
+    written to which unit, and by whom. The guide is docs/how-to/station.md.
     """
 
 
 def _call(action: str, *args: object, **named: object) -> int:
-    """Run an action ("module.function"); returns the exit code. Raises UsageError without the
-    extra.
+    """Run an action ("module.function") and return its exit code. Raises UsageError when the extra
+    `station` is not installed.
     """
     need("The station", "station")
     module, _, name = action.partition(".")
@@ -111,12 +112,12 @@ class RecordsOptions:
     )]  # fmt: skip
     heads: Annotated[tuple[str, ...], option(
         "--heads", metavar="DIR|URL", multiple=True, panel="records",
-        help="another place than beside the key where the signed heads of the audit trails are "
-        "kept: a folder, best on another computer, or postgresql://USER@HOST/NAME; may be repeated "
-        "(default: of --sockets)",
+        help="a place for copies of the signed heads of the audit trails, in addition to the one "
+        "beside the key: a folder, best on another computer, or postgresql://USER@HOST/NAME; may "
+        "be repeated (default: of --sockets)",
     )]  # fmt: skip
     sockets: Annotated[Path | None, _path_option(
-        "--sockets", panel="records", brief=True, help="the station's file (TOML)",
+        "--sockets", panel="records", brief=True, help="the station file (TOML)",
     )]  # fmt: skip
 
 
@@ -124,12 +125,12 @@ _records_options: Final = option_set("records", RecordsOptions)
 
 
 _operator_option: Final = option(
-    "--operator", metavar="NAME", brief=True, help="who decides it (default: the login)"
+    "--operator", metavar="NAME", brief=True, help="who decides this (default: the login)"
 )
 
 
 def _reason_option(*, required: bool) -> Decorator:
-    return option("--reason", required=required, metavar="TEXT", help="why")
+    return option("--reason", required=required, metavar="TEXT", help="the reason, for the records")
 
 
 def _share(text: str) -> float:
@@ -150,14 +151,14 @@ class Address:
 def _address(text: str) -> Address:
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) < 65536):
-        raise click.BadParameter("is no address: PORT or HOST:PORT")
+        raise click.BadParameter("must be PORT or HOST:PORT")
     return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
 
 
 def _mock_share_option(name: str, share: float, what: str) -> Decorator:
     return option(
         f"--mock-{name}", type=_share, default=share, metavar="SHARE", panel=_VIRTUAL,
-        help=f"how many {what}",
+        help=f"share of units that {what}",
     )  # fmt: skip
 
 
@@ -167,8 +168,8 @@ _PAGES: Final = "pages"
 DEFAULT_WEB: Final = "8740"
 DEFAULT_DESK: Final = "8741"
 _VIRTUAL: Final = "virtual units, for training and demonstration"
-_WHICH: Final = "which runs (default: all)"
-_WRITTEN: Final = "what is written"
+_WHICH: Final = "selection of runs (default: all)"
+_WRITTEN: Final = "files to write"
 
 
 @dataclass(frozen=True)
@@ -177,22 +178,22 @@ class PagesOptions:
 
     web_password: Annotated[Path | None, _path_option(
         "--web-password", panel=_PAGES,
-        help="a file whose first line is the password of the pages",
+        help="a file with the password of the pages in its first line",
     )]  # fmt: skip
     web_certificate: Annotated[Path | None, _path_option(
         "--web-certificate", panel=_PAGES,
-        help="serve them by TLS with this certificate (PEM)",
+        help="serve the pages over TLS with this certificate (PEM)",
     )]  # fmt: skip
     web_key: Annotated[Path | None, _path_option(
         "--web-key", panel=_PAGES, help="the key of the certificate (PEM)",
     )]  # fmt: skip
     web_insecure: Annotated[bool, option(
         "--web-insecure", is_flag=True, panel=_PAGES,
-        help="let other computers in without TLS: anyone on the network can read the traffic",
+        help="allow other computers without TLS: anyone on the network can read the traffic",
     )]  # fmt: skip
     language: Annotated[str | None, option(
         "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
-        help="of the pages (default: the browser's)",
+        help="language of the pages (default: the browser's)",
     )]  # fmt: skip
 
 
@@ -201,9 +202,9 @@ _pages_options: Final = option_set("pages", PagesOptions)
 
 @station.action("check")
 @argument("recipe", type=values.FilePath("toml", gives=Path), metavar="RECIPE", help="the recipe")
-@_path_option("--sockets", brief=True, help="the station's file, and its adapters, too")
+@_path_option("--sockets", brief=True, help="check this station file and its adapters, too")
 def check(output: Output, recipe: Path, sockets: Path | None) -> int:
-    """Check everything about a recipe, before a shift."""
+    """Check a recipe and its images, before a shift."""
     return _call("check.check", output, recipe, sockets)
 
 
@@ -212,36 +213,37 @@ class RunOptions:
     """Settings of a station's run."""
 
     recipe: Annotated[Path, _path_option(
-        "--recipe", required=True, help="what is done to each unit",
+        "--recipe", required=True, help="the recipe (TOML): steps, images and limits of a unit",
     )]  # fmt: skip
     operator: Annotated[str | None, option(
-        "--operator", metavar="NAME", brief=True, help="who works here (default: the login)",
+        "--operator", metavar="NAME", brief=True, help="name of the operator (default: the login)",
     )]  # fmt: skip
     lot: Annotated[str, option(
         "--lot", default="", metavar="NAME", show_default=False, help="the lot of the units",
     )]  # fmt: skip
     badges: Annotated[Path | None, _path_option(
-        "--badges", help="the table of the badges: who may work here (default: of --sockets)"
+        "--badges", help="the badge table of the people who may work here (default: of --sockets)"
     )]  # fmt: skip
     scans: Annotated[Path | None, _path_option(
-        "--scans", help="labels in the order of the units; the run ends after the last",
+        "--scans", help="a file with a label on each line, in the order of the units; the station "
+        "ends after the last",
     )]  # fmt: skip
     lines: Annotated[bool, option(
-        "--lines", is_flag=True, help="a line for each event, even on a terminal",
+        "--lines", is_flag=True, help="print a line for each event, even on a terminal",
     )]  # fmt: skip
     web: Annotated[Address | None, option(
         "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
         panel=_PAGES, brief=True, show_default=False,
-        help="serve the pages of the operator and the supervisor (alone: on this computer only, "
+        help="serve the operator and supervisor pages (without a value: on this computer only, "
         f"port {DEFAULT_WEB})",
     )]  # fmt: skip
     mix_virtual: Annotated[bool, option(
         "--mix-virtual", is_flag=True, panel="records",
-        help="let real and virtual units share the records (no serial number is both)",
+        help="allow real and virtual units in the same records (with different serial numbers)",
     )]  # fmt: skip
     mock_sockets: Annotated[int | None, option(
         "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
-        help="N sockets with virtual units",
+        help="use N sockets with virtual units",
     )]  # fmt: skip
     units: Annotated[int | None, option(
         "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
@@ -249,7 +251,7 @@ class RunOptions:
     )]  # fmt: skip
     scan_by_hand: Annotated[bool, option(
         "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
-        help="their labels are shown, and have to be typed",
+        help="show the labels of virtual units, to be typed",
     )]  # fmt: skip
     mock_bad: Annotated[float, _mock_share_option(
         "bad", 0.15, "refuse the image, or have the wrong hardware",
@@ -257,18 +259,18 @@ class RunOptions:
     mock_slow: Annotated[float, _mock_share_option("slow", 0.1, "take longer")]
     mock_dead: Annotated[float, _mock_share_option("dead", 0.05, "never answer")]
     mock_exchanged: Annotated[float, _mock_share_option(
-        "exchanged", 0.0, "are exchanged for the next one while they are flashed",
+        "exchanged", 0.0, "are exchanged for the next one while being flashed",
     )]  # fmt: skip
     mock_mislabelled: Annotated[float, _mock_share_option(
-        "mislabelled", 0.0, "bear the label of another unit",
+        "mislabelled", 0.0, "have the label of another unit",
     )]  # fmt: skip
     mock_seed: Annotated[int, option(
         "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL,
-        help="other ones",
+        help="seed of the virtual units; another one gives other units",
     )]  # fmt: skip
     mock_speed: Annotated[float, option(
         "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
-        help="times as fast as a real bus; 0 takes no time",
+        help="speed relative to a real bus; 0: no delays",
     )]  # fmt: skip
 
 
@@ -277,7 +279,7 @@ class RunOptions:
 @_pages_options
 @_records_options
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
-    """Flash unit after unit."""
+    """Flash units until Ctrl-C, or until all scans or virtual units are done."""
     if options.web is not None:
         need("The operator page", "web")
     return _call("run.run", output, options, pages, records)
@@ -286,13 +288,13 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 @station.action("pages", epilog=_PAGES_NOTES)
 @option(
     "--web", type=_address, default=DEFAULT_DESK, metavar="[HOST:]PORT", panel=_PAGES, brief=True,
-    help="where they are served; a port alone: on this computer only",
+    help="address of the pages; a port alone: on this computer only",
 )  # fmt: skip
 @_pages_options
 @_records_options
 def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOptions) -> int:
-    """Serve the supervisor pages of records, until Ctrl-C: runs, units, yield, causes, times,
-    images, audit trail. The records are not changed, and no station has to run here.
+    """Serve the supervisor pages of records until Ctrl-C: runs, units, yield, causes, times,
+    images, audit trail. It does not change the records, and needs no running station.
     """
     need("The supervisor pages", "web")
     return _call("pages.serve", output, web, pages, records)
@@ -300,7 +302,7 @@ def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOpt
 
 @station.action("pin")
 def pin(output: Output) -> int:
-    """Print the hash of a PIN, for the badge table. The PIN is typed, and not shown."""
+    """Ask for a PIN, without showing it, and print its hash for the badge table."""
     return _call("setup.pin", output)
 
 
@@ -309,33 +311,35 @@ class ReportOptions:
     """Selection of runs, and the files to write."""
 
     lot: Annotated[str | None, option(
-        "--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot",
+        "--lot", metavar="NAME", panel=_WHICH, brief=True, help="runs of this lot",
     )]  # fmt: skip
     recipe: Annotated[str | None, option(
-        "--recipe", metavar="NAME", panel=_WHICH, help="by the recipe of this name",
+        "--recipe", metavar="NAME", panel=_WHICH, help="runs by this recipe",
     )]  # fmt: skip
-    part: Annotated[str | None, option("--part", metavar="NAME", panel=_WHICH, help="of this part")]
+    part: Annotated[str | None, option(
+        "--part", metavar="NAME", panel=_WHICH, help="runs of this part",
+    )]  # fmt: skip
     serial: Annotated[str | None, option(
-        "--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number",
+        "--serial", metavar="SERIAL", panel=_WHICH, help="runs of this serial number",
     )]  # fmt: skip
     since: Annotated[str | None, option(
         "--since", metavar="TIME", panel=_WHICH, brief=True,
-        help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
+        help="runs begun at this time or later: 2026-05-17, or 2026-05-17T06:00",
     )]  # fmt: skip
     until: Annotated[str | None, option(
-        "--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before",
+        "--until", metavar="TIME", panel=_WHICH, brief=True, help="runs begun before this time",
     )]  # fmt: skip
     csv: Annotated[Path | None, _path_option(
-        "--csv", panel=_WRITTEN, brief=True, help="one row a run",
+        "--csv", panel=_WRITTEN, brief=True, help="a table with a row for each run",
     )]  # fmt: skip
     json_report: Annotated[Path | None, _path_option(
-        "--json-report", panel=_WRITTEN, help="figures and runs",
+        "--json-report", panel=_WRITTEN, help="figures and runs, as JSON",
     )]  # fmt: skip
     junit: Annotated[Path | None, _path_option(
-        "--junit", panel=_WRITTEN, help="one test case a run",
+        "--junit", panel=_WRITTEN, help="JUnit XML with a test case for each run",
     )]  # fmt: skip
     certificates: Annotated[Path | None, _path_option(
-        "--certificates", metavar="DIR", panel=_WRITTEN, help="a page to print for each unit (HTML)"
+        "--certificates", metavar="DIR", panel=_WRITTEN, help="a certificate (HTML) for each unit"
     )]  # fmt: skip
 
 
@@ -367,7 +371,7 @@ def unit(
 
 
 @station.action("backup")
-@argument("file", type=values.FilePath(gives=Path), metavar="FILE", help="where the copy goes")
+@argument("file", type=values.FilePath(gives=Path), metavar="FILE", help="the file to write")
 @_records_options
 def backup(output: Output, file: Path, records: RecordsOptions) -> int:
     """Copy the records while the station runs."""
@@ -375,13 +379,13 @@ def backup(output: Output, file: Path, records: RecordsOptions) -> int:
 
 
 @station.action("roles")
-@option("--station-role", metavar="NAME", default="flasher_station", help="it adds records")
-@option("--reader-role", metavar="NAME", default="flasher_reader", help="it reads them")
+@option("--station-role", metavar="NAME", default="flasher_station", help="user that adds records")
+@option("--reader-role", metavar="NAME", default="flasher_reader", help="user that reads records")
 @_records_options
 def roles(output: Output, station_role: str, reader_role: str, records: RecordsOptions) -> int:
-    """Give two users of a PostgreSQL server their rights, as the owner of the database: one for
-    stations, which adds records, and one that reads them. Neither can delete records, or change
-    tables and triggers. Missing users and records are created.
+    """Grant rights to two users of a PostgreSQL database: one for stations, which adds records, and
+    one that reads them. Neither can delete records, or change tables and triggers. Missing users
+    and records are created. Run it as the owner of the database.
     """
     return _call("maintenance.roles", output, records, station_role, reader_role)
 
@@ -389,7 +393,8 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
 @station.action("verify")
 @option(
     "--all", "is_all", is_flag=True, brief=True,
-    help="examine everything again; else what came after the last examination without a problem",
+    help="examine everything again; default: only records since the last examination without "
+    "problems",
 )  # fmt: skip
 @_path_option(
     "--certificate", brief=True,
@@ -400,7 +405,7 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
 def verify(
     output: Output, records: RecordsOptions, certificate: Path | None, *, is_all: bool
 ) -> int:
-    """Check whether the records, or a certificate of them, were changed."""
+    """Check whether records, or a certificate, were changed after they were written."""
     if certificate is not None:
         return _call("maintenance.verify_certificate", output, records, certificate)
     return _call("maintenance.verify", output, records, is_all=is_all)
@@ -408,7 +413,7 @@ def verify(
 
 @station.action("key")
 @option("--rotate", is_flag=True, brief=True, help="sign with a new key from now on")
-@option("--lost", is_flag=True, help="the key is gone: go on with a new one (needs --reason)")
+@option("--lost", is_flag=True, help="the key was lost: use a new one (needs --reason)")
 @_operator_option
 @_reason_option(required=False)
 @_records_options
@@ -431,8 +436,8 @@ def key(
 @argument(
     "what",
     type=click.Choice(("clock", "restored")),
-    help="clock: it is right, though records of a later time are there; restored: the records are "
-    "an older copy, and what they lack is lost",
+    help="clock: the clock is right, although the records contain later times; restored: the "
+    "records are an older copy, and newer records are lost",
 )
 @_operator_option
 @_reason_option(required=True)
@@ -440,14 +445,14 @@ def key(
 def accept(
     output: Output, what: str, operator: str | None, reason: str, records: RecordsOptions
 ) -> int:
-    """Let the station continue, and record who decided it."""
+    """Let a station continue after a problem, and record who decided it."""
     return _call("maintenance.accept", output, records, what, operator, reason)
 
 
 @station.action("upgrade")
 @_records_options
 def upgrade(output: Output, records: RecordsOptions) -> int:
-    """Migrate records of an older flasher. A file is backed up first; a server has to be backed up
-    before (pg_dump), and its owner migrates it.
+    """Migrate records of an older flasher. An SQLite file is backed up first; back up a PostgreSQL
+    database yourself (pg_dump), and migrate it as its owner.
     """
     return _call("maintenance.upgrade", output, records)

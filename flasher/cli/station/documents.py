@@ -38,9 +38,9 @@ class CheckedTargetDocument:
     sha256: str
     size_bytes: int
     version: str
-    """Empty when nobody says it."""
+    """Empty when neither image nor manifest has one."""
     required: str
-    """How far it is verified, in words."""
+    """Required verification, in words."""
 
 
 @dataclass(frozen=True)
@@ -65,25 +65,25 @@ class FindingsDocument:
 
 @dataclass(frozen=True)
 class FiguresDocument:
-    """The figures of runs. Golden units count in none of them."""
+    """The figures of runs. They exclude golden units."""
 
     runs: int
     units: int
-    """Units with a run that told PASS from FAIL."""
+    """Units with at least one run that ended in PASS or FAIL."""
     passed: int
     first_passed: int
     """Units whose first such run is a PASS."""
     yield_share: float | None
-    """Of 1; null without units."""
+    """From 0 to 1; null without units."""
     first_pass_share: float | None
     by_state: dict[str, int]
     failures: dict[str, int]
-    """Runs that are no PASS, by code."""
+    """Runs that ended in another state than PASS, by code."""
     duration_median_s: float | None
     """Of runs that passed."""
     duration_longest_s: float | None
     virtual_runs: int
-    """Runs of virtual units among all of these: no products."""
+    """Runs of virtual units, which are counted above too; none of them made a product."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,13 @@ class StationRunDocument:
     recipe: str
     revision: str
     records: str
-    """Where they are; empty for virtual units that are recorded nowhere."""
+    """Path or URL of the records; empty for virtual units whose records were not kept."""
     is_complete: bool
-    """False when it was ended before the scans, or the virtual units, were used up."""
+    """False when it was ended before all scans, or virtual units, were done."""
     figures: FiguresDocument | None
     """null when they cannot be read."""
     units: list[RunEnded]
-    """How the last run of each ended."""
+    """The last run of each unit."""
     refused: list[ScanRefused]
 
 
@@ -114,7 +114,7 @@ class StationReportDocument:
 
 @dataclass(frozen=True)
 class UnitTraceDocument:
-    """A trace of a run, explained."""
+    """The explanation of a run's trace."""
 
     run_id: int
     sha256: str
@@ -139,9 +139,9 @@ class RoleDocument:
 
     name: str
     may: str
-    """"add" records, or only "read" them."""
+    """"add" or "read": adds and reads records, or only reads them."""
     is_new: bool
-    """It was made now, and has no password yet."""
+    """True for a user created by this command, which has no password yet."""
 
 
 @dataclass(frozen=True)
@@ -162,10 +162,9 @@ class SigningKeyDocument:
     """The public key, in hexadecimal digits."""
     file: str
     is_there: bool
-    """The file is where it has to be."""
+    """True when the file exists."""
     heads: tuple[str, ...]
-    """The places where the signed heads of the audit trail are kept, the one beside the key
-    first."""
+    """Places with the signed heads of the audit trail; the first is the one beside the key."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +198,7 @@ DOCUMENTS: Final = (
     Upgraded,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
-"""Every event of a station, as it happens."""
+"""The events of a station, which are printed while it runs."""
 
 
 def figures_document(figures: Figures) -> FiguresDocument:

@@ -32,7 +32,7 @@ from flasher.station.records.store import Store, SystemClock
 from flasher.station.records.upgrade import upgrade as upgrade_records
 from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 
-ELSEWHERE: Final = "a head kept elsewhere"
+ELSEWHERE: Final = "heads stored elsewhere"
 
 
 def _open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
@@ -96,8 +96,8 @@ def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> i
 
 
 def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
-    """A line for each problem; problems of the schema with one cause share a line, and come
-    first.
+    """Format problems, one on each line. Problems of the schema come first; those with the same
+    cause share a line.
     """
     schema, others = "schema, ", []
     alike: dict[str, list[str]] = {}
@@ -120,35 +120,35 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
         output.result(f"records, traces and audit trails{since} are as they were written")
     elif found.kept:
         output.result(
-            f"nothing in the records{since} differs; NOT CHECKED as a whole against {ELSEWHERE}:"
-            " whoever can write beside the key could have made records and heads anew"
+            f"no difference in the records{since}; NOT CHECKED as a whole against {ELSEWHERE}:"
+            " whoever can write beside the key could have forged records and heads"
         )
     else:
-        output.result(f"nothing in the records{since} differs; NOT CHECKED against {ELSEWHERE}")
+        output.result(f"no difference in the records{since}; NOT CHECKED against {ELSEWHERE}")
     if since:
-        output.result("  what is older was examined then; --all examines everything again")
+        output.result("  older records were examined then; --all examines everything again")
     for each in found.kept:
         where = "the heads in" if each.is_elsewhere else "the heads beside the key, in"
         rows = f"{each.station}: rows {each.first:,} to {each.last:,}"
         output.result(printable(f"  {rows} match {where} {each.place}"))
         if each.first > 1:
-            output.result(f"    the rows before row {each.first:,} are compared with no head there")
+            output.result(f"    rows before row {each.first:,} have no head there")
         if each.last < each.rows:
-            output.result(f"    the rows after row {each.last:,} are not kept there yet")
+            output.result(f"    rows after row {each.last:,} have no head there yet")
     beside = {each.station for each in found.kept}
     for name in found.unkept:
-        missing = "no heads are kept elsewhere than beside the key"
+        missing = "heads are stored only beside the key"
         if name not in beside:
-            missing = "no heads of it were found; an older copy would look the same"
+            missing = "no heads were found; an older copy of the records could not be detected"
         output.result(f"  {printable(name)}: {missing}")
     output.result(f"  {counted(found.traces, 'trace')} of runs that passed agree with the records")
     if found.unkept and not found.unreached:
         output.progress(
-            "Name a second place of the heads: heads in the station's file, or --heads."
+            "Name another place for the heads: `heads` in the station file, or --heads."
         )
 
 
-# -- the key and what a person answers for --------------------------------------------------------
+# -- the key, and decisions of people --------------------------------------------------------------
 
 
 def key(
@@ -163,7 +163,7 @@ def key(
     with closing(_open_as_station(records, changes=rotate or lost)) as store:
         if lost:
             if not reason:
-                raise UsageError("A lost key needs a reason.", remedy="Add --reason TEXT.")
+                raise UsageError("--lost needs a reason.", remedy="Add --reason TEXT.")
             store.replace_lost_key(operator_of(operator), reason)
         elif rotate:
             store.rotate_key(operator_of(operator))
@@ -195,11 +195,11 @@ def accept(
     with closing(_open_as_station(records, changes=True)) as store:
         if what == "clock":
             store.release_clock(who, reason)
-            said = "the clock is released; the station may begin units from now on"
+            done = "the clock was accepted; the station may begin units from now on"
         else:
             lost = store.accept_restored(who, reason)
-            said = f"the station goes on; {counted(lost, 'audit row')} of it given up as lost"
-    output.result(f"{printable(store.station)}: {said}")
+            done = f"the restored records were accepted; {counted(lost, 'audit row')} lost"
+    output.result(f"{printable(store.station)}: {done}")
     return output.document(AcceptedDocument(station=store.station, what=what))
 
 
@@ -220,7 +220,7 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
     if done.before == done.after:
         output.result(f"schema {done.after}: nothing to do")
     else:
-        output.result(f"brought from schema {done.before} to schema {done.after}")
+        output.result(f"upgraded from schema {done.before} to schema {done.after}")
     if done.backup is not None:
         output.result(f"  backup: {printable(str(done.backup))}")
     for each in done.problems:
@@ -233,7 +233,7 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
 
 
 def roles(output: Output, records: RecordsOptions, station_role: str, reader_role: str) -> int:
-    """Creates missing records: a station without the right to create tables needs them."""
+    """Also creates missing records, since a station has no right to create tables."""
     place = records_of(records)
     location = locate(place.url, Path())
     check_roles(location, station_role, reader_role)

@@ -52,17 +52,17 @@ from flasher.web.supervisor import CHECK, PAGES, place_of, serve_supervisor, upl
 _TURN_S: Final = 0.1
 PASSWORD_MIN: Final = 8
 _PASSWORD_FILE_MAX_SIZE: Final = 4096
-"""In bytes."""
+"""Bytes."""
 _ANY: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104  compared, not bound
 _SECRET_MAX_SIZE: Final = 200
 _LOG: Final = logging.getLogger("flasher.web")
 
 
-# -- the operator's -------------------------------------------------------------------------------
+# -- operator page --------------------------------------------------------------------------------
 
 
 class OperatorView:
-    """Hands the events and turns of a station to the screen; called in the station's thread."""
+    """Passes the events of a station to the operator page; called in the station's thread."""
 
     def __init__(self, screen: Screen, station: Station, board: Board) -> None:
         self._screen = screen
@@ -70,7 +70,7 @@ class OperatorView:
         self._board = board
         self._lot = ""
         self._good: dict[str, bool] = {}
-        """Units of the lot, and whether each passed in the end."""
+        """Units of the lot by serial number: True when the last run passed."""
 
     def show(self, event: StationEvent) -> None:
         """Show an event that the board has applied."""
@@ -79,7 +79,7 @@ class OperatorView:
         self._screen.show(event, self._board)
 
     def turn(self) -> None:
-        """Once in each turn of the station's loop."""
+        """Update the operator and the lot; called once in each turn of the station's loop."""
         line, board = self._station.line, self._board
         rule = self._station.recipe.recipe
         if rule.lot.quantity_max and line.lot != self._lot:
@@ -87,7 +87,7 @@ class OperatorView:
             self._good = {run.serial: run.state is RunState.PASS for run in runs}
         self._lot = line.lot
         lot = CurrentLot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
-        operator = line.operator or text("nobody: scan a badge")
+        operator = line.operator or text("none: scan a badge")
         if not board.has_badges:
             operator = text("{name} (no badges)", name=line.operator)
         self._screen.turn(board, operator=operator, lot=lot)
@@ -104,10 +104,8 @@ def operator_page(
     keeping: KeyLocations | None,
     people: Sequence[Person],
 ) -> Iterator[tuple[OperatorView, str]]:
-    """Serve the page, and those of the supervisor beside it, while the block runs; gives its view
-    and its address. `keeping` and `people`: as `served` has them.
-
-    Raises UsageError.
+    """Serve the operator page and the supervisor pages while the block runs. Yields the view and
+    the URL. `keeping` and `people`: see `served`. Raises UsageError.
     """
     tally = ShiftCounts(config.shifts)
     began = tally.began(datetime.now().astimezone())
@@ -121,7 +119,7 @@ def operator_page(
     pages = Pages(options.language)
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
-    # In processes of their own: a page takes no time from the station.
+    # In processes of their own, so that pages do not slow the station down.
     answering = QueryProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
     routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     server = served(
@@ -143,7 +141,7 @@ def operator_page(
             screen.feed.close()
 
 
-# -- the supervisor's alone -----------------------------------------------------------------------
+# -- supervisor pages only ------------------------------------------------------------------------
 
 
 def serve(output: Output, address: Address, options: PagesOptions, records: RecordsOptions) -> int:
@@ -151,7 +149,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
     shifts = DEFAULT_SHIFTS if config is None else config.shifts
     badges = "" if config is None else config.badges
     people = BADGES.load(Path(badges)).person if badges else ()
-    with closing(open_to_read(records)) as store:  # what is wrong with them is said before
+    with closing(open_to_read(records)) as store:  # fails before the pages are served
         place = place_of(store)
     pages = Pages(options.language)
     answering = QueryProcesses(partial(serve_supervisor, *place, shifts))
@@ -168,7 +166,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
             people=people,
             is_supervised=lambda _path: True,
             clock=SystemClock(),
-            # The trail is written by the station alone.
+            # Only a station writes the audit trail.
             note=lambda event, data: _LOG.info("%s: %s", event.value, printable(str(data))),
             checker=checker(),
         ) as url,
@@ -184,7 +182,7 @@ async def _start(_request: Request) -> Response:
     return RedirectResponse("/runs", 303)
 
 
-# -- who may see them ------------------------------------------------------------------------------
+# -- access ----------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -201,11 +199,12 @@ def served(
     note: Note,
     checker: Executor,
 ) -> Iterator[str]:
-    """Serve pages while the block runs; gives their address. `keeping`: where the secret of the
-    cookies is kept, so that a page that is open works after a restart; None for no place. `people`:
-    those with a badge, of whom supervisors alone see the pages that `is_supervised` tells by their
-    path; without people everybody sees them. `note` takes who signs in and out; `checker` checks
-    PINs. Raises UsageError.
+    """Serve pages while the block runs; yields their URL. Raises UsageError.
+
+    `keeping`: location of the secret that signs cookies, so that open pages survive a restart;
+    None: the secret is not stored. `people`: the people with a badge; only their supervisors may
+    open paths for which `is_supervised` is true. Without people everyone may. `note` records
+    sign-ins and sign-outs; `checker` runs the check of PINs.
     """
     password, tls = _password(options), _tls(options)
     _check_open(options, address, has_password=bool(password or people), has_tls=tls is not None)
@@ -214,7 +213,7 @@ def served(
     if people:
         badges = Badges(
             people,
-            # A badge alone is no more than paper: it is not enough in place of a password.
+            # A badge can be copied: alone it does not replace a password.
             needs_pin=is_far or bool(password),
             is_supervised=is_supervised,
             are_for_all=is_far and not password,
@@ -252,13 +251,13 @@ def _check_open(
         return
     if not (has_tls or options.web_insecure):
         raise UsageError(
-            f"Other computers could reach the pages on {address.host}, and read along.",
-            remedy="Give --web-certificate and --web-key; --web-insecure does without.",
+            f"The pages on {address.host} would be served to other computers without TLS.",
+            remedy="Give --web-certificate and --web-key, or allow it with --web-insecure.",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
     if not has_password:
         raise UsageError(
-            f"Other computers could reach the pages on {address.host}, without a password.",
+            f"The pages on {address.host} would be open to other computers without a password.",
             remedy="Give --web-password FILE, or a badge table (--badges).",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
@@ -268,7 +267,7 @@ def _tls(options: PagesOptions) -> Tls | None:
     certificate, key = options.web_certificate, options.web_key
     if (certificate is None) != (key is None):
         raise UsageError(
-            "--web-certificate and --web-key belong together.",
+            "--web-certificate and --web-key need each other.",
             remedy="Give both.",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
@@ -283,16 +282,18 @@ def _password(options: PagesOptions) -> str:
     text = data.decode("utf-8", "replace").partition("\n")[0].strip()
     if len(text) < PASSWORD_MIN:
         raise UsageError(
-            f"The password of the pages has less than {PASSWORD_MIN} characters.",
+            f"The password of the pages has fewer than {PASSWORD_MIN} characters.",
             where="--web-password",
-            remedy="Write a longer one into the first line of the file.",
+            remedy="Write a longer password into the first line of the file.",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
     return text
 
 
 def kept_secret(keeping: KeyLocations) -> str:
-    """What signs the cookies of the pages, for this user alone; made where there is none."""
+    """Read the secret that signs the cookies of the pages from a file of this user; create the file
+    if it is missing. Raises UsageError.
+    """
     path: Path = keeping.keys_folder / "pages.secret"
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -301,15 +302,15 @@ def kept_secret(keeping: KeyLocations) -> str:
             with os.fdopen(handle, "w", encoding="ascii") as file:
                 file.write(secrets.token_urlsafe(32))
         except OSError:
-            path.unlink()  # an empty one would be found at every start from now on
+            path.unlink()  # else every later start would find an empty file
             raise
     except FileExistsError:
         pass
     except OSError as error:
         raise UsageError(
             f"{path} cannot be written: {error.strerror or error}.",
-            remedy="Give another place with --keys.",
+            remedy="Name another folder with --keys.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
-    found = read(path, _SECRET_MAX_SIZE, what="secret of the pages").decode("ascii", "replace")
-    return found or secrets.token_urlsafe(32)
+    secret = read(path, _SECRET_MAX_SIZE, what="secret of the pages").decode("ascii", "replace")
+    return secret or secrets.token_urlsafe(32)

@@ -17,7 +17,7 @@ from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
 
 _READER: Final = "report"
-"""A reader is not a station: it claims no unit."""
+"""Station name of a reader, which claims no units."""
 
 
 @dataclass(frozen=True)
@@ -76,23 +76,23 @@ def _path(text: str) -> Path | None:
 
 
 def open_to_read(options: RecordsOptions) -> Store:
-    """The records as they are: nothing of them is changed. Raises UsageError, RecordError."""
+    """Open the records for reading only. Raises UsageError, RecordError."""
     return records_of(options).open(_READER, read_only=True)
 
 
 def the_station(names: tuple[str, ...]) -> str:
-    """The only station of the records. Raises UsageError."""
+    """The only station of the records. Raises UsageError if they have none or several."""
     if len(names) != 1:
-        found = ", ".join(map(printable, names)) or "none"
+        listed = ", ".join(map(printable, names)) or "none"
         raise UsageError(
-            f"Which station is meant? The records know: {found}.",
-            remedy="Name its file with --sockets.",
+            f"The records do not have exactly one station: {listed}.",
+            remedy="Name the file of the station with --sockets.",
         )
     return names[0]
 
 
 def operator_of(named: str | None) -> str:
-    """Who works here."""
+    """The named operator, else the user of the computer."""
     try:
         return named or getpass.getuser()
     except (OSError, KeyError):

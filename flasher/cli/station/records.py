@@ -87,29 +87,31 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
 
 
 def _moment(text: str | None, option: str) -> datetime | None:
-    """A time of the clock on the wall, unless it names its zone."""
+    """Parse a time, local unless it has a time zone. Raises UsageError."""
     if text is None:
         return None
     try:
         return datetime.fromisoformat(text).astimezone()
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"{text!a:.40} is no time.",
+            f"{text!a:.40} is not a time.",
             where=option,
             remedy="Write 2026-05-17 or 2026-05-17T06:00.",
         ) from error
 
 
 def _certificates(folder: Path, report: Report, store: Store, output: Output) -> int:
-    """Write the pages; for how many units there is none, since their records were changed."""
+    """Write a certificate for each unit. Returns the number of units that got none, because their
+    records were changed.
+    """
     option = "--certificates"
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(
-            f"{printable(str(folder))} cannot be made: {error.strerror}.",
+            f"{printable(str(folder))} cannot be created: {error.strerror}.",
             where=option,
-            remedy="Name a folder in a folder that exists.",
+            remedy="Name a folder whose parent exists.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
     units = sorted({(run.serial, run.part) for run in report.runs})
@@ -117,21 +119,21 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
     lives = [store.read.unit(serial, part) for serial, part in units]
     refused = 0
     for life in lives:
-        # Two parts may have one serial number; no name leads out of the folder.
+        # Two parts may have the same serial number. The name is quoted to stay in the folder.
         name = life.serial if serials.count(life.serial) == 1 else f"{life.part} {life.serial}"
         page = folder / f"{quote(name, safe=' ').replace('.', '%2E')}.html"
         try:
             write_whole(page, certificate(store, life), option)
         except UnprovenError as error:
             refused += 1
-            output.result(printable(f"no page for {life.serial}: {error.cause}"))
-    written = counted(len(units) - refused, "page")
+            output.result(printable(f"no certificate for {life.serial}: {error.cause}"))
+    written = counted(len(units) - refused, "certificate")
     output.progress(f"written: {written} in {printable(str(folder))}")
     return refused
 
 
 def certificate(store: Store, life: UnitLife) -> bytes:
-    """The page of a unit. Raises UnprovenError where its records were changed."""
+    """Render the certificate of a unit. Raises UnprovenError when its records were changed."""
     from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
     proof = proven(store, life)
@@ -153,15 +155,15 @@ def unit(
     with closing(open_to_read(records)) as store:
         check_writable(page, "--certificate")
         life = store.read.unit(serial, part)
-        told: dict[RunId, list[str | Story]] = {}
+        stories: dict[RunId, list[str | Story]] = {}
         traces = []
         for details in life.runs:
             for file in details.attachments:
                 if file.kind in (TRACE, TORN_TRACE):
-                    found = explained(store.files, file)
-                    told.setdefault(details.run.run_id, []).append(found)
-                    traces.append(_trace_document(details.run.run_id, file, found, full=full))
-        output.results(unit_lines(life, told, full=full))
+                    story = explained(store.files, file)
+                    stories.setdefault(details.run.run_id, []).append(story)
+                    traces.append(_trace_document(details.run.run_id, file, story, full=full))
+        output.results(unit_lines(life, stories, full=full))
         if page is not None:
             write_whole(page, certificate(store, life), "--certificate")
             output.progress(f"page: {printable(str(page))}")
@@ -169,22 +171,22 @@ def unit(
 
 
 def _trace_document(
-    run_id: RunId, file: AttachmentFile, found: Story | str, *, full: bool
+    run_id: RunId, file: AttachmentFile, story: Story | str, *, full: bool
 ) -> UnitTraceDocument:
-    if isinstance(found, str):
+    if isinstance(story, str):
         return UnitTraceDocument(
-            run_id=run_id, sha256=file.sha256, cause=None, text=found, story=None
+            run_id=run_id, sha256=file.sha256, cause=None, text=story, story=None
         )
     return UnitTraceDocument(
         run_id=run_id,
         sha256=file.sha256,
-        cause=found.verdict.cause,
-        text=found.verdict.text,
-        story=found if full else None,
+        cause=story.verdict.cause,
+        text=story.verdict.text,
+        story=story if full else None,
     )
 
 
-# -- in words -------------------------------------------------------------------------------------
+# -- as text --------------------------------------------------------------------------------------
 
 
 def figure_lines(figures: Figures) -> Iterator[str]:
@@ -201,15 +203,17 @@ def figure_lines(figures: Figures) -> Iterator[str]:
 
 
 def unit_lines(
-    life: UnitLife, told: Mapping[RunId, Sequence[Story | str]], *, full: bool
+    life: UnitLife, stories: Mapping[RunId, Sequence[Story | str]], *, full: bool
 ) -> Iterator[str]:
-    """A unit's whole life; `told` are the stories of each run's traces, or why there is none."""
+    """Format all runs of a unit. `stories`: for each run the stories of its traces, or texts why
+    there is none.
+    """
     nature = ", a VIRTUAL unit, no product" if life.is_virtual else ""
     yield printable(f"{life.serial}, part {life.part}: {life.state.value}{nature}")
     for details in life.runs:
         yield ""
         yield from _run_lines(details)
-        for story in told.get(details.run.run_id, ()):
+        for story in stories.get(details.run.run_id, ()):
             yield from _story_lines(story, full=full)
 
 
@@ -251,14 +255,14 @@ def _write_line(write: WriteRecord) -> str:
 
 def _step_lines(step: StepRecord) -> Iterator[str]:
     tries = f", try {step.try_number}" if step.try_number > 1 else ""
-    said = f"  {step.code}: {step.text}" if step.code else ""
+    cause = f"  {step.code}: {step.text}" if step.code else ""
     name = f"{step.name}{tries}"
     yield printable(
-        f"  step:     {name:<14} {step.state.value:<7} {duration(step.duration_s)}{said}"
+        f"  step:     {name:<14} {step.state.value:<7} {duration(step.duration_s)}{cause}"
     )
     for each in step.measurements:
         value = each.text if each.value is None else f"{each.value:g} {each.unit}".rstrip()
-        outside = "" if each.is_within else ": outside of its limits"
+        outside = "" if each.is_within else ": outside its limits"
         yield printable(f"              {each.name}: {value}{outside}")
 
 

@@ -1,4 +1,4 @@
-"""`flasher station run`: runs a station with a view, until its scans are used up."""
+"""`flasher station run`: runs a station and shows its events, until its scans are used up."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ if TYPE_CHECKING:
     from flasher.cli.station.pages import OperatorView
 
 LAUNCH: Launch = ProcessPort
-"""How a socket's process is made."""
+"""Starts the process of a socket; tests replace it."""
 END_LIMIT_S: Final = 10.0
-"""How long stopped runs have to say their end; what does not is INTERRUPTED at the next start."""
+"""Time for stopped runs to end; runs that take longer are INTERRUPTED at the next start."""
 WAIT_LEFT_S: Final = 4.0
 """How long a label waits for its unit after the last scan."""
 RETURN_LIMIT_S: Final = 10.0
-"""A virtual unit that was exchanged in its run comes back sooner."""
+"""Time within which an exchanged virtual unit is put in again."""
 _LEAVE_S: Final = 2.0
-"""A verdict on a virtual unit can be read so long."""
+"""How long the verdict on a virtual unit is shown."""
 
 
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
-    """Run the command; returns the exit code. Without a terminal it speaks JSON."""
+    """Run the command and return its exit code. Without a terminal the output is JSON."""
     is_terminal = sys.stdout.isatty()
     if not (is_terminal or options.lines):
         output.json_wanted = True
@@ -80,7 +80,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
             is_temporary=_is_temporary(options, records),
         )  # fmt: skip
         first = 1
-        if is_virtual:  # numbers that these records do not know yet
+        if is_virtual:  # serial numbers that are not in the records yet
             known = partial(store.read.known, recipe.recipe.part)
             first = next_number(recipe.recipe.serial_number, known)
         session.station = Station(
@@ -121,8 +121,8 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 def _find_sockets(
     options: RunOptions, file: Path | None
 ) -> tuple[StationConfig, tuple[Resolved, ...]]:
-    """The station that the options name, and its sockets with their adapters. Raises UsageError,
-    BusError for a missing adapter.
+    """The station file or virtual station of the options, with the adapters of its sockets. Raises
+    UsageError, and BusError for a missing adapter.
     """
     if file is not None and options.mock_sockets is None:
         config = load_config(file)
@@ -130,8 +130,8 @@ def _find_sockets(
         shares = {"bad": options.mock_bad, "slow": options.mock_slow, "dead": options.mock_dead}
         if sum(shares.values()) > 1:
             raise UsageError(
-                "--mock-bad, --mock-slow and --mock-dead are more than all units together.",
-                remedy="Their sum is 1 at the most.",
+                "--mock-bad, --mock-slow and --mock-dead add up to more than 1.",
+                remedy="Give smaller shares.",
             )
         units = MockUnits(
             **shares,
@@ -142,19 +142,19 @@ def _find_sockets(
         config = mock_config(options.mock_sockets, units)
     else:
         raise UsageError(
-            "A station needs either its sockets or virtual ones.",
-            remedy="Give --sockets FILE, or --mock-sockets N.",
+            "A station needs either a station file or virtual sockets.",
+            remedy="Give --sockets FILE or --mock-sockets N.",
         )
     sockets = resolve(config.socket, detect(config.socket))
     given = [name for name in ("units", "scan_by_hand") if getattr(options, name)]
     if given and any(socket.bus is not None for socket in sockets):
         raise UsageError(
             f"--{given[0].replace('_', '-')} is for virtual units; this station has adapters.",
-            remedy="Leave it out.",
+            remedy="Remove it.",
         )
     if options.units and options.scans is not None:
         raise UsageError(
-            "--units and --scans both say when the station ends.", remedy="Leave one of them out."
+            "--units and --scans both decide when the station ends.", remedy="Remove one of them."
         )
     return config, sockets
 
@@ -168,7 +168,7 @@ def _is_temporary(options: RunOptions, records: RecordsOptions) -> bool:
 def _opened_records(
     options: RunOptions, records: RecordsOptions, config: StationConfig, output: Output
 ) -> Iterator[Store]:
-    """The records; those of virtual units without --database are gone afterwards.
+    """Open the records; temporary ones for virtual units without --database.
 
     Raises UsageError, RecordError.
     """
@@ -184,7 +184,7 @@ def _opened_records(
 
 @dataclass
 class _Session:
-    """A station at work, from its start to its end."""
+    """One run of the command, from the start of the station to its end."""
 
     options: RunOptions
     pages: PagesOptions
@@ -195,7 +195,7 @@ class _Session:
     config: StationConfig
     is_virtual: bool
     is_temporary: bool
-    """The records are gone afterwards."""
+    """The records are deleted afterwards."""
     station: Station = field(init=False)
     file: ScanFile | None = None
     _pipe: LineReader | None = None
@@ -203,16 +203,16 @@ class _Session:
     _was_submitted: bool = False
     _is_used_up: bool = False
     _busy_at: float = 0.0
-    """When something went on last."""
+    """When a socket was last busy, in monotonic seconds."""
     _used_up_at: float = 0.0
-    """When the last scan was submitted."""
+    """When the last scan was submitted, in monotonic seconds."""
     _failure: FlasherError | None = None
     _page: OperatorView | None = None
     _is_begun: bool = False
 
     @property
     def scans_itself(self) -> bool:
-        """Nobody has to scan the labels of its virtual units."""
+        """True when the station scans the labels of its virtual units itself."""
         options = self.options
         by_hand = options.scan_by_hand or self.crew is not None or bool(self.config.scanner)
         return self.is_virtual and options.scans is None and not by_hand
@@ -220,8 +220,8 @@ class _Session:
     # -- at work ----------------------------------------------------------------------------------
 
     def work(self) -> None:
-        """Until the scans are used up, or somebody ends it. Raises RecordError when the station
-        cannot begin.
+        """Run the station until its scans are used up or it is stopped. Raises RecordError when it
+        cannot start.
         """
         try:
             with ExitStack() as stack:
@@ -234,7 +234,7 @@ class _Session:
             self._failure = _stopped_now()
 
     def _open_page(self, stack: ExitStack) -> None:
-        """Serve the pages, where they are asked for. Raises UsageError."""
+        """Serve the pages with --web. Raises UsageError."""
         address = self.options.web
         if address is None:
             return
@@ -259,7 +259,7 @@ class _Session:
             self._page.show(event)
 
     def turn(self) -> None:
-        """Once in each turn of the station's loop."""
+        """Refresh the view; called once in each turn of the station's loop."""
         if not self._is_begun:
             self._is_begun = True
             if (page := self.view.board.page) and not isinstance(self.view, Table):
@@ -272,9 +272,7 @@ class _Session:
             self._page.turn()
 
     def _open_scans(self, stack: ExitStack) -> None:
-        """Listen to the scanners; to the keyboard, or to the pipe where that is where the scans
-        come from. Raises UsageError.
-        """
+        """Open all sources of scans: scanners, keyboard or pipe. Raises UsageError."""
         for scanner in scanners_of(self.config, self.station):
             stack.enter_context(scanner)
         if sys.stdin is None:
@@ -282,7 +280,7 @@ class _Session:
         if sys.stdin.isatty():
             submit = partial(self.station.submit, source=TERMINAL)
             has_pins = self.crew is not None and self.crew.has_pins
-            if isinstance(self.view, Table) or has_pins:  # what is typed is not echoed
+            if isinstance(self.view, Table) or has_pins:  # no echo of typed text
                 self._typing = Typing(submit)
                 stack.enter_context(keyboard(self._typing))
             else:
@@ -292,19 +290,19 @@ class _Session:
             self._pipe.start()
 
     def _second_stop(self) -> None:
-        """A second Ctrl-C; called in the handler of the signal."""
-        # No exception: it could tear the station's turn, and a socket would wait for its answer.
+        """Abort all runs after a second Ctrl-C; called in the signal handler."""
+        # No exception: inside a turn of the station it could leave a socket without its reply.
         self._failure = _stopped_now()
         self.station.abort_all()
 
     def _first_stop(self) -> None:
-        text = "No further unit is begun; those that run are finished. Ctrl-C again stops them."
+        text = "No further unit starts; running ones are finished. Ctrl-C again stops them."
         self.view.board.speak(text)
         self.output.progress(text)
         self.view.refresh()
 
     def _is_over(self, *, is_stopped: bool) -> bool:
-        """Asked once a turn, in the station's thread."""
+        """True when the station has to end; called once in each turn, in the station's thread."""
         if is_stopped:
             return True
         try:
@@ -321,8 +319,8 @@ class _Session:
             (self.file or self.scans_itself) and not (self._typing or self._page)
         )
         if self.station.line.stopped is not None and is_alone:
-            return not self.station.is_running  # nobody is there who could scan RESUME
-        # What was submitted last is understood only in the station's next turn.
+            return not self.station.is_running  # no further scan, so no RESUME can come
+        # The station handles a submitted scan only in its next turn.
         was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
         self._drop_what_waits()
         is_busy = any(socket.is_busy for socket in self.station.line.sockets.values())
@@ -336,7 +334,7 @@ class _Session:
         return self._is_used_up
 
     def _drop_what_waits(self) -> None:
-        """When no scan follows: a card or label that still waits for its unit is not done."""
+        """Drop cards and labels that still wait for a unit some time after the last scan."""
         now = self.station.clock.monotonic_s()
         is_starting = any(socket.is_starting for socket in self.station.line.sockets.values())
         if self.scans_itself or is_starting or not self._was_submitted:
@@ -351,7 +349,7 @@ class _Session:
             name, reason = next(iter(broken.items()))
             raise BusError(
                 f"No socket can work; socket {printable(name)}: {printable(reason)}",
-                remedy="Mend it, then start the station again.",
+                remedy="Repair it, then start the station again.",
                 code=ErrorCode.NO_SOCKET,
             )
 
@@ -363,7 +361,7 @@ class _Session:
             return wanted is not None and len(self.view.board.arrived) >= wanted
         return self._pipe is not None and self._pipe.is_at_end
 
-    # -- its end ----------------------------------------------------------------------------------
+    # -- summary ----------------------------------------------------------------------------------
 
     def report(self) -> int:
         """Print the summary; returns the exit code."""
@@ -375,12 +373,12 @@ class _Session:
             is_record = stopped.code == codes.RECORD_NOT_SAVED.name
             kind = RecordError if is_record else UsageError
             error = kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
-        # A list of scans has an end; a shift has none.
+        # Only a list of scans can be incomplete: a shift ends whenever a person ends it.
         is_list = self.file is not None or bool(self.options.units)
         if error is None and is_list and not self._is_used_up:
             error = InterruptedByUserError(
-                "Ended before all units were done.",
-                remedy="Start it again with those that are left.",
+                "The station was ended before all units were done.",
+                remedy="Start it again with the remaining units.",
             )
         if error is not None:
             self.output.failure(error, self._document())
@@ -389,8 +387,8 @@ class _Session:
         return code
 
     def _not_done(self) -> list[str]:
-        """Labels that have no run: of the file those that were refused, of standard input those
-        that still waited at its end.
+        """Labels without a run: refused labels of the file, or those of standard input that still
+        waited at its end.
         """
         refused = {
             each.text
@@ -435,5 +433,6 @@ class _Session:
 
 def _stopped_now() -> InterruptedByUserError:
     return InterruptedByUserError(
-        "Stopped at once.", remedy="Units that were being flashed are RECHECK: scan them again."
+        "The station was stopped during runs.",
+        remedy="Units that were being flashed are RECHECK: scan them again.",
     )

@@ -1,6 +1,6 @@
-"""Where scans come from while a station runs: keys on a terminal (a scanner is a keyboard), the
-lines of a pipe, or a file, of which each label is submitted when a unit waits for it. Keys and
-lines are read by a thread, which only hands texts on.
+"""Sources of scans for a running station: keys of a terminal (scanners act as keyboards), lines of
+a pipe, or a file whose labels are submitted when units wait for them. A thread reads keys and
+lines, and only passes them on.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flasher.station.scans import Command, Label, Word, understand
 from flasher.station.socket import Socket
 
 _ESCAPES: Final = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
-"""Arrows and other keys that are no text."""
+"""Escape sequences of arrows and other keys that type no character."""
 _BACK: Final = "\x08\x7f"
 _CLEAR: Final = "\x15\x03"
 """Ctrl-U."""
@@ -33,37 +33,37 @@ _LINE_MAX: Final = 300
 _POLL_S: Final = 0.1
 Submit = Callable[[str], None]
 FILE_MAX_SIZE: Final = 4 * 1024 * 1024
-"""In bytes."""
+"""Bytes."""
 OPTION: Final = "--scans"
 _AGAIN_MAX: Final = 3
 
 
 def read_scans(path: Path) -> list[str]:
-    """The scans of a file; empty lines and those that begin with # are none. Raises UsageError."""
+    """Read the scans of a file, without empty lines and comments (#). Raises UsageError."""
     shown = printable(str(path))
     raw = read(path, FILE_MAX_SIZE, what="file of scans")
     try:
         text = raw.decode("utf-8-sig")
     except ValueError as error:
         raise UsageError(
-            f"{shown} cannot be read: it is no text.", where=OPTION, code=ErrorCode.FILE_NOT_READ
+            f"{shown} is not a text file.", where=OPTION, code=ErrorCode.FILE_NOT_READ
         ) from error
     lines = [line.strip() for line in text.splitlines()]
     scans = [line for line in lines if line and not line.startswith("#")]
     if not scans:
         raise UsageError(
-            f"{shown} holds no scans.",
+            f"{shown} contains no scans.",
             where=OPTION,
-            remedy="One scan a line: a label, or a command.",
+            remedy="Write one scan on each line: a label, or a command.",
         )
     return scans
 
 
 class ScanFile:
-    """The scans of a file. A label goes to the socket that was named before it, else to the next
-    one in which a unit waits; a virtual unit gets its own label, where the file has it.
+    """Submits the scans of a file. A label goes to the socket that a command before it names, else
+    to the next socket with a waiting unit; a virtual unit gets its own label if the file has it.
 
-    Units are waited for without end: the line is the clock.
+    Labels wait for units without a time limit.
     """
 
     def __init__(
@@ -74,23 +74,23 @@ class ScanFile:
         *,
         badges: Collection[str] = (),
     ) -> None:
-        """`badges`: scans that are no labels. Raises UsageError for a socket that there is not."""
+        """`badges`: scans that are not labels. Raises UsageError for an unknown socket."""
         names = {name.lower() for name in sockets}
         for each in map(understand, scans):
             if not isinstance(each, Command) or each.word is not Word.SOCKET:
                 continue
             if each.argument.lower() not in names:
                 raise UsageError(
-                    f"There is no socket {printable(each.argument)}.",
+                    f"The station has no socket {printable(each.argument)}.",
                     where=OPTION,
-                    remedy=f"There are: {', '.join(map(printable, sockets))}.",
+                    remedy=f"Its sockets are {', '.join(map(printable, sockets))}.",
                 )
         self._badges = badges
         self.labels = frozenset(filter(self._is_label, scans))
         self._left = deque(scans)
         self._submit = submit
         self._again: Counter[str] = Counter()
-        """How often labels were submitted once more."""
+        """How often each label was submitted again."""
 
     @property
     def is_used_up(self) -> bool:
@@ -100,9 +100,9 @@ class ScanFile:
     def turn(
         self, sockets: Iterable[Socket], borne: Mapping[str, str], exchanged: Collection[str] = ()
     ) -> None:
-        """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
-        their sockets; `exchanged` those that were taken out in their run, which are scanned again
-        when they come back. Raises UsageError where no socket can tell that a unit is in it.
+        """Submit the next scan when its unit waits. `borne`: labels of virtual units by socket;
+        `exchanged`: labels of units taken out in their run, which are scanned again when the unit
+        returns. Raises UsageError when no socket can detect units.
         """
         sockets = tuple(sockets)
         for socket in sockets:
@@ -117,7 +117,7 @@ class ScanFile:
         working = [socket for socket in sockets if socket.can_work]
         if working and not any(socket.sees_units for socket in working):
             raise UsageError(
-                "No socket of this station sees whether a unit is in it.",
+                "No socket of this station can detect whether a unit is in it.",
                 where=OPTION,
                 remedy="Scan each unit when it is in its socket.",
             )
@@ -133,7 +133,7 @@ class ScanFile:
             self._submit(self._left.popleft())
 
     def _label(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
-        """Give a label to a unit that waits."""
+        """Submit a label for a waiting unit."""
         ahead = list(takewhile(self._is_label, self._left))  # up to the next command
         for socket in sockets:
             if not (socket.awaits_label and socket.sees_units):
@@ -176,7 +176,7 @@ class Typing:
 
 
 class LineReader:
-    """Lines of a pipe, each a scan, until its end."""
+    """Reads the lines of a pipe, and submits each as a scan."""
 
     def __init__(self, stream: TextIO, submit: Submit) -> None:
         self.is_at_end = False
@@ -193,15 +193,15 @@ class LineReader:
                 if line.strip():
                     self._submit(line)
         except (OSError, ValueError):
-            pass  # closed, or no text: the end as well
+            pass  # a closed pipe, or one without text, has ended too
         finally:
             self.is_at_end = True
 
 
 @contextmanager
 def keyboard(typing: Typing) -> Iterator[None]:
-    """Read keys from the terminal into `typing` while the block runs, without echo; the terminal
-    is as before afterwards.
+    """Read keys from the terminal into `typing` while the block runs, without echo. Restores the
+    terminal afterwards.
     """
     ended = threading.Event()
     reader = _windows_keys if os.name == "nt" else _posix_keys
@@ -250,7 +250,7 @@ def _windows_keys(typing: Typing, ended: threading.Event) -> Iterator[Callable[[
             while msvcrt.kbhit():
                 key = msvcrt.getwch()
                 if key in "\x00\xe0":
-                    msvcrt.getwch()  # the second half of a key that is no text
+                    msvcrt.getwch()  # the second half of a key that types no character
                 else:
                     typing.feed(key)
 

@@ -1,4 +1,4 @@
-"""What belongs to a station beside its sockets: badges, `flasher station pin`, labels."""
+"""Sets up badges, label printer and scanners of a station; `flasher station pin`."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from flasher.station.station import Station
 
 
 def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNumber) -> Crew | None:
-    """Who has a badge; None without a table. Raises UsageError."""
+    """The people of the badge table; None without a table. Raises UsageError."""
     table = options.badges or (Path(config.badges) if config.badges else None)
     if table is None:
         return None
     given = [name for name in ("operator", "units") if getattr(options, name)]
     if given:
         raise UsageError(
-            f"--{given[0]} does not go with a badge table: "
-            + ("a badge says who works." if given == ["operator"] else "people scan the labels."),
-            remedy="Leave it out.",
+            f"--{given[0]} cannot be combined with a badge table: "
+            + ("the operator scans a badge." if given == ["operator"] else "people scan labels."),
+            remedy=f"Remove --{given[0]}.",
         )
     return Crew(load_badges(table, serial_number))
 
 
 def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | None:
-    """The printer of the labels; None without one. Raises UsageError."""
+    """The label printer; None without one. Raises UsageError."""
     label = config.label
     if label is None:
         return None
@@ -52,7 +52,7 @@ def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | Non
 
 
 def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
-    """The scanners that the station reads itself. Raises UsageError."""
+    """The scanners that the station reads directly. Raises UsageError."""
     needs = {"serial": any(each.port for each in config.scanner)}
     needs["evdev"] = not all(each.port for each in config.scanner)
     missing = [name for name, is_needed in needs.items() if is_needed and not find_spec(name)]
@@ -69,15 +69,15 @@ def pin(output: Output) -> int:
     typed = _typed("PIN: ")
     if not is_form(typed):
         raise UsageError(f"A PIN has {FORM_WORDS}.", remedy="Type another one.")
-    if sys.stdin.isatty() and _typed("The same again: ") != typed:
-        raise UsageError("The two were not the same.", remedy="Begin again.")
+    if sys.stdin.isatty() and _typed("Repeat the PIN: ") != typed:
+        raise UsageError("The two PINs differ.", remedy="Run the command again.")
     document = PinDocument(pin=hash_of(Pin(typed)))
     output.result(document.pin)
     return output.document(document)
 
 
 def _typed(prompt: str) -> str:
-    """A line without echo; from a pipe its first line."""
+    """Read a line without echo; from a pipe its first line."""
     if sys.stdin is None or not sys.stdin.isatty():
         return "" if sys.stdin is None else sys.stdin.readline().strip()
     try:

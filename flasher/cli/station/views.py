@@ -1,7 +1,7 @@
-"""How `flasher station run` shows what happens: a live table, a line for each event, JSON lines.
+"""Views of `flasher station run`: a live table, a line of text for each event, JSON lines.
 
-What comes from outside enters the table as `Text`, which is never read as markup. A state is a
-colour and a word. The columns do not depend on what stands in them, so nothing moves.
+Text from outside enters the table as `Text`, which is never parsed as markup. A state has a colour
+and a word. The widths of columns do not depend on their content, so the table does not move.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from flasher.station.events import LineStopped, SocketState, StationEvent
 from flasher.station.records.model import Figures
 
 WIDE: Final = 140
-"""From this width on, what to do stands in the row; else below it."""
+"""Width of the terminal from which the instruction is in the row, not below it."""
 REFRESH_S: Final = 0.1
-"""Time between two refreshes of the table at the least."""
+"""Minimum time between two refreshes of the table."""
 _STYLES: Final = {
     SocketState.STARTING: "dim",
     SocketState.EMPTY: "dim",
@@ -46,7 +46,7 @@ _STYLES: Final = {
 _LOUD: Final = frozenset(
     {SocketState.FAIL, SocketState.RECHECK, SocketState.ERROR, SocketState.SCAN}
 )
-"""States in which somebody has to do something."""
+"""States in which a person has to act."""
 _STATE_WIDTH: Final = max(map(len, SocketState)) + 2
 _Column = tuple[int | None, int | None]
 _COLUMNS: Final[Sequence[_Column]] = ((None, 6), (None, _STATE_WIDTH), (6, None), (5, None))
@@ -55,10 +55,10 @@ _PROGRESS: Final[_Column] = (None, 13)
 _WHAT_TO_DO: Final[_Column] = (6, None)
 _HEAD_LINES: Final = 2
 """Title and head."""
-_SAID_LINES: Final = 3
-"""For the answer to the last scan."""
+_REPLY_LINES: Final = 3
+"""Lines for the reply to the last scan."""
 _HIGH: Final = 20
-"""Lower windows have one line for it."""
+"""Windows of fewer lines have one line for it."""
 _KEYS: Final = "Ctrl-C: no further unit; twice: stop now"
 
 
@@ -69,11 +69,11 @@ class View:
         self.output = output
         self.board = Board()
         self.typed: str | None = None
-        """What stands on the scan line; None where nobody can type."""
+        """Text of the scan line; None when scans are not typed."""
 
     @contextmanager
     def on_screen(self) -> Iterator[None]:
-        """Hold the screen while the block runs, where the view needs it."""
+        """Context of a running view; the table takes over the screen."""
         yield
 
     def __call__(self, event: StationEvent) -> None:
@@ -85,18 +85,18 @@ class View:
         """Show an event that the board has applied."""
 
     def refresh(self, *, at_once: bool = False) -> None:
-        """Draw again, if the last time is long enough ago or `at_once`."""
+        """Draw again if `at_once`, or `REFRESH_S` after the last time."""
 
 
 class JsonLines(View):
-    """Every event as a line of JSON."""
+    """Prints every event as a line of JSON."""
 
     def show(self, event: StationEvent) -> None:
         self.output.line(to_json(event))
 
 
 class Lines(View):
-    """A line of text for each event that the operator has to know."""
+    """Prints a line of text for each event that the operator needs."""
 
     def show(self, event: StationEvent) -> None:
         for line in _words(event):
@@ -105,12 +105,12 @@ class Lines(View):
 
 
 class Table(View):
-    """The board, refreshed in place."""
+    """Shows the board as a table that is refreshed in place."""
 
     def __init__(self, output: Output, now: Callable[[], float] = time.perf_counter) -> None:
         super().__init__(output)
-        # No thread refreshes: the station's own turn does. On a screen of its own lines are
-        # written over each other, without erasing them first: nothing flickers.
+        # The station's loop refreshes it, not a thread of rich. The alternate screen overwrites
+        # lines without erasing them first, so it does not flicker.
         console = Console(markup=False, highlight=False, emoji=False)
         self._live = Live(console=console, screen=True, auto_refresh=False)
         self._now = now
@@ -119,7 +119,7 @@ class Table(View):
     @contextmanager
     def on_screen(self) -> Iterator[None]:
         self._live.start()
-        # Text on stderr would tear the table; what matters stands in it.
+        # Text on stderr would break the table, which shows everything important.
         self.output.write_stderr = lambda _text: None
         try:
             yield
@@ -128,13 +128,13 @@ class Table(View):
             self.output.restore_stderr()
 
     def show(self, event: StationEvent) -> None:
-        # The station is busy while it saves: what the row said last would stay for so long.
+        # Saving blocks the station: without this refresh the row would show the state before.
         is_saving = isinstance(event, events.SocketChanged) and event.state is SocketState.SAVING
         self.refresh(at_once=is_saving)
 
     def refresh(self, *, at_once: bool = False) -> None:
         if at_once or self._now() - self._drawn_at >= REFRESH_S:
-            with suppress(OSError):  # a terminal that is gone does not stop the line
+            with suppress(OSError):  # a closed terminal does not stop the line
                 table = draw(self.board, self._live.console, self.typed)
                 self._live.update(table, refresh=True)
             self._drawn_at = self._now()
@@ -144,9 +144,9 @@ class Table(View):
 
 
 def draw(board: Board, console: Console, typed: str | None = "") -> RenderableType:
-    """The board as it fits the console: one row a socket, where there is room for it a line below
-    with what to do, and totals at the foot. `typed` is what stands on the scan line so far, None:
-    nothing is typed.
+    """Draw the board to fit the console: a row for each socket, with its instruction on a line
+    below if there is room, and totals at the bottom. `typed`: text of the scan line so far; None:
+    no scan line.
     """
     width, height = console.size
     foot = _foot(board, typed, width, height)
@@ -155,7 +155,7 @@ def draw(board: Board, console: Console, typed: str | None = "") -> RenderableTy
     is_wide = width >= WIDE
     is_double = not is_wide and 2 * len(rows) <= room
     shown = rows if len(rows) <= room else rows[: room - 1]
-    # In a low window what to do stands where the progress would be.
+    # In a low window the instruction replaces the progress.
     more = (_PROGRESS, _WHAT_TO_DO) if is_wide else (_PROGRESS if is_double else _WHAT_TO_DO,)
     columns = (*_COLUMNS, *more)
     head = ("socket", "state", "serial number", "step", "    %    left", "")
@@ -215,10 +215,10 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
             _cut(f" {text:<{width - 2}} ", "bold white on red")
             for text in _stopped_lines(board.stopped, width - 2, room)
         ]
-    said_lines = _SAID_LINES if height >= _HIGH else 1
-    said = textwrap.wrap(board.said, width)[:said_lines]
-    said += [""] * (said_lines - len(said))
-    lines += [_cut(line, "bold red" if board.is_refusal else "") for line in said]
+    reply_lines = _REPLY_LINES if height >= _HIGH else 1
+    reply = textwrap.wrap(board.said, width)[:reply_lines]
+    reply += [""] * (reply_lines - len(reply))
+    lines += [_cut(line, "bold red" if board.is_refusal else "") for line in reply]
     if typed is not None:
         lines.append(_cut(f"scan> {printable(typed)}_"))
     page = f"; the operator page: {board.page}" if board.page else ""
@@ -226,7 +226,7 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
 
 
 def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
-    """Why the line stands and what to do; where there is no room for all, what to do is kept."""
+    """Format reason and remedy of a stopped line; when they are too long, the reason is cut."""
     remedy = printable(f"{stop.remedy} Then scan RESUME.")
     reason = printable(f"LINE STOPPED  {stop.code}: {stop.reason}")
     lines = textwrap.wrap(f"{reason} {remedy}", width)
@@ -242,7 +242,7 @@ def _cut(line: str, style: str = "") -> Text:
 
 
 def percent(share: float | None) -> str:
-    """A share of 1; never 100 % for a little less."""
+    """Format a share from 0 to 1, rounded down: 100 % only if all."""
     if share is None:
         return "-"
     return f"{int(share * 1000) / 10:g} %"
@@ -264,7 +264,7 @@ def figures_line(figures: Figures) -> str:
 
 
 def _words(event: StationEvent) -> Iterator[str]:
-    """An event in words; nothing for what is only progress."""
+    """Format an event as lines of text; none for progress."""
     match event:
         case events.StationStarted():
             yield f"{event.station}: {event.recipe}, revision {event.revision}"
@@ -286,7 +286,7 @@ def _words(event: StationEvent) -> Iterator[str]:
         case events.LineStopped(code, reason, remedy):
             yield f"LINE STOPPED {code}: {reason} {remedy} Then scan RESUME."
         case events.LineResumed():
-            yield "the line goes on"
+            yield "the line is running again"
         case _:
             words = _socket_words(event)
             if words:
@@ -294,14 +294,14 @@ def _words(event: StationEvent) -> Iterator[str]:
 
 
 def _socket_words(event: StationEvent) -> str:
-    """What an event says of its socket."""
+    """Format an event of a socket; "" for progress."""
     match event:
         case events.RunStarted(_, serial, run_id, kind):
             return f"{serial}  run {run_id} begins, {kind.value}"
         case events.StepEnded(_, serial, step, _, state, duration_s):
-            said = f" {event.code}: {event.text}" if event.code else ""
+            cause = f" {event.code}: {event.text}" if event.code else ""
             name = f"{step.value} {event.target}".strip()
-            return f"{serial}  {name}: {state.value}, {duration_s:.2f} s{said}"
+            return f"{serial}  {name}: {state.value}, {duration_s:.2f} s{cause}"
         case events.RunEnded():
             code = "" if event.code == "OK" else f" {event.code}"
             text = event.text.rstrip(". ")
@@ -312,6 +312,6 @@ def _socket_words(event: StationEvent) -> str:
         case events.RecordNotSaved(_, serial, _, reason, remedy):
             return f"{serial}  {reason} {remedy}"
         case events.WorkerFailed(_, reason):
-            return f"its process is gone: {reason}"
+            return f"its process ended: {reason}"
         case _:
             return ""
