@@ -1,7 +1,7 @@
-"""From the sockets of a station's file to what their processes are given: each socket finds its
-adapter by serial number or place on the USB.
+"""Finds the adapters of a station's sockets by serial number or USB path, and makes the set-up of
+the sockets' processes.
 
-`resolve` is a pure function of what was detected (`flasher.bus.detect`).
+`detect` lists the connected adapters (see `flasher.bus.detect`), and `resolve` assigns them.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Resolved:
 def resolve(
     sockets: Sequence[SocketConfig], detected: Iterable[DetectedAdapter]
 ) -> tuple[Resolved, ...]:
-    """Every socket with its adapter.
+    """Assign an adapter to each socket.
 
-    Raises BusError when an adapter is not there, UsageError when two sockets come to the same one
-    or when the channel does not follow from what is given.
+    Raises BusError when an adapter is missing, UsageError when two sockets have the same adapter or
+    when an adapter has several channels.
     """
-    found = tuple(detected)
-    resolved = tuple(_resolve(socket, found) for socket in sockets)
+    adapters = tuple(detected)
+    resolved = tuple(_resolve(socket, adapters) for socket in sockets)
     taken: dict[tuple[object, object], str] = {}
     for each in resolved:
         if each.bus is None:
@@ -83,7 +83,7 @@ def _resolve(socket: SocketConfig, detected: Sequence[DetectedAdapter]) -> Resol
         raise BusError(
             f"Socket {socket.name}: no {socket.interface} adapter with the {what} "
             f"{printable(wanted)} is plugged in.",
-            remedy="Plug it in. `flasher doctor` shows the adapters that there are.",
+            remedy="Plug it in. `flasher doctor` lists the connected adapters.",
             code=ErrorCode.NO_ADAPTER,
         )
     if len(channels) > 1:
@@ -116,9 +116,8 @@ def worker_setups(
     speed: float = 1.0,
     leave_after_s: float = 1.0,
 ) -> list[WorkerSetup]:
-    """What each socket's process needs. Virtual units are numbered from `first_number` on, no
-    number twice, and dealt out like cards: `units` in all, or without end. Raises ImageError as
-    `check_samples`.
+    """Make the set-up of each socket's process. Virtual units are numbered from `first_number` on,
+    in turn over the sockets, up to `units` of them. Raises ImageError as `check_samples`.
     """
     check_samples(sockets, recipe)
     files = {str(path): sha256 for path, sha256 in recipe.files.items()}
@@ -141,30 +140,29 @@ def worker_setups(
     return setups
 
 
-# -- what is plugged in ---------------------------------------------------------------------------
+# -- detection ------------------------------------------------------------------------------------
 
 
 def detect(
     sockets: Sequence[SocketConfig], *, network: Path = SYSFS
 ) -> tuple[DetectedAdapter, ...]:
-    """The adapters for the interfaces of sockets that are found by serial number or USB path.
-
-    Raises UsageError where a package is missing that finds them.
+    """Detect the connected adapters of all interfaces that sockets look for by serial number or USB
+    path. Raises UsageError when a package for it is not installed.
     """
     wanted = {s.interface for s in sockets if s.serial_number or s.usb_path}
-    found: list[DetectedAdapter] = []
+    adapters: list[DetectedAdapter] = []
     for interface in sorted(wanted & SERIAL_PORTS):
         try:
-            found += serial_ports(interface)
+            adapters += serial_ports(interface)
         except ImportError as error:
             raise UsageError(
-                f"To find a {interface} adapter by its serial number, pyserial is needed.",
+                f"Finding a {interface} adapter by its serial number needs pyserial.",
                 remedy="Install python-can with its serial extra: pip install "
                 "'python-can[serial]'.",
                 code=ErrorCode.PACKAGE_MISSING,
             ) from error
     if SOCKETCAN in wanted:
-        found += network_adapters(network)
+        adapters += network_adapters(network)
     with Detection(sorted(wanted - SERIAL_PORTS - {SOCKETCAN})) as detection:
-        found += detection.collect().found
-    return tuple(found)
+        adapters += detection.collect().found
+    return tuple(adapters)

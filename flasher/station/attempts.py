@@ -1,5 +1,5 @@
-"""Limits on guessing a PIN or a password. A try is counted before it is checked, so that tries made
-at the same time count as well. Times are seconds on a monotonic clock, given from outside.
+"""Limits on guessing PINs and passwords. A try is counted before it is checked, so that parallel
+tries count too. Times are arguments: seconds on a monotonic clock.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ PAUSE_S: Final = 60.0
 """The first pause; each following one takes twice as long."""
 PAUSE_MAX_S: Final = 960.0
 FORGOTTEN_S: Final = 3600.0
-"""After this time without a try earlier ones do not count."""
+"""Time without a try after which earlier ones are forgotten."""
 RATE_S: Final = 60.0
-"""The rates are per this time."""
+"""Period of the rate limits."""
 PER_ADDRESS_MAX: Final = 20
-"""Tries from one address, so that one client cannot use up those of all."""
+"""Tries from one address in `RATE_S`, so that one client cannot use up `ALL_MAX`."""
 ALL_MAX: Final = 60
-"""Tries from everywhere: this bounds the processor time that they take."""
+"""Tries from all addresses in `RATE_S`, which bounds the processor time for checks."""
 _PRUNED_ABOVE: Final = 1000
 _NEVER: Final = float("-inf")
 
 
 class BackOff:
-    """Counts tries until one is right; after `TRIES_MAX` a pause begins."""
+    """Counts tries since the last right one; after each `TRIES_MAX` a pause begins."""
 
     def __init__(self) -> None:
         self._tries = 0
@@ -48,7 +48,7 @@ class BackOff:
             self._tries, self._pauses, self._open_at_s = 0, self._pauses + 1, now + pause_s
 
     def reset(self) -> None:
-        """The last try was right."""
+        """Forget all tries, after a right one."""
         self._tries, self._pauses, self._open_at_s = 0, 0, _NEVER
 
     def is_forgotten(self, now: float) -> bool:
@@ -56,7 +56,7 @@ class BackOff:
 
 
 class Rate:
-    """At most `limit` tries in any `RATE_S`, right ones included."""
+    """Limits tries, right ones included, to `limit` in any period of `RATE_S`."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -84,8 +84,8 @@ class _OfBadge:
 
 
 class Attempts:
-    """Tries of many clients. They are limited by badge and address together, by address, and over
-    all: who guesses the PIN of a badge does not stop its owner at another address.
+    """Limits the tries of all clients: for each badge at each address, for each address, and in
+    total. Guessing the PIN of a badge does not lock out its owner at another address.
     """
 
     def __init__(self) -> None:
@@ -94,8 +94,8 @@ class Attempts:
         self._badges: dict[tuple[str, str], _OfBadge] = {}
 
     def begin(self, address: str, badge: str | None, now: float) -> float:
-        """Count a try; 0 when it may be checked, else the time to wait, and it is not counted.
-        `badge`: whose PIN is tried, "" for the password of all, None where nothing is compared.
+        """Begin a try. Returns 0 if it may be checked; else the seconds to wait, without counting
+        it. `badge`: the badge whose PIN is tried; "" for the password; None: nothing is compared.
         """
         self._prune(now)
         limits: list[Rate | BackOff] = [
@@ -103,7 +103,7 @@ class Attempts:
             self._addresses.setdefault(address, Rate(PER_ADDRESS_MAX)),
         ]
         wait_s = max(each.wait_s(now) for each in limits)
-        # What is refused by these leaves nothing in memory, whatever badges it names.
+        # Tries that these limits refuse must not use memory for the badges that they name.
         if badge is not None and wait_s == 0.0:
             of_badge = self._badges.setdefault((badge, address), _OfBadge())
             limits += [of_badge.rate, of_badge.back_off]
@@ -114,12 +114,12 @@ class Attempts:
         return wait_s
 
     def pause_s(self, address: str, badge: str, now: float) -> float:
-        """The pause that the tries of a badge have brought; 0 before it."""
+        """Seconds left of the pause after too many tries of a badge; 0 without one."""
         of_badge = self._badges.get((badge, address), _OfBadge())
         return of_badge.back_off.wait_s(now)
 
     def was_right(self, address: str, badge: str) -> None:
-        """The last try of this badge was right: its next pause is the first one again."""
+        """Forget the tries of a badge at an address, after a right one."""
         self._badges[badge, address].back_off.reset()
 
     def _prune(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""Processes of a station that Ctrl-C does not reach: it is for the station, which ends them."""
+"""Starts processes of a station that ignore Ctrl-C; the station ends them itself."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from multiprocessing import resource_tracker
 
 @contextmanager
 def deaf_from_birth(*, to_sigterm: bool = False) -> Iterator[None]:
-    """What this thread starts meanwhile never hears Ctrl-C or a hangup (nor SIGTERM: service
-    managers send it to the whole group), not even before its first line; this process hears what
-    came meanwhile afterwards. On Windows nothing is done.
+    """Block signals while the block runs: processes that this thread starts in it never get Ctrl-C
+    or a hangup (`to_sigterm`: nor SIGTERM, which service managers send to the whole group), not
+    even while they start. This process gets pending signals afterwards. Does nothing on Windows.
     """
     if os.name == "nt":
         yield
         return
-    resource_tracker.ensure_running()  # else `multiprocessing` starts it, and hears again
+    resource_tracker.ensure_running()  # else `multiprocessing` starts it, and unblocks the signals
     deaf_to = {signal.SIGINT, signal.SIGHUP}
     if to_sigterm:
         deaf_to.add(signal.SIGTERM)

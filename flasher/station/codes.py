@@ -1,6 +1,6 @@
-"""Every way in which a run can end: a stable code, whose fault it is, and what the operator does.
+"""Codes of the ends of runs, each with its outcome, its meaning and the operator's action.
 
-The codes stand in the records for years: a code is never given another meaning.
+Codes are stored in the records: the meaning of a code never changes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _TECHNICIAN: Final = text("Call the technician; the unit is not judged.")
 
 
 class Code(NamedTuple):
-    """A code of the records. `may_retry` is False where another try cannot help or would harm."""
+    """A code. `may_retry` is False when another try cannot help, or could do harm."""
 
     name: str
     outcome: RunState
@@ -119,8 +119,8 @@ UNIT_CHANGED: Final = _error(
 NOT_OBSERVED: Final = _error(
     "NOT_OBSERVED",
     text(
-        "this computer stood still, or its adapter was away, so that it did not see whether the"
-        " unit stayed in the socket"
+        "the computer stalled or its adapter was away, and the station could not observe whether"
+        " the unit stayed in the socket"
     ),
     text("Scan the unit again; it is not judged."),
 )
@@ -164,7 +164,7 @@ INTERNAL: Final = _error("INTERNAL", text("an internal error: a bug of flasher")
 CODES: Final[Mapping[str, Code]] = {
     value.name: value for value in tuple(globals().values()) if isinstance(value, Code)
 }
-"""Every code by its name."""
+"""All codes by name."""
 
 OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.UNCONFIRMED: UNCONFIRMED,
@@ -188,10 +188,10 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.CANCELLED: OPERATOR_ABORT,
     Ending.UP_TO_DATE: RECIPE,
 }
-"""Codes of the records for failed upgrades."""
+"""Codes of failed upgrades, by the ending of the upgrade."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
-"""After these a power cycle may reach the bootloader again."""
+"""Codes after which a power cycle may reach the bootloader again."""
 OF_ANOTHER: Final = frozenset({UNIT_CHANGED.name, NOT_OBSERVED.name})
-"""The names of those after which another unit may have been in the socket."""
+"""Names of the codes after which another unit may be in the socket."""
 OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED, NO_BOOTLOADER, NO_RESTART})
-"""Codes of a unit that has disappeared."""
+"""Codes of a unit that stopped answering."""

@@ -1,4 +1,4 @@
-"""Whether a station can keep what it makes: its records, the space for them, its clock."""
+"""Checks the health of a station: records, labels, scanners, free disk space and clock."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from flasher.protocol.text import printable
 from flasher.station.board import Board
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
-"""Less free space is told."""
+"""Less free disk space is reported."""
 CLOCK_SHIFT_MAX_S: Final = 5.0
-"""Between the clock on the wall and the one that only goes forward, since the station started."""
+"""Greatest change of UTC relative to the monotonic clock since the start of the station."""
 LOOK_EVERY_S: Final = 5.0
 NAMES_SHOWN: Final = 3
 
 
 @dataclass(frozen=True)
 class HealthCheck:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     name: str
     is_good: bool
     text: str
-    """What was seen."""
+    """The state found, for people."""
 
 
 class HealthWatch:
-    """Looks at the disk and the clock every few seconds. `folder`: where the records' files are;
-    `utc` and `monotonic_s`: the two clocks; `unkept`: the places that have not the last heads.
+    """Checks the health of a station; disk and clock every `LOOK_EVERY_S`. `folder`: the files of
+    the records; `utc` and `monotonic_s`: the two clocks; `unkept` returns the places that lack the
+    last heads.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class HealthWatch:
         self._seen: tuple[HealthCheck, ...] = ()
 
     def look(self, board: Board) -> tuple[HealthCheck, ...]:
-        """What is so now."""
+        """Run all checks."""
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
@@ -86,7 +87,7 @@ class HealthWatch:
 
 
 def _few(names: Collection[str]) -> str:
-    """The first of them, and how many there are more."""
+    """The first names, and the number of the others."""
     first = ", ".join(map(printable, list(names)[:NAMES_SHOWN]))
     more = len(names) - NAMES_SHOWN
     return text("{first} and {more} more", first=first, more=more) if more > 0 else first

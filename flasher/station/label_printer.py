@@ -1,5 +1,5 @@
-"""Prints labels in a thread of its own, one after the other, each within a time limit. Nothing that
-a printer does is waited for.
+"""Prints labels in a thread, one at a time, each within a time limit. The station never waits for
+the printer.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from flasher.station.config import LabelConfig
 from flasher.station.label_template import LabelTemplate
 
 BACKLOG_MAX: Final = 100
-"""Labels that wait for a printer; more are refused."""
+"""Maximum number of waiting labels; more are refused."""
 _IS_WINDOWS: Final = os.name == "nt"
-"""There a file cannot be waited for."""
+"""`select` does not work on files there."""
 Send = Callable[[bytes, float], None]
 """Sends a label to the printer within a time in seconds. Raises NotPrinted."""
 
 
-class NotPrinted(Exception):  # noqa: N818  a printer that fails is no fault of the station
-    """Why a label was not printed, as a sentence."""
+class NotPrinted(Exception):  # noqa: N818  not an error of the station
+    """A label was not printed; the argument is the reason, a sentence."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class LabelJob:
 
 
 class LabelPrinter:
-    """The printer of a station. `submit` and `take` are called in the station's thread."""
+    """The label printer of a station. Call `submit` and `take` in the station's thread."""
 
     def __init__(
         self, template: LabelTemplate, send: Send, *, limit_s: float, prints_each: bool = True
     ) -> None:
         self.prints_each = prints_each
-        """Every unit that passes gets a label; else only REPRINT prints."""
+        """Print a label for every passed unit; else only on REPRINT."""
         self._template = template
         self._send = send
         self._limit_s = limit_s
@@ -63,12 +63,12 @@ class LabelPrinter:
         self._sending: threading.Thread | None = None
 
     def start(self, wake: Callable[[], None]) -> None:
-        """`wake` is called in the printer's thread when something can be taken."""
+        """Start the thread, which calls `wake` when `take` has results."""
         self._wake = wake
         self._thread.start()
 
     def submit(self, job: LabelJob) -> None:
-        """Print it; returns at once."""
+        """Queue a label, and return at once."""
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
@@ -76,13 +76,13 @@ class LabelPrinter:
             self._wake()
 
     def take(self) -> list[tuple[LabelJob, str]]:
-        """The labels that are done since the last call, each with why it was not printed; "" for
-        one that was.
+        """Returns the labels finished since the last call, each with the reason why it was not
+        printed, or "".
         """
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Print what waits, as far as one time limit lets it."""
+        """Print the waiting labels within one time limit, and end the thread."""
         try:
             self._jobs.put_nowait(None)
         except queue.Full:
@@ -97,15 +97,15 @@ class LabelPrinter:
                 self._send_in_time(self._template.fill(job.values))
             except NotPrinted as error:
                 reason = error.args[0]
-            except Exception as error:  # noqa: BLE001  of a template: a station has to know it
+            except Exception as error:  # noqa: BLE001  any error of the template is reported
                 reason = text("The label cannot be made: {why}.", why=printable(str(error))[:200])
             self._done.append((job, reason))
             self._wake()
 
     def _send_in_time(self, data: bytes) -> None:
-        """Send a label, and give it up after the time limit: Windows knows no limit for a device,
-        nor for a program whose own programs go on. While it hangs, nothing else is sent. Raises
-        NotPrinted, and whatever sending raises.
+        """Send a label in another thread, and give up after the time limit, since Windows has no
+        time limits for devices, or for programs that started others. While a label hangs, no other
+        one is sent. Raises NotPrinted, and all exceptions of sending.
         """
         self._await_sent()
         failures: list[Exception] = []
@@ -123,7 +123,7 @@ class LabelPrinter:
             raise failures[0]
 
     def _await_sent(self) -> None:
-        """Wait for the label that is sent, if one is. Raises NotPrinted."""
+        """Wait until a label that is being sent is done. Raises NotPrinted after the time limit."""
         if self._sending is not None:
             self._sending.join(self._limit_s)
             if self._sending.is_alive():
@@ -135,7 +135,7 @@ class LabelPrinter:
 
 
 def printer_of(config: LabelConfig) -> Send:
-    """How labels get to the printer that is configured."""
+    """Returns the function that sends labels to the configured printer."""
     if config.command:
         return lambda data, limit_s: run_command(config.command, data, limit_s)
     kind, _, place = config.printer.partition(":")
@@ -153,7 +153,7 @@ def send_tcp(address: tuple[str, int], data: bytes, limit_s: float) -> None:
             while data:
                 connection.settimeout(max(until - time.perf_counter(), 0.001))
                 data = data[connection.send(data) :]
-            # A printer that is switched off in between resets it: that is seen here.
+            # Raises if the printer was switched off meanwhile and has reset the connection.
             connection.shutdown(socket.SHUT_WR)
     except TimeoutError as error:
         raise _too_slow(limit_s) from error
@@ -162,10 +162,10 @@ def send_tcp(address: tuple[str, int], data: bytes, limit_s: float) -> None:
 
 
 def write_file(path: Path, data: bytes, limit_s: float) -> None:
-    """Append to a file, or write to a device. A device that takes nothing is not waited for."""
+    """Append a label to a file, or write it to a device. Raises NotPrinted after the time limit."""
     until = time.perf_counter() + limit_s
     flags = os.O_WRONLY | os.O_APPEND | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    if not path.is_relative_to("/dev"):  # a device that is unplugged must not become a file
+    if not path.is_relative_to("/dev"):  # do not create a file for an unplugged device
         flags |= os.O_CREAT
     try:
         handle = os.open(path, flags, 0o644)
@@ -182,7 +182,7 @@ def write_file(path: Path, data: bytes, limit_s: float) -> None:
 
 
 def run_command(words: Sequence[str], data: bytes, limit_s: float) -> None:
-    """Give the label to a program on its standard input."""
+    """Run a program with the label as its standard input. Raises NotPrinted."""
     try:
         done = subprocess.run(  # noqa: S603  the user's own command, without a shell
             list(words), check=False, capture_output=True, timeout=limit_s, input=data
@@ -192,13 +192,13 @@ def run_command(words: Sequence[str], data: bytes, limit_s: float) -> None:
     except OSError as error:
         raise _unreachable(error) from error
     if done.returncode:
-        said = printable(done.stderr.decode(errors="replace").strip()[-200:])
+        output = printable(done.stderr.decode(errors="replace").strip()[-200:])
         raise NotPrinted(
             text(
-                "{command} ended with {code}: {said}.",
+                "{command} failed with exit code {code}: {output}.",
                 command=printable(shlex.join(words))[:80],
                 code=done.returncode,
-                said=said,
+                output=output,
             )
         )
 

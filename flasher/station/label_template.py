@@ -1,12 +1,12 @@
-"""What stands on a unit's label: a ZPL template, filled in from a run that is in the records.
+"""Label templates: ZPL that is filled in with the values of a recorded run.
 
     ^XA
     ^FO40,40^BQN,2,6^FDQA,{{ serial }}^FS
     ^FO40,220^FH^FD{{ recipe | fh }}^FS
     ^XZ
 
-The template runs in a sandbox. A value can never be a command of the printer: `^`, `~` and control
-characters in it become `?`. In a field with ^FH, `fh` prints every character as it is.
+The template runs in a sandbox. Values cannot contain printer commands: `^`, `~` and control
+characters become `?`. In a field with ^FH, the filter `fh` prints all characters unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flasher.station.recipe import Recipe
 from flasher.station.records.model import RunRecord
 
 FILE_MAX_SIZE: Final = 64 * 1024
-"""In bytes."""
+"""Bytes."""
 LABEL_MAX_SIZE: Final = 1024 * 1024
 _COMMANDS: Final = "^~"
 _PLAIN: Final = frozenset("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz-. ")
@@ -37,7 +37,7 @@ def _neutral(value: object) -> str:
 
 
 def _hex(value: object) -> str:
-    """For a field with ^FH: what is not plain as its bytes in UTF-8, `_5E`."""
+    """Escape a value for a field with ^FH: other than plain characters as UTF-8 bytes, `_5E`."""
     return "".join(
         char if char in _PLAIN else "".join(f"_{byte:02X}" for byte in char.encode())
         for char in str(value)
@@ -45,7 +45,7 @@ def _hex(value: object) -> str:
 
 
 class LabelTemplate:
-    """A template that was tried with the values of a sample. Raises UsageError."""
+    """Loads a template, and tries it with the values of a sample. Raises UsageError."""
 
     def __init__(self, path: Path, sample: dict[str, object]) -> None:
         raw = read(path, FILE_MAX_SIZE, what="label template")
@@ -57,18 +57,18 @@ class LabelTemplate:
         )
         environment.filters["fh"] = _hex
         where = printable(str(path))
-        known = f"It knows: {', '.join(sample)}."
+        known = f"Known values are {', '.join(sample)}."
         try:
             self._template = environment.from_string(raw.decode("utf-8-sig"))
             self.fill(sample)
         except UnicodeDecodeError as error:
-            raise UsageError("The label template is no text.", where=where) from error
+            raise UsageError("The label template is not a text file.", where=where) from error
         except Exception as error:
             what = f"The label template cannot be filled in: {printable(str(error))}."
             raise UsageError(what, where=where, remedy=known) from error
 
     def fill(self, values: dict[str, object]) -> bytes:
-        """The label. Raises whatever a template does that is wrong."""
+        """Fill in the template. Raises all exceptions of the template."""
         made: list[str] = []
         size = 0
         for part in self._template.generate(values):
@@ -80,7 +80,7 @@ class LabelTemplate:
 
 
 def values_of(run: RunRecord, groups: dict[str, str]) -> dict[str, object]:
-    """What a template knows of a run; `groups` are those of its serial number."""
+    """The values of a run for a template. `groups`: the groups of its serial number."""
     ended_at = (run.ended_at or run.begun_at).astimezone()
     return {
         "serial": run.serial,
@@ -99,7 +99,7 @@ def values_of(run: RunRecord, groups: dict[str, str]) -> dict[str, object]:
 
 
 def sample_of(recipe: Recipe, station: str) -> dict[str, object]:
-    """As `values_of`, for the example of a recipe."""
+    """Sample values for the example of a recipe, with the keys of `values_of`."""
     example = recipe.serial_number.example
     return {
         "serial": example,

@@ -1,10 +1,9 @@
-"""Serial numbers: patterns that cannot take long, and check digits by python-stdnum.
+"""Patterns of serial numbers with bounded matching time, and check digits by python-stdnum.
 
-A recipe comes from outside, and a pattern such as `(A+)+` can take a regular expression years. So a
-pattern is a part of Python's language in which the work is bounded before it is used: characters,
-classes, named groups that are not repeated, counts (`{8}`, `{2,4}`, `?`) on single characters, and
-alternatives. Nothing repeats without end. The ways in which a text can be tried are the product of
-the choices, and at most `WAYS_MAX`.
+Recipes come from outside, and matching a regular expression such as `(A+)+` can take years. So
+patterns are a subset of Python's regular expressions: characters, classes, named groups that are
+not repeated, counts (`{8}`, `{2,4}`, `?`) of single characters, and alternatives, but no unlimited
+repetition. The product of all choices is at most `WAYS_MAX`.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ _TOKEN: Final = re.compile(
     re.ASCII,
 )
 _ALLOWED: Final = (
-    "Use characters, \\d, classes as [0-9A-F], counts as {8} or {2,4} behind them, and groups as "
-    "(?P<lot>...) that are not repeated."
+    "Use characters, \\d, classes such as [0-9A-F], each followed by a count such as {8} or {2,4}, "
+    "and groups such as (?P<lot>...) that are not repeated."
 )
 
 
 class Pattern:
-    """A pattern whose work is bounded. Raises ValueError saying what is not allowed."""
+    """A pattern. Raises ValueError for one that is invalid or not bounded."""
 
     def __init__(self, text: str) -> None:
         if len(text) > PATTERN_MAX:
@@ -44,13 +43,13 @@ class Pattern:
         ways = _ways(text)
         if ways > WAYS_MAX:
             raise ValueError(
-                f"the pattern leaves {ways} ways to read a text, {WAYS_MAX} are allowed: "
-                "give fixed counts"
+                f"the pattern has {ways} ways to match a text, more than {WAYS_MAX}: "
+                "use fixed counts"
             )
         try:
             self._compiled = re.compile(text, re.ASCII)
         except re.error as error:
-            raise ValueError(f"the pattern is not right: {error}") from error
+            raise ValueError(f"the pattern is invalid: {error}") from error
         self.text = text
 
     @property
@@ -58,23 +57,23 @@ class Pattern:
         return tuple(self._compiled.groupindex)
 
     def match(self, text: str) -> dict[str, str] | None:
-        """The named groups when the whole text fits the pattern, else None. A group that took no
-        part is empty.
+        """The named groups if the pattern matches the whole text, else None. Groups that did not
+        take part in the match are empty.
         """
         if len(text) > TEXT_MAX:
             return None
-        found = self._compiled.fullmatch(text)
-        return None if found is None else {k: v or "" for k, v in found.groupdict().items()}
+        match = self._compiled.fullmatch(text)
+        return None if match is None else {k: v or "" for k, v in match.groupdict().items()}
 
 
 @lru_cache(maxsize=64)
 def pattern_of(text: str) -> Pattern:
-    """The pattern, made once. Raises ValueError."""
+    """Compile a pattern; cached. Raises ValueError."""
     return Pattern(text)
 
 
 def _ways(text: str) -> int:
-    """The product of all choices. Raises ValueError for what is not in the language."""
+    """Number of ways to match a text. Raises ValueError for anything outside of the subset."""
     position, ways, depth = 0, 1, 0
     alternatives = [1]
     may_repeat = False
@@ -88,7 +87,7 @@ def _ways(text: str) -> int:
         if token["count"]:
             if not may_repeat:
                 raise ValueError(
-                    f"a count at {position + 1} stands behind no single character. {_ALLOWED}"
+                    f"the count at {position + 1} does not follow a single character. {_ALLOWED}"
                 )
             ways *= _choices(token)
         elif token["open"]:
@@ -114,18 +113,18 @@ def _choices(token: re.Match[str]) -> int:
     low = int(token["low"])
     high = int(token["high"] or low)
     if not low <= high <= TEXT_MAX:
-        raise ValueError(f"a count {token['count']} is not possible, {TEXT_MAX} is the most")
+        raise ValueError(f"the count {token['count']} is not possible; the maximum is {TEXT_MAX}")
     return high - low + 1
 
 
 def _check(form: str, is_right: Callable[[str], bool]) -> Callable[[str], bool]:
-    """A check of texts of this form; stdnum's own take more than their standards allow."""
+    """Restrict a check to texts of this form, since those of stdnum accept more than allowed."""
     return lambda text: re.fullmatch(form, text) is not None and is_right(text)
 
 
 CHECKS: Final = {
     "luhn": _check("[0-9]{2,}", luhn.is_valid),
-    # Of any length: stdnum's `is_valid` knows no SSCC.
+    # Not `ean.is_valid`, which refuses the 18 digits of an SSCC.
     "gtin": _check("[0-9]{2,}", lambda text: bool(ean.calc_check_digit(text[:-1]) == text[-1])),
     "mod11-2": _check("[0-9]{2,}[0-9X]", mod_11_2.is_valid),
     "mod11-10": _check("[0-9]{2,}", mod_11_10.is_valid),
@@ -133,4 +132,4 @@ CHECKS: Final = {
     "mod37-36": _check("[0-9A-Z]{2,}", mod_37_36.is_valid),
     "mod97-10": _check("[0-9A-Z]{3,}", mod_97_10.is_valid),
 }
-"""Each takes the whole text, check characters included; texts of another form are not valid."""
+"""Checks by method. Each gets the text with its check characters."""

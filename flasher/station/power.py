@@ -1,7 +1,7 @@
-"""Power of a unit by a command of the socket's configuration, as `relay 3 {on|off}`.
+"""Switches the power of a unit by a command of the station file, such as `relay 3 {on|off}`.
 
-A cycle runs beside the bus: the bootloader announces itself for 0.2 s when the power comes, and
-somebody has to listen meanwhile.
+A power cycle runs in a thread: the bootloader announces itself for 0.2 s after power-up, and the
+caller has to receive meanwhile.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flasher.protocol.text import printable
 from flasher.station.config import power_command
 
 OFF_S: Final = 1.0
-"""How long the power stays off: long enough for capacitors of a controller."""
+"""How long the power stays off, so that the capacitors of a controller discharge."""
 COMMAND_LIMIT_S: Final = 10.0
 Run = Callable[[Sequence[str]], None]
 
@@ -27,14 +27,14 @@ class PowerControl(Protocol):
     """Switches the unit off and on."""
 
     def begin_cycle(self) -> None:
-        """Begin; returns at once. Raises BusError when the one before failed."""
+        """Begin a power cycle, and return at once. Raises BusError if the cycle before failed."""
 
     def check(self) -> None:
         """Raises BusError when a cycle failed."""
 
 
 class PowerCommand:
-    """The power of one socket. `run` runs a command's words; it raises BusError."""
+    """Switches the power of one socket. `run` runs an argument list, and raises BusError."""
 
     def __init__(
         self,
@@ -53,9 +53,8 @@ class PowerCommand:
         self._failure: FlasherError | None = None
 
     def begin_cycle(self) -> None:
-        """Switch off, and on again after a while; returns at once, after a cycle under way.
-
-        Raises BusError when the one before failed.
+        """Begin to switch off, and on again after `off_s`. Returns at once, or after the end of a
+        running cycle. Raises BusError if the cycle before failed.
         """
         self.check()
         self._thread = threading.Thread(target=self._cycle, daemon=True)
@@ -98,11 +97,11 @@ def run_command(words: Sequence[str]) -> None:
         what = f"The power command cannot be run: {error.strerror}."
         raise BusError(what, where=where, remedy=remedy, code=ErrorCode.COMMAND_FAILED) from error
     if done.returncode:
-        said = printable(done.stderr.decode(errors="replace").strip()[-300:])
+        output = printable(done.stderr.decode(errors="replace").strip()[-300:])
         raise BusError(
             f"The power command failed with exit code {done.returncode}.",
             where=where,
-            cause=said,
+            cause=output,
             remedy=remedy,
             code=ErrorCode.COMMAND_FAILED,
         )

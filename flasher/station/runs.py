@@ -1,7 +1,7 @@
-"""A run on the side of the station: what earlier runs of the unit mean for it, and how its outcome
-is saved.
+"""Runs on the station's side: `with_history` prepares the claim of a run from earlier runs of the
+unit, and `save` saves its outcome.
 
-Saving may be tried again after every failure, from any point; nothing is shown before it is done.
+`save` can be called again after any failure; the outcome is shown only after it is saved.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class ActiveRun:
     where: str = StepName.CONNECT.value
     """The active step, with its target."""
     journal_error: str = ""
-    """Something of it could not be saved: it cannot pass any more."""
+    """Why a record of the run could not be saved; such a run cannot pass."""
     reported: RunResult | None = None
-    """Its end, once the process has reported it."""
+    """The result that the process reported; None until then."""
     ended_s: float = 0.0
     attached: list[AttachmentFile] = field(default_factory=list)
     result: RunResult | None = None
-    """The end as it is to be saved; tried again until it is."""
+    """The result to be saved."""
     is_save_noted: bool = False
 
 
@@ -67,7 +67,7 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
     try:
         store.finish(run.claim.run_id, _ending(run, run.result))
     except RuleBrokenError as error:
-        # The records know better: it is no PASS. That is a bug, and the unit is not judged.
+        # The records refuse this PASS, so the program has a bug: the unit gets no verdict.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
         store.finish(run.claim.run_id, _ending(run, run.result))
     store.files.forget_spooled(run.claim.run_id)
@@ -95,7 +95,7 @@ def _attach(store: Store, run: ActiveRun) -> None:
         return
     file = store.files.add(TRACE, packed(trace))
     if file.sha256 != closed and run.result is not None:
-        words = "The trace on disk is not the one that was written."
+        words = "The trace on disk differs from the one that was recorded."
         run.result = _worse(run.result, codes.TRACE_NOT_SAVED, words)
     run.attached = [file]
 
@@ -110,7 +110,7 @@ def _ending(run: ActiveRun, result: RunResult) -> Ending:
 
 
 def sentence(text: str) -> str:
-    """A text with a full stop, so that another sentence can follow."""
+    """Add a full stop to a text, so that another sentence can follow."""
     text = text.strip()
     return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
@@ -130,11 +130,12 @@ _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED
 def with_history(
     claim: Claim, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
 ) -> Claim:
-    """The claim with what the unit's runs before mean for it. A verdict ends a story: what came
-    before the last PASS or FAIL is not the state in which this run finds the unit; nor is a flash
-    before a run in which the unit may have become another one. But what must
-    not change is held until a PASS: a run that failed after its first write may be what changed it.
-    Only for a unit that `is_reworked` it is read anew.
+    """Add the results of the unit's earlier runs to a claim.
+
+    Flashes count since the last PASS or FAIL, and since the last run in which the unit may have
+    been exchanged. Values that must not change are kept since the last PASS, since a run that
+    failed after its first write may have changed them; `is_reworked`: only since the last verdict,
+    so that the run reads them again.
     """
     runs = [] if life is None else list(life.runs)
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
@@ -155,13 +156,13 @@ def with_history(
 
 
 def _after(runs: list[RunDetails], ends: Callable[[RunDetails], bool]) -> list[RunDetails]:
-    """The runs after the last one with a verdict."""
+    """The runs after the last one for which `ends` is true."""
     last = next((at for at in reversed(range(len(runs))) if ends(runs[at])), -1)
     return runs[last + 1 :]
 
 
 def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
-    """Values that must not change, as the first of these runs with a write read them."""
+    """Values that must not change, as the first run with a write read them before it."""
     known: dict[str, str] = {}
     for run in runs:
         if not run.writes:

@@ -1,4 +1,4 @@
-"""Counts of this hour and this shift: good and bad units, first-pass yield, causes of failures."""
+"""Counts good and bad units, first-pass yield and causes of failures of this hour and shift."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CAUSES_MAX: Final = 3
 
 
 class Count(NamedTuple):
-    """Units whose last run in a time was a PASS, and those whose last was not."""
+    """Number of units whose last run in a period was a PASS (good), or was not (bad)."""
 
     good: int
     bad: int
@@ -23,14 +23,14 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True)
 class Output:
-    """What a footer shows."""
+    """The figures in the footer of the operator page."""
 
     hour: Count
     shift: Count
     first_pass_share: float | None
-    """Of the shift: units passed at their first run, as a share of 1; None without units."""
+    """Share of the shift's units that passed in their first run, 0 to 1; None without units."""
     causes: tuple[tuple[str, int], ...]
-    """Codes of runs of the shift that were no PASS, the most frequent first."""
+    """Codes of the shift's runs without a PASS with their counts, the most frequent first."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class EndedRun:
 
 
 def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
-    """When the shift began that goes on; `shifts`: when each begins, in the time zone of `now`."""
+    """Start of the current shift. `shifts`: start times in the time zone of `now`."""
     starts = (
         datetime.combine(now.date() - timedelta(days=days), each, now.tzinfo)
         for each in shifts
@@ -54,8 +54,8 @@ def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
 
 
 class ShiftCounts:
-    """Runs of the shift that goes on; those of the shift before are forgotten. `shifts`: when each
-    begins, in the local time of the moments that are given.
+    """Counts the runs of the current shift, and forgets those of earlier ones. `shifts`: start
+    times in the time zone of the moments that its methods get.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class ShiftCounts:
         self._runs.append(run)
 
     def began(self, now: datetime) -> datetime:
-        """When the shift began that goes on."""
+        """Start of the current shift; `now` without shifts."""
         return shift_began(self._shifts, now) or now
 
     def output(self, now: datetime) -> Output:
-        """The figures at this moment, which has a time zone."""
+        """The figures at `now`, which has a time zone."""
         began = self.began(now)
         hour = now.replace(minute=0, second=0, microsecond=0)
         self._runs = runs = [run for run in self._runs if run.at >= min(began, hour)]

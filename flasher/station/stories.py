@@ -1,4 +1,4 @@
-"""What the traces of runs tell, in words."""
+"""Explains the traces of runs in the records."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flasher.trace.story import Story
 
 
 def explained(files: FileStore, file: AttachmentFile) -> Story | str:
-    """The story of a trace in the records; or in words why there is none."""
+    """Explain a trace of the records. Returns a text with the reason when that fails."""
     try:
         with files.named(file) as path:
             return replace(explain_path(path), source=printable(file.name))

@@ -14,41 +14,39 @@ from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, Wor
 from flasher.station.worker import worker_main
 
 HANG_S: Final = 10.0
-"""A process that sends nothing for this time hangs: heartbeats come every half second, and no call
-of an adapter takes longer than some seconds."""
+"""Without a message for this time a process hangs: heartbeats come every half second, and calls of
+an adapter take at most some seconds."""
 START_S: Final = 60.0
-"""A process that has only begun may take longer: it loads its adapter's driver."""
+"""The same for a process that starts, which loads the driver of its adapter."""
 RESTART_MIN_S: Final = 1.0
 RESTART_MAX_S: Final = 30.0
 _QUIT_S: Final = 5.0
 _MESSAGES_AT_ONCE: Final = 1000
-"""Taken from one process before the others have their turn."""
+"""Messages read from one process before the next one's turn."""
 
 
 class WorkerPort(Protocol):
-    """The station's end of one process."""
+    """The station's side of one process."""
 
     @property
     def waitable(self) -> Any:
-        """For `multiprocessing.connection.wait`; None where there is nothing to wait for."""
+        """Argument for `multiprocessing.connection.wait`; None: cannot be waited for."""
 
     def send(self, message: ToWorker) -> bool:
-        """False when the process is gone."""
+        """Send a message. Returns False when the process has ended."""
 
     def receive(self) -> FromWorker | None:
-        """The next message, None when there is none. Raises EOFError or OSError when the process is
-        gone.
-        """
+        """The next message, or None. Raises EOFError or OSError when the process has ended."""
 
     def kill(self) -> None:
-        """End the process at once, and wait for its end."""
+        """Kill the process, and wait for its end."""
 
     def join(self, limit_s: float) -> bool:
-        """Wait for it to end by itself; False when it did not."""
+        """Wait until the process ends. Returns False after the time limit."""
 
 
 class ProcessPort:
-    """A process made with "spawn": nothing of the station is copied into it, on any system."""
+    """A process, started with "spawn", so that it shares no state with the station."""
 
     def __init__(self, setup: WorkerSetup) -> None:
         context = multiprocessing.get_context("spawn")
@@ -58,7 +56,7 @@ class ProcessPort:
         )
         with deaf_from_birth(to_sigterm=True):  # `kill` ends it with SIGKILL
             self._process.start()
-        # The child has its own: only without this one its end is seen here.
+        # The end of the process is only detected after this side has closed the other end.
         theirs.close()
 
     @property
@@ -90,7 +88,7 @@ class ProcessPort:
 
 @dataclass(frozen=True)
 class WorkerLost:
-    """A process was lost. It is restarted after `restart_in_s`; None: never."""
+    """A process ended or hung. It is restarted after `restart_in_s`; None: never."""
 
     reason: str
     hung: bool
@@ -130,25 +128,27 @@ class Supervisor:
 
     @property
     def ports(self) -> Mapping[str, WorkerPort]:
-        """The processes that are there, by socket."""
+        """The running processes by socket."""
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
 
     def send(self, socket: str, message: ToWorker) -> bool:
-        """False without a process that could receive it."""
+        """Send a message to a socket's process. Returns False when none is running."""
         port = self._slots[socket].port
         return port is not None and port.send(message)
 
     def wait(self, extra: Sequence[Any], limit_s: float) -> None:
         """Wait for a message, up to `limit_s`."""
-        found = [port.waitable for port in self.ports.values()]
-        waitables = [*filter(None, found), *extra]
+        ports = [port.waitable for port in self.ports.values()]
+        waitables = [*filter(None, ports), *extra]
         if waitables:
             with suppress(OSError):
                 wait(waitables, timeout=limit_s)
 
     def poll(self) -> list[tuple[str, FromWorker | WorkerLost]]:
-        """The messages of the processes, and the lost ones; starts those that are due."""
-        found: list[tuple[str, FromWorker | WorkerLost]] = []
+        """Read the messages of all processes, and start those that are due. Returns the messages
+        with their sockets; for a lost process `WorkerLost`.
+        """
+        news: list[tuple[str, FromWorker | WorkerLost]] = []
         for name, slot in self._slots.items():
             if slot.port is None:
                 if slot.start_at is not None and self._now() >= slot.start_at:
@@ -157,19 +157,20 @@ class Supervisor:
                     slot.is_new, slot.start_at, slot.reason = True, None, ""
                 continue
             messages, is_gone = self._receive(slot)
-            found += [(name, message) for message in messages]
-            # Looked at after everything that waited was read: a busy station is no hung process.
+            news += [(name, message) for message in messages]
+            # Checked after all waiting messages were read: a busy station must not look like a hung
+            # process.
             limit_s = START_S if slot.is_new else HANG_S
             if is_gone:
-                found.append((name, self._lose(slot, "its process ended", hung=False)))
+                news.append((name, self._lose(slot, "its process ended", hung=False)))
             elif self._now() - slot.heard_at > limit_s:
                 slot.port.kill()
-                reason = f"its process said nothing for {limit_s:g} s, and was ended"
-                found.append((name, self._lose(slot, reason, hung=True)))
-        return found
+                reason = f"its process sent nothing for {limit_s:g} s, and was killed"
+                news.append((name, self._lose(slot, reason, hung=True)))
+        return news
 
     def close(self) -> None:
-        """Let all processes end; those that do not in time are ended."""
+        """Ask all processes to end; kill those that do not in time."""
         ports = list(self.ports.values())
         for port in ports:
             port.send(Quit())
@@ -183,7 +184,7 @@ class Supervisor:
     # -- one process ------------------------------------------------------------------------------
 
     def _receive(self, slot: _Slot) -> tuple[list[FromWorker], bool]:
-        """All its messages, and whether it is gone."""
+        """Returns the waiting messages of a process, and whether it has ended."""
         messages: list[FromWorker] = []
         port = slot.port
         if port is None:
@@ -206,7 +207,7 @@ class Supervisor:
             slot.port.kill()
         slot.port = None
         if slot.reason:
-            # Starting it again would change nothing.
+            # A new process would fail for the same reason.
             return WorkerLost(slot.reason, hung, None)
         pause_s = slot.pause_s
         slot.start_at = self._now() + pause_s
@@ -214,5 +215,5 @@ class Supervisor:
         return WorkerLost(reason, hung, pause_s)
 
     def worked(self, socket: str) -> None:
-        """The process of this socket has done its work: forget its failures."""
+        """Reset the pause before restarts, after the process of this socket completed a run."""
         self._slots[socket].pause_s = RESTART_MIN_S
