@@ -297,7 +297,7 @@ class _OurCommand(HelpedCommand):
         return token if is_whole or len(matches) != 1 else matches[0]
 
 
-class Command(_OurCommand):
+class CliCommand(_OurCommand):
     """A command whose function takes the output and returns the exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -314,10 +314,10 @@ class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-cl
         """In the order of declaration, the most used first."""
         return list(self.commands)
 
-    def action(self, name: str, **more: Any) -> Callable[[Callable[..., int]], Command]:
+    def action(self, name: str, **more: Any) -> Callable[[Callable[..., int]], CliCommand]:
         """Make a function an action; its exit codes default to the group's."""
 
-        def make(function: Callable[..., int]) -> Command:
+        def make(function: Callable[..., int]) -> CliCommand:
             summary = (function.__doc__ or "").partition(".")[0]
             more.setdefault("exit_codes", self.exit_codes)
             made = command(short_help=" ".join(summary.split()), **more)(function)
@@ -327,9 +327,9 @@ class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-cl
         return make
 
 
-def command(**more: Any) -> Callable[[Callable[..., int]], Command]:
+def command(**more: Any) -> Callable[[Callable[..., int]], CliCommand]:
     """Make a function a command; its docstring begins the help."""
-    return click.command(cls=Command, **more)
+    return click.command(cls=CliCommand, **more)
 
 
 def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., Any]], Group]:
@@ -359,7 +359,7 @@ def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., A
 
 
 @dataclass(frozen=True)
-class Entry:
+class CommandEntry:
     """A command of the program: its location, and its line in the list of commands."""
 
     place: str
@@ -377,7 +377,9 @@ class Entry:
 class Program(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-click's own bases
     """The program. It imports a command when it is called, or its help is requested."""
 
-    def __init__(self, *args: Any, entries: Mapping[str, Mapping[str, Entry]], **more: Any) -> None:
+    def __init__(
+        self, *args: Any, entries: Mapping[str, Mapping[str, CommandEntry]], **more: Any
+    ) -> None:
         """`entries` are the commands, by section and name."""
         super().__init__(
             *args,

@@ -43,7 +43,7 @@ class Logs:
 
     def __init__(self, output: Output) -> None:
         self._output = output
-        self._file: _File | None = None
+        self._file: _LogFile | None = None
         self._restore: list[tuple[logging.Logger, int, logging.Handler]] = []
 
     def __enter__(self) -> Self:
@@ -68,7 +68,7 @@ class Logs:
         self._attach(_Screen(self._output), *_ON_STDERR[max(-1, min(verbosity, 2))])
         if log_file is not None:
             check_not_read(log_file, LOG_FILE, others)
-            self._file = _File(Path(log_file))
+            self._file = _LogFile(Path(log_file))
             self._attach(self._file, logging.DEBUG, _FILE_CAN_LEVEL)
 
     def _attach(self, handler: logging.Handler, flasher_level: int, can_level: int) -> None:
@@ -102,7 +102,7 @@ class _Screen(logging.Handler):
             pass
 
 
-class _File(logging.FileHandler):
+class _LogFile(logging.FileHandler):
     """Appends every record with its time. `failure` explains an incomplete log."""
 
     def __init__(self, path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 import click
 
-from flasher.cli.framework import Entry, Program, Session, usage_error
+from flasher.cli.framework import CommandEntry, Program, Session, usage_error
 from flasher.cli.help import STYLE
 from flasher.cli.logs import Logs
 from flasher.cli.output import SAID, Output
@@ -25,69 +25,75 @@ from flasher.errors import (
 )
 from flasher.protocol.text import printable
 
-PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
+PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
     "upgrade a device": {
-        "flash": Entry("upgrade.flash:flash", "upgrade a device"),
-        "rescue": Entry(
+        "flash": CommandEntry("upgrade.flash:flash", "upgrade a device"),
+        "rescue": CommandEntry(
             "upgrade.flash:rescue",
             "wait for a device to announce itself at power-up, then upgrade it",
         ),
-        "ui": Entry("upgrade.ui:ui", "upgrade a bike in a browser, step by step"),
-        "image-info": Entry(
+        "ui": CommandEntry("upgrade.ui:ui", "upgrade a bike in a browser, step by step"),
+        "image-info": CommandEntry(
             "upgrade.image_info:image_info",
             "show an image, the bytes to be sent, and the time it takes",
         ),
-        "history": Entry("upgrade.history:history", "list the upgrades made from this computer"),
-        "manifest": Entry(
+        "history": CommandEntry(
+            "upgrade.history:history", "list the upgrades made from this computer"
+        ),
+        "manifest": CommandEntry(
             "upgrade.manifest:manifest", "create or check the release manifest of an image"
         ),
     },
     "look at devices and the bus": {
-        "info": Entry(
+        "info": CommandEntry(
             "look.info:info", "identity, versions, state, faults and history of a device"
         ),
-        "scan": Entry("look.scan:scan", "list the devices on the bus, and identify its dialect"),
-        "read": Entry("look.read:read", "read an item of a device by its name, or its memory"),
-        "write": Entry(
+        "scan": CommandEntry(
+            "look.scan:scan", "list the devices on the bus, and identify its dialect"
+        ),
+        "read": CommandEntry(
+            "look.read:read", "read an item of a device by its name, or its memory"
+        ),
+        "write": CommandEntry(
             "look.write:write", "write an item of a device by its name, and read it back"
         ),
-        "backup": Entry(
+        "backup": CommandEntry(
             "look.backup:backup", "save a device's memory and all its answers to a file"
         ),
-        "monitor": Entry(
+        "monitor": CommandEntry(
             "look.monitor:monitor", "show decoded traffic, live or of a recorded trace"
         ),
-        "export": Entry(
+        "export": CommandEntry(
             "look.export:export", "convert the protocol and traces for Wireshark and other tools"
         ),
     },
     "when something goes wrong": {
-        "adapters": Entry(
+        "adapters": CommandEntry(
             "look.adapters:adapters",
             "list the adapters of this computer, with the arguments for each",
         ),
-        "doctor": Entry(
+        "doctor": CommandEntry(
             "look.doctor:doctor",
             "check adapters, bus and traffic, and suggest repairs",
         ),
-        "help": Entry("look.help:help_", "explain an error code, as E402"),
-        "explain": Entry(
+        "help": CommandEntry("look.help:help_", "explain an error code, as E402"),
+        "explain": CommandEntry(
             "look.explain:explain", "explain a recorded trace or a bundle, with a verdict"
         ),
     },
     "without hardware, and for bootloaders": {
-        "mock": Entry("bench.mock:mock", "run the device model on a bus until interrupted"),
-        "conformance": Entry(
+        "mock": CommandEntry("bench.mock:mock", "run the device model on a bus until interrupted"),
+        "conformance": CommandEntry(
             "bench.conformance:conformance", "test a bootloader against the protocol, case by case"
         ),
     },
     "at the end of a production line": {
-        "station": Entry(
+        "station": CommandEntry(
             "station.commands:station", "flash unit after unit at the end of a line, with records"
         ),
     },
     "what a product does its own way": {
-        "profile": Entry(
+        "profile": CommandEntry(
             "upgrade.profile:profile",
             "show the settings of a target, and where each comes from",
         ),

@@ -31,7 +31,7 @@ class Stop:
 
     def __init__(self, on_first: Callable[[], None] | None) -> None:
         self._on_first = on_first
-        self._told = False
+        self._was_reported = False
         self.is_asked = False
         """Ctrl-C or SIGTERM came."""
         self.has_hung_up = False
@@ -43,8 +43,8 @@ class Stop:
     def asked(self) -> bool:
         """True after Ctrl-C or SIGTERM; the first call that returns True calls `on_first`."""
         # Not in the handler, which may interrupt a print: printing there fails.
-        if self.is_asked and not self._told:
-            self._told = True
+        if self.is_asked and not self._was_reported:
+            self._was_reported = True
             if self._on_first is not None:
                 self._on_first()
         return self.is_asked

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from math import ceil, inf
 from typing import Final
 
-from flasher.conformance.results import CaseStopped, CaseVerdict, Check, CheckOutcome, Measurement
+from flasher.conformance.results import CaseStopped, CaseVerdict, Check, CheckOutcome, MeasuredTime
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Received, Reply, describe
 
@@ -38,7 +38,7 @@ class Judge:
 
     def __init__(self, tester: BusTester) -> None:
         self.checks: list[Check] = []
-        self.measurements: list[Measurement] = []
+        self.measurements: list[MeasuredTime] = []
         self.infos: list[str] = []
         self._tester = tester
         self._step = ""
@@ -151,7 +151,7 @@ class Judge:
 
     def measure(self, name: str, value_s: float) -> None:
         """Record a time without judging it."""
-        self.measurements.append(Measurement(name, value_s, self._tester.port.uncertainty_s))
+        self.measurements.append(MeasuredTime(name, value_s, self._tester.port.uncertainty_s))
 
     def check_time(
         self, name: str, value_s: float, *, low_s: float = 0.0, high_s: float | None = None

@@ -46,7 +46,7 @@ from flasher.conformance.results import (
     CaseStopped,
     CaseVerdict,
     CheckOutcome,
-    Measurement,
+    MeasuredTime,
     RunReport,
     TraceEntry,
     Unsupported,
@@ -86,13 +86,13 @@ class Measurements:
         """Add a time of the user's own."""
         self.times.setdefault(name, []).append(value_s)
 
-    def add(self, measurements: Iterable[Measurement]) -> None:
+    def add(self, measurements: Iterable[MeasuredTime]) -> None:
         for one in measurements:
             self.record(one.name, one.value_s)
 
     def of(self, name: str) -> Distribution:
         """Distribution of the times of a name. Raises KeyError when none was measured."""
-        return distribution(Measurement(name, value, 0.0) for value in self.times[name])
+        return distribution(MeasuredTime(name, value, 0.0) for value in self.times[name])
 
 
 class BenchTrace:

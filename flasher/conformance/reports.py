@@ -19,7 +19,7 @@ from flasher.conformance.results import (
     CaseVerdict,
     CheckOutcome,
     Histogram,
-    Measurement,
+    MeasuredTime,
     RunReport,
     Times,
     TraceEntry,
@@ -60,7 +60,7 @@ def group_title(group: str) -> str:
     return GROUPS.get(group, group)
 
 
-def distribution(measurements: Iterable[Measurement]) -> Distribution:
+def distribution(measurements: Iterable[MeasuredTime]) -> Distribution:
     """Distribution of measured times. Raises ValueError for none."""
     found = Distribution.of(measurement.value_s for measurement in measurements)
     if found is None:

@@ -83,7 +83,7 @@ class CheckCounts:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class MeasuredTime:
     """One measured time; its name states both ends ("packet to ACK")."""
 
     name: str
@@ -158,7 +158,7 @@ class CaseResult:
     seed: str = ""
     note: str = ""
     checks: tuple[Check, ...] = ()
-    measurements: tuple[Measurement, ...] = ()
+    measurements: tuple[MeasuredTime, ...] = ()
     infos: tuple[str, ...] = ()  # what was observed without being judged
     duration_s: float = 0.0
     trace: tuple[TraceEntry, ...] = ()
@@ -370,9 +370,9 @@ class RunReport:
             found.setdefault(text.group, []).append((text, result))
         return found
 
-    def measured(self) -> dict[str, list[Measurement]]:
+    def measured(self) -> dict[str, list[MeasuredTime]]:
         """All measurements by name, in order of first occurrence."""
-        found: dict[str, list[Measurement]] = {}
+        found: dict[str, list[MeasuredTime]] = {}
         for result in self.results:
             for measurement in result.measurements:
                 found.setdefault(measurement.name, []).append(measurement)

@@ -319,7 +319,7 @@ def load_profile(
     """
     found = Path(path) if path is not None else find_profile()
     if found is not None and found != Path(os.devnull):
-        return _File(found, was_named=path is not None).profile(target, dialect)
+        return _ProfileFile(found, was_named=path is not None).profile(target, dialect)
     profile = Profile(
         target, dialect, has_upgrade=dialect.has_upgrade, version_query=documented_query(target)
     )
@@ -331,7 +331,7 @@ def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
 
     Raises UsageError as `load_profile`.
     """
-    file = _File(Path(path))
+    file = _ProfileFile(Path(path))
     for target in TARGETS.values():
         file.profile(target, WELLING)
     return tuple(target for target in TARGETS.values() if target.name in file.tables)
@@ -380,7 +380,7 @@ def reader() -> Reader[Profile]:
     return Reader(Profile, "profile", beside=_BESIDE, also=(*TARGETS, _BUS))
 
 
-class _File:
+class _ProfileFile:
     """File whose keys and values are valid individually. Raises UsageError."""
 
     def __init__(self, path: Path, *, was_named: bool = True) -> None:

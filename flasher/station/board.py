@@ -85,7 +85,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ScanReply:
     """The answer to a scan, or a prompt to a person."""
 
     text: str = ""
@@ -98,16 +98,18 @@ class Answer:
 class Spoken:
     """The last answers: to what each page scanned, and all others."""
 
-    to_all: Answer = Answer()
-    to_pages: Mapping[str, Answer] = field(default_factory=dict)
+    to_all: ScanReply = ScanReply()
+    to_pages: Mapping[str, ScanReply] = field(default_factory=dict)
 
-    def to(self, source: str) -> Answer:
+    def to(self, source: str) -> ScanReply:
         """The last answer for this source; other pages' answers are not shown."""
-        return max(self.to_all, self.to_pages.get(source, Answer()), key=lambda each: each.number)
+        return max(
+            self.to_all, self.to_pages.get(source, ScanReply()), key=lambda each: each.number
+        )
 
     def with_answer(self, text: str, source: str, *, is_refusal: bool) -> Spoken:
         before = max((each.number for each in self.to_pages.values()), default=0)
-        answer = Answer(text, is_refusal, max(before, self.to_all.number) + 1)
+        answer = ScanReply(text, is_refusal, max(before, self.to_all.number) + 1)
         if not source.startswith(PAGE):
             return replace(self, to_all=answer)
         others = {name: each for name, each in self.to_pages.items() if name != source}
@@ -157,13 +159,13 @@ class Board:
     """Sockets that will not work any more, with the reason."""
 
     @property
-    def said(self) -> str:
+    def last_reply(self) -> str:
         """The answer to the last scan outside pages, or a prompt."""
         return self.spoken.to_all.text
 
     @property
     def is_refusal(self) -> bool:
-        """True when `said` is a refusal."""
+        """True when `last_reply` is a refusal."""
         return self.spoken.to_all.is_refusal
 
     def apply(self, event: StationEvent) -> None:
@@ -246,7 +248,7 @@ class Board:
         self.speak(beside_words(event), is_refusal=True)
         row = self.rows.get(event.socket)
         if row is not None and row.serial == printable(event.serial):
-            row.note = self.said
+            row.note = self.last_reply
 
     def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
         sentence = printable(event.text)

@@ -34,16 +34,16 @@ from flasher.station.events import (
     UnitArrived,
     UnitRemoved,
 )
-from flasher.station.messages import AdapterDown, PresenceChanged, Ready, RunResult
+from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged, RunResult
 from flasher.station.operators import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, Order, RunState
 from flasher.station.scans import (
-    Command,
     Label,
     NotUnderstood,
     Refused,
+    ScanCommand,
     Waiting,
     Word,
     card_waits,
@@ -119,7 +119,7 @@ class NotSaved:
 
 
 SocketInput = (
-    Ready
+    AdapterReady
     | AdapterDown
     | PresenceChanged
     | RunStarted
@@ -239,7 +239,7 @@ class Line:
         self._TABLE[socket.phase][type(what)](self, socket, what, now)
         self._go_on(now)
 
-    def _ready(self, socket: Socket, what: Ready, now: float) -> None:
+    def _ready(self, socket: Socket, what: AdapterReady, now: float) -> None:
         if socket.can_work:
             return  # the adapter was reopened between two polls
         was_short = now - socket.out_since_s < SHORT_OUTAGE_S
@@ -278,10 +278,10 @@ class Line:
             # It may have come after its card or label was scanned, in place of a silent one.
             self._drop_for(socket, now, *_CHANGED, keeps_label=socket.binding is Binding.NAMED)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
-        is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
+        is_new = socket.note_unit(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
             socket.arrived_at_s = now
-            self._tell(UnitArrived(socket.name, what.how, what.label))
+            self._emit(UnitArrived(socket.name, what.how, what.label))
         if socket.phase is not SocketPhase.REST:
             return
         if what.label and self._scans_labels and not socket.label:
@@ -315,7 +315,7 @@ class Line:
         awaits = awaits and socket.binding is Binding.NAMED
         if not socket.fall_silent(is_certain=is_certain):
             return
-        self._tell(UnitRemoved(socket.name))
+        self._emit(UnitRemoved(socket.name))
         if awaits:
             socket.begin_at_s = None
         self._drop_for(socket, now, code, reason, remedy, keeps_label=awaits)
@@ -365,7 +365,7 @@ class Line:
                 socket=named.name,
                 here=socket.name,
             )
-            self._tell(OperatorPrompted(socket.name, sentence, source=named.source.name))
+            self._emit(OperatorPrompted(socket.name, sentence, source=named.source.name))
 
     def _claimed(self, socket: Socket, _what: RunStarted, _now: float) -> None:
         socket.phase = SocketPhase.RUN
@@ -428,7 +428,7 @@ class Line:
             before, self.operator = self.operator, person.name
             role = person.role.value
             self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=role)
-            self._tell(ScanAccepted(printable(person.name), "badge", source=source.name))
+            self._emit(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # A PIN typed too late or too often: no message may show it.
             reason = text("No PIN is awaited, and it is no serial number of this recipe.")
@@ -451,7 +451,7 @@ class Line:
         else:
             if meaning not in (_RESUME, _REPRINT, _PIN):  # other events report the result
                 name = "" if socket is None else socket.name
-                self._tell(ScanAccepted(shown, meaning, name, source.name))
+                self._emit(ScanAccepted(shown, meaning, name, source.name))
 
     def _understand(self, raw: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
         """The meaning of a scan, and its socket. Raises Refused."""
@@ -471,11 +471,11 @@ class Line:
                         waiting.is_in_doubt = True
                         raise self._in_doubt(waiting)
                 return "label", self._take_label(serial, waiting, now)
-            case Command(word, argument):
+            case ScanCommand(word, argument):
                 person = self._crew.check_role(word)
                 if person is not None and person.pin:
                     asked = self._crew.ask(person, word, argument, now, waiting.source)
-                    self._tell(PinAwaited(person.name, asked.text, asked.until_s - now))
+                    self._emit(PinAwaited(person.name, asked.text, asked.until_s - now))
                     return _PIN, None
                 return word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)
             case NotUnderstood(why):
@@ -532,7 +532,7 @@ class Line:
             crew.was_right(asked.person.name, source)
             word, argument = asked.word, asked.argument
             waiting = self._waiting.setdefault(asked.source.name, Waiting(asked.source))
-            self._tell(PinEnded(asked.person.name, is_right=True))
+            self._emit(PinEnded(asked.person.name, is_right=True))
             self._answer(
                 printable(asked.text)[:80],
                 asked.source,
@@ -548,7 +548,7 @@ class Line:
     def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
         """Refuse the override that waited for its PIN."""
         self._crew.asked = None
-        self._tell(PinEnded(asked.person.name, is_right=False))
+        self._emit(PinEnded(asked.person.name, is_right=False))
         self._refuse(printable(asked.text)[:80], code, reason, remedy)
 
     # -- labels and commands ----------------------------------------------------------------------
@@ -575,7 +575,7 @@ class Line:
         self._bind(socket, serial, why, now, waiting.source)
         if why is not Binding.SAID and not socket.is_due(now):
             source = waiting.source.name
-            self._tell(OperatorPrompted(socket.name, socket.wanted, source=source))
+            self._emit(OperatorPrompted(socket.name, socket.wanted, source=source))
         return socket
 
     def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
@@ -665,7 +665,7 @@ class Line:
                 label=shown,
                 socket=before.name,
             )
-        self._tell(OperatorPrompted("", words, source=waiting.source.name))
+        self._emit(OperatorPrompted("", words, source=waiting.source.name))
 
     def _take_socket(self, argument: str, now: float, waiting: Waiting) -> Socket:
         is_again = waiting.card is not None and waiting.card.name.lower() == argument.lower()
@@ -785,7 +785,7 @@ class Line:
         """Result of `Reprint`."""
         text = printable(f"{Word.REPRINT.value} {serial}")[:80]
         if refused is None:
-            self._tell(ScanAccepted(text, _REPRINT))
+            self._emit(ScanAccepted(text, _REPRINT))
         else:
             self._refuse(text, refused.code, refused.reason, refused.remedy)
 
@@ -801,8 +801,8 @@ class Line:
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None
-            self._tell(ScanAccepted(word, _RESUME))
-            self._tell(LineResumed())
+            self._emit(ScanAccepted(word, _RESUME))
+            self._emit(LineResumed())
             for socket in self.sockets.values() if self._scans_labels else ():
                 if socket.awaits_label and socket.borne:  # it was refused meanwhile
                     self._scan_borne(socket, socket.borne, now)
@@ -865,7 +865,7 @@ class Line:
             if socket.shown != shown and socket.phase is not SocketPhase.CLAIM:
                 socket.shown = shown
                 state, serial, text = shown
-                self._tell(SocketChanged(socket.name, state, serial, text))
+                self._emit(SocketChanged(socket.name, state, serial, text))
 
     def _bind(self, socket: Socket, serial: str, why: Binding, now: float, source: Source) -> None:
         """Assign the label to the unit in this socket, or to the one that will arrive."""
@@ -948,7 +948,7 @@ class Line:
         if self.stopped is not None:
             return
         self.stopped = LineStopped(code, reason, remedy)
-        self._tell(self.stopped)
+        self._emit(self.stopped)
         reason = text("The line was stopped.")
         self.drop_all(_FORGOTTEN, reason, text("Scan it again when it goes on."))
 
@@ -961,7 +961,7 @@ class Line:
 
     # -- effects ----------------------------------------------------------------------------------
 
-    def _tell(self, event: StationEvent) -> None:
+    def _emit(self, event: StationEvent) -> None:
         self._effects.append(event)
 
     def _refuse(
@@ -974,7 +974,7 @@ class Line:
         source: Source = UNNAMED,
     ) -> None:
         name = "" if socket is None else socket.name
-        self._tell(ScanRefused(text, code, reason, remedy, name, source.name))
+        self._emit(ScanRefused(text, code, reason, remedy, name, source.name))
         self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
 
     def _audit(self, what: AuditEvent, **data: str) -> None:
@@ -993,27 +993,27 @@ class Line:
         except Refused as refused:
             self._refuse(label, refused.code, refused.reason, refused.remedy, socket)
         else:
-            self._tell(ScanAccepted(label, "label", socket.name))
+            self._emit(ScanAccepted(label, "label", socket.name))
             self._bind(socket, label, Binding.SAID, now, UNNAMED)
 
     # -- the tables -------------------------------------------------------------------------------
 
     _TABLE: ClassVar[Mapping[SocketPhase, Mapping[type, Callable[..., None]]]] = {
-        SocketPhase.REST: {Ready: _ready, AdapterDown: _down, PresenceChanged: _unit},
+        SocketPhase.REST: {AdapterReady: _ready, AdapterDown: _down, PresenceChanged: _unit},
         SocketPhase.CLAIM: {
             RunStarted: _claimed,
             NotClaimed: _not_claimed,
             NotSaved: _claim_failed,
         },
         SocketPhase.RUN: {
-            Ready: _ready,
+            AdapterReady: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
             RunResult: _ended,
         },
         SocketPhase.SAVE: {
-            Ready: _ready,
+            AdapterReady: _ready,
             AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,

@@ -29,7 +29,7 @@ class RunResult:
 
 
 @dataclass(frozen=True)
-class Write:
+class JournalWrite:
     """A write to a device, recorded before it is done and again after it."""
 
     target: str
@@ -50,10 +50,10 @@ class Journal(Protocol):
     raises JournalError when it cannot be saved.
     """
 
-    def intent(self, target: str, what: str, value: str) -> Write:
+    def intent(self, target: str, what: str, value: str) -> JournalWrite:
         """Records a write before it is sent to the device."""
 
-    def verified(self, write: Write, read_back: str | None) -> None:
+    def verified(self, write: JournalWrite, read_back: str | None) -> None:
         """Records that it was done; `read_back` is None when nothing could be read back."""
 
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
@@ -137,7 +137,7 @@ ToWorker = Claim | WriteReply | Abort | Quit
 
 
 @dataclass(frozen=True)
-class Ready:
+class AdapterReady:
     """The adapter is open. `sees_units` is False when present units may be silent."""
 
     adapter: str
@@ -189,7 +189,7 @@ class Ask:
     """A request to save a write or step; the process waits for the `WriteReply`."""
 
     number: int
-    what: Write | StepEnded
+    what: JournalWrite | StepEnded
     measurements: tuple[Measurement, ...] = ()
     """The measurements of the step."""
 
@@ -203,4 +203,6 @@ class CannotWork:
 
 RunEvent = StepStarted | Progressed | OperatorPrompted
 """Progress of a run, only displayed. The station adds the socket."""
-FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork
+FromWorker = (
+    AdapterReady | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork
+)

@@ -28,8 +28,8 @@ from flasher.station import pins
 from flasher.station.attempts import BackOff
 from flasher.station.config import no_two
 from flasher.station.pattern import pattern_of
-from flasher.station.recipe import SerialNumber, ShortText
-from flasher.station.scans import Command, Label, Refused, Word, understand
+from flasher.station.recipe import SerialNumberRule, ShortText
+from flasher.station.scans import Label, Refused, ScanCommand, Word, understand
 from flasher.station.socket import PAGE, Source
 
 PIN_LIMIT_S: Final = 30.0
@@ -72,7 +72,7 @@ class Person(TomlTable):
     def _check_code(cls, value: str) -> str:
         meaning = understand(value)
         if meaning != Label(value):
-            what = "is a command" if isinstance(meaning, Command) else "cannot be scanned"
+            what = "is a command" if isinstance(meaning, ScanCommand) else "cannot be scanned"
             raise ValueError(f"{value!a:.60} {what}")
         return value
 
@@ -100,7 +100,7 @@ class BadgeTable(TomlTable):
 BADGES: Final = Reader(BadgeTable, "badge table")
 
 
-def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
+def load_badges(path: Path, serial_number: SerialNumberRule) -> tuple[Person, ...]:
     """Load the people of a badge table. Raises UsageError with all problems, among them badges that
     could be labels of this recipe.
     """

@@ -66,7 +66,7 @@ class TargetTable(TomlTable):
         return TARGETS[self.target]
 
 
-class SerialNumber(TomlTable):
+class SerialNumberRule(TomlTable):
     """The form of the product's serial numbers."""
 
     pattern: str
@@ -102,7 +102,7 @@ class SerialNumber(TomlTable):
         return value
 
     @model_validator(mode="after")
-    def _check_example(self) -> SerialNumber:
+    def _check_example(self) -> SerialNumberRule:
         groups = pattern_of(self.pattern).groups
         for key in ("check_group", "lot_group", "number_group"):
             name = getattr(self, key)
@@ -276,7 +276,7 @@ class Recipe(TomlTable):
     """Notes for people."""
     profile: str = ""
     """A target profile (see `flasher profile`) in the recipe's folder."""
-    serial_number: SerialNumber
+    serial_number: SerialNumberRule
     lot: Lot = Lot()
     target: tuple[Firmware, ...] = Field(min_length=1)
     write: tuple[Write, ...] = ()

@@ -22,8 +22,8 @@ from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
     Claim,
-    Ending,
     RunDetails,
+    RunEnd,
     RunState,
     StepName,
     StepState,
@@ -100,13 +100,13 @@ def _attach(store: Store, run: ActiveRun) -> None:
     run.attached = [file]
 
 
-def _ending(run: ActiveRun, result: RunResult) -> Ending:
+def _ending(run: ActiveRun, result: RunResult) -> RunEnd:
     code = CODES.get(result.code, codes.INTERNAL)
     log = next((file.sha256 for file in run.attached if file.kind == TRACE), None)
     text = " ".join(filter(None, (sentence(result.text), code.action)))
     if result.outcome is RunState.PASS:
         text = verified_words(result)
-    return Ending(result.outcome, code.name, text, result.verified, log, tuple(run.attached))
+    return RunEnd(result.outcome, code.name, text, result.verified, log, tuple(run.attached))
 
 
 def sentence(text: str) -> str:

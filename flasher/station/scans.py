@@ -100,7 +100,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class Command:
+class ScanCommand:
     """A command word with its argument."""
 
     word: Word
@@ -114,7 +114,7 @@ class NotUnderstood:
     why: str
 
 
-def understand(scan: str) -> Label | Command | NotUnderstood:
+def understand(scan: str) -> Label | ScanCommand | NotUnderstood:
     """Parse a scan. Whether a label fits the recipe is checked later."""
     scanned = scan.strip()
     if not scanned:
@@ -124,7 +124,7 @@ def understand(scan: str) -> Label | Command | NotUnderstood:
     first, _, rest = scanned.partition(" ")
     word = next((each for each in Word if each.value == first.upper()), None)
     if word is not None and (word in ALONE) == (not rest.strip()):
-        return Command(word, rest.strip())
+        return ScanCommand(word, rest.strip())
     if word is not None:
         return NotUnderstood(
             text("{word} stands alone.", word=word.value)

@@ -22,7 +22,7 @@ class Count(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Output:
+class ShiftFigures:
     """The figures in the footer of the operator page."""
 
     hour: Count
@@ -71,7 +71,7 @@ class ShiftCounts:
         """Start of the current shift; `now` without shifts."""
         return shift_began(self._shifts, now) or now
 
-    def output(self, now: datetime) -> Output:
+    def output(self, now: datetime) -> ShiftFigures:
         """The figures at `now`, which has a time zone."""
         began = self.began(now)
         hour = now.replace(minute=0, second=0, microsecond=0)
@@ -82,7 +82,7 @@ class ShiftCounts:
         for run in shift:
             if run.outcome in (RunState.PASS, RunState.FAIL):
                 first.setdefault(run.serial, run.outcome is RunState.PASS)
-        return Output(
+        return ShiftFigures(
             _count(run for run in runs if run.at >= hour),
             _count(shift),
             sum(first.values()) / len(first) if first else None,

@@ -216,7 +216,7 @@ class Socket:
         """True when the last unit here has passed, wherever it is by now."""
         return self.last is not None and self.last.outcome is RunState.PASS
 
-    def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
+    def note_unit(self, what: PresenceChanged, *, is_serial: bool) -> bool:
         """Note a unit that was detected or reported its serial number; `is_serial`: a number of the
         recipe. True when it is another unit than before.
         """

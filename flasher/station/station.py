@@ -48,13 +48,13 @@ from flasher.station.line import ARRIVAL_LIMIT_S, Line
 from flasher.station.messages import (
     Abort,
     AdapterDown,
+    AdapterReady,
     Ask,
     FromWorker,
+    JournalWrite,
     PresenceChanged,
-    Ready,
     RunResult,
     WorkerSetup,
-    Write,
     WriteReply,
 )
 from flasher.station.operators import Crew
@@ -63,7 +63,6 @@ from flasher.station.records.errors import ClaimRefusedError, RecordError, Refus
 from flasher.station.records.model import (
     AuditEvent,
     Claim,
-    Clock,
     Figures,
     Measurement,
     Order,
@@ -72,6 +71,7 @@ from flasher.station.records.model import (
     RunKind,
     RunRecord,
     RunState,
+    StationClock,
     UnitLife,
     WriteId,
 )
@@ -79,7 +79,7 @@ from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
 from flasher.station.scans import Refused
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
-from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
+from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
 
 TURN_S: Final = 0.1
 """A turn of the loop waits at most this long."""
@@ -123,14 +123,14 @@ class Station:
         on_event: EventHandler = lambda _event: None,
         on_turn: Callable[[], None] = lambda: None,
         options: StationOptions | None = None,
-        clock: Clock | None = None,
+        clock: StationClock | None = None,
         launch: Launch = ProcessPort,
         checker: Executor | None = None,
     ) -> None:
         self.store = store
         self.recipe = recipe
         self.options = options or StationOptions()
-        self.clock: Clock = clock or SystemClock()
+        self.clock: StationClock = clock or SystemClock()
         self._on_event = on_event
         self._on_turn = on_turn
         setups = tuple(setups)
@@ -145,7 +145,7 @@ class Station:
         )
         self._has_badges = crew is not None
         self._labels = labels
-        self.supervisor = Supervisor(setups, self.clock.monotonic_s, launch)
+        self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
         """Runs that are claimed and not saved yet, by socket."""
         self._scans: deque[tuple[str, Source]] = deque()
@@ -181,7 +181,7 @@ class Station:
         if self._labels is not None:
             self._labels.start(self._wake)
         rule = self.recipe.recipe
-        self.tell(
+        self.emit(
             StationStarted(
                 self.store.station,
                 rule.name,
@@ -257,7 +257,7 @@ class Station:
         for socket, message in self.supervisor.poll():
             self._hear(socket, message)
         while self._published:
-            self.tell(self._published.popleft())
+            self.emit(self._published.popleft())
         self._write_notes()
         self._take_scans()
         if self._is_aborting:
@@ -294,7 +294,7 @@ class Station:
             self._labels.close()
             self._tell_labels()
         self._write_notes()
-        self.tell(StationStopped(self.store.station))
+        self.emit(StationStopped(self.store.station))
 
     @property
     def is_running(self) -> bool:
@@ -315,7 +315,7 @@ class Station:
     def _now(self) -> float:
         return self.clock.monotonic_s()
 
-    def tell(self, event: StationEvent) -> None:
+    def emit(self, event: StationEvent) -> None:
         """Publish an event with its time."""
         try:
             at = self.clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -351,25 +351,25 @@ class Station:
                     case line.Audit(what, data):
                         self._audit(what, data)
                     case _:
-                        self.tell(effect)
+                        self.emit(effect)
 
     def _hear(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
-            case Ready() | AdapterDown() | PresenceChanged():
+            case AdapterReady() | AdapterDown() | PresenceChanged():
                 self._feed(socket, message)
             case Ask():
                 self._answer(socket, message)
             case StepStarted() | Progressed() | OperatorPrompted() if socket in self._runs:
                 if isinstance(message, StepStarted):
                     self._runs[socket].where = f"{message.step.value} {message.target}".strip()
-                self.tell(replace(message, socket=socket))
+                self.emit(replace(message, socket=socket))
             case RunResult():
                 self.supervisor.worked(socket)
                 self._end(socket, message)
             case WorkerLost(reason, hung, restart_in_s):
                 self._end_lost(socket, reason, hung=hung)
                 self._feed(socket, AdapterDown(reason))
-                self.tell(WorkerFailed(socket, reason, restart_in_s))
+                self.emit(WorkerFailed(socket, reason, restart_in_s))
             case _:
                 pass  # heartbeats and endings: the supervisor handles them
 
@@ -442,7 +442,7 @@ class Station:
 
     def _begin(self, started: RunStarted) -> None:
         """Send the claimed run to the process of its socket."""
-        self.tell(started)
+        self.emit(started)
         socket = started.socket
         if not self.supervisor.send(socket, self._runs[socket].claim):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
@@ -464,11 +464,11 @@ class Station:
         write_id, claim = None, run.claim
         try:
             match asked.what:
-                case Write(write_id=None) as write:
+                case JournalWrite(write_id=None) as write:
                     write_id = self.store.intent(
                         claim.run_id, write.target, write.what, write.value
                     )
-                case Write(write_id=int() as done) as write:
+                case JournalWrite(write_id=int() as done) as write:
                     self.store.verified(WriteId(done), write.read_back)
                 case StepEnded() as step:
                     self._save_step(socket, claim, step, asked.measurements)
@@ -491,7 +491,7 @@ class Station:
             text=step.text,
             measurements=measurements,
         )
-        self.tell(replace(step, socket=socket, serial=claim.serial))
+        self.emit(replace(step, socket=socket, serial=claim.serial))
 
     # -- its end ----------------------------------------------------------------------------------
 
@@ -540,12 +540,12 @@ class Station:
             tuple(result.verified.items()),
             self.line.sockets[socket].is_virtual,
         )
-        self.tell(ended)
+        self.emit(ended)
         self.line.feed(socket, ended, self._now)
         if code is codes.TRACE_NOT_SAVED:  # the next ones would not be judged either
             self.line.stop(code.name, text, code.action)
         with suppress(RecordError):
-            self.tell(FiguresChanged(self.figures))
+            self.emit(FiguresChanged(self.figures))
         if result.outcome is RunState.PASS:
             self._print(socket, claim)
         return True
@@ -593,17 +593,17 @@ class Station:
             if reason:
                 self._label_failed(job.socket, job.serial, reason)
             else:
-                self.tell(LabelPrinted(job.socket, job.serial, job.is_reprint))
+                self.emit(LabelPrinted(job.socket, job.serial, job.is_reprint))
 
     def _label_failed(self, socket: str, serial: str, reason: str) -> None:
         remedy = text("Mend it, then scan REPRINT {serial}.", serial=printable(serial))
-        self.tell(LabelFailed(socket, serial, reason, remedy))
+        self.emit(LabelFailed(socket, serial, reason, remedy))
 
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
     ) -> line.NotSaved:
         """Publish an error of the records; returns the input for the line."""
-        self.tell(RecordNotSaved(socket, serial, run_id, _error_line(error), error.remedy))
+        self.emit(RecordNotSaved(socket, serial, run_id, _error_line(error), error.remedy))
         return line.NotSaved(error.what, error.remedy)
 
 

@@ -113,7 +113,7 @@ class _Slot:
         """The reason that it reported for not working."""
 
 
-class Supervisor:
+class WorkerSupervisor:
     """All processes. `now` is a monotonic clock in seconds."""
 
     def __init__(

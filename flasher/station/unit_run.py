@@ -80,7 +80,7 @@ class UnitRun:
         journal: Journal,
         *,
         taps: Sequence[Tap] = (),
-        tell: Callable[[RunEvent], None] = lambda _event: None,
+        send_progress: Callable[[RunEvent], None] = lambda _event: None,
         cancelled: Callable[[], bool] = lambda: False,
         power: PowerControl | None = None,
         watchers: Sequence[TargetWatcher] | None = None,
@@ -94,7 +94,7 @@ class UnitRun:
         self._clock = connection.clock
         self._journal = journal
         self._taps = taps
-        self._tell = tell
+        self._send_progress = send_progress
         self._cancelled = cancelled
         goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
         blind_s = BLIND_S * connection.clock.speed
@@ -144,7 +144,7 @@ class UnitRun:
 
     def _steps(self) -> UnitSteps:
         def prompt(text: str, limit_s: float | None) -> None:
-            self._tell(OperatorPrompted("", text, limit_s))
+            self._send_progress(OperatorPrompted("", text, limit_s))
 
         try:
             taps = (*self._taps, *self._continuity.values())
@@ -204,7 +204,7 @@ class UnitRun:
         began_at = self._step_began_at = self._clock.now()
         self._told_at = float("-inf")
         self._step_ends_at = None if limit_s is None else began_at + limit_s
-        self._tell(StepStarted("", self._claim.serial, step, try_number, target))
+        self._send_progress(StepStarted("", self._claim.serial, step, try_number, target))
         measured: list[Measurement] = []
         failed, text = None, ""
         try:
@@ -307,4 +307,4 @@ class UnitRun:
         passed_s = now - self._step_began_at
         left_s = passed_s / share * (1 - share) if share > 0 else None
         step, target = self._step
-        self._tell(Progressed("", self._claim.serial, step, share, left_s, target))
+        self._send_progress(Progressed("", self._claim.serial, step, share, left_s, target))

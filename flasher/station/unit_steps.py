@@ -288,7 +288,7 @@ class UnitSteps:
         limit_s = self._recipe.recipe.rule(StepName.FLASH).time_limit_s
         lost_at, completions_when_lost = 0.0, -1
 
-        def hear(event: object) -> None:
+        def on_event(event: object) -> None:
             nonlocal lost_at, completions_when_lost
             match event:
                 case events.AdapterLost():
@@ -317,7 +317,7 @@ class UnitSteps:
             watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s
             watched = replace(timings, boot_watch_s=max(timings.boot_watch_s, watch_s))
             options = replace(options, timings=watched)
-        result = replace(target.job, options=options).run(target.device, on_event=hear)
+        result = replace(target.job, options=options).run(target.device, on_event=on_event)
         left = result.outcome.device_left
         self.left_behind = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()
@@ -472,12 +472,12 @@ class UnitSteps:
         if not needs_memory:
             return Verified.VERSION
 
-        def hear(event: object) -> None:
+        def on_event(event: object) -> None:
             if isinstance(event, events.MemoryRead):
                 self._progress(event.read_bytes / event.total_bytes)
 
         check = memory_check(target.job.plan, target.job.options, running)
-        target.run(check, hear)
+        target.run(check, on_event)
         found = check.result
         if not found.ok:
             code = _OF_VERDICT.get(found.verdict, codes.MEMORY_DIFFERS)

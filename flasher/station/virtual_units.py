@@ -35,7 +35,7 @@ from flasher.protocol.spec import (
 from flasher.protocol.text import encode_text
 from flasher.station.config import MockUnits
 from flasher.station.messages import PresenceChanged, VirtualUnits
-from flasher.station.recipe import SerialNumber
+from flasher.station.recipe import SerialNumberRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import SERIAL_NUMBER
 
@@ -78,7 +78,7 @@ def health_of(units: MockUnits, serial: str) -> Health:
     return Health.SLOW if at < units.bad + units.dead + units.slow else Health.GOOD
 
 
-def serial_numbers(rule: SerialNumber, first: int, step: int) -> Iterator[str]:
+def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[str]:
     """Serial numbers that fit a recipe: its example with other digits in its last number.
 
     Raises UsageError where none is found.
@@ -101,7 +101,7 @@ def serial_numbers(rule: SerialNumber, first: int, step: int) -> Iterator[str]:
     )
 
 
-def next_number(rule: SerialNumber, known: Callable[[Collection[str]], Collection[str]]) -> int:
+def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Collection[str]]) -> int:
     """The number after that of the last virtual unit that records know; `known` returns those of
     some serial numbers that they know.
     """

@@ -34,19 +34,19 @@ from flasher.station.events import StepEnded
 from flasher.station.messages import (
     Abort,
     AdapterDown,
+    AdapterReady,
     Ask,
     Beat,
     CannotWork,
     FromWorker,
     JournalError,
+    JournalWrite,
     PresenceChanged,
     Quit,
-    Ready,
     RunEvent,
     RunResult,
     ToWorker,
     WorkerSetup,
-    Write,
     WriteReply,
     packed,
 )
@@ -112,7 +112,7 @@ class StationPipe:
             self.is_gone = self.is_over = True
             raise StationGoneError from error
 
-    def tell(self, event: RunEvent) -> None:
+    def send_progress(self, event: RunEvent) -> None:
         """Send progress; a dead station is detected by `look`."""
         with suppress(StationGoneError):
             self.send(event)
@@ -153,20 +153,22 @@ class StationPipe:
 
     # -- the `Journal` of a run, which the station writes ------------------------------------------
 
-    def intent(self, target: str, what: str, value: str) -> Write:
-        write = Write(target, what, value)
+    def intent(self, target: str, what: str, value: str) -> JournalWrite:
+        write = JournalWrite(target, what, value)
         write_id = self._ask(write).write_id
         if write_id is None:
             raise JournalError("The station did not say what it saved.")
         return replace(write, write_id=write_id)
 
-    def verified(self, write: Write, read_back: str | None) -> None:
+    def verified(self, write: JournalWrite, read_back: str | None) -> None:
         self._ask(replace(write, read_back=read_back))
 
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
         self._ask(ended, measurements)
 
-    def _ask(self, what: Write | StepEnded, measurements: Sequence[Measurement] = ()) -> WriteReply:
+    def _ask(
+        self, what: JournalWrite | StepEnded, measurements: Sequence[Measurement] = ()
+    ) -> WriteReply:
         """Wait for the station to save it. Raises StationGoneError, JournalError."""
         self._asked += 1
         self.send(Ask(self._asked, what, tuple(measurements)))
@@ -222,7 +224,7 @@ class Worker:
     def work(self) -> None:
         """Work until the station ends the process or is gone."""
         sees = self._virtual is not None or self._presence.sees_units
-        self._pipe.send(Ready(self._connection.name, sees))
+        self._pipe.send(AdapterReady(self._connection.name, sees))
         if self._virtual is not None:
             self._pipe.send(PresenceChanged(is_there=False, is_certain=True))
         while not self._pipe.is_over:
@@ -289,7 +291,7 @@ class Worker:
         if self._is_down:
             self._is_down = False
             self._watch_anew()
-            self._pipe.send(Ready(self._connection.name, self._presence.sees_units))
+            self._pipe.send(AdapterReady(self._connection.name, self._presence.sees_units))
 
     # -- a run ------------------------------------------------------------------------------------
 
@@ -314,7 +316,7 @@ class Worker:
                     self._connection,
                     self._pipe,
                     taps=(recorder,),
-                    tell=self._pipe.tell,
+                    send_progress=self._pipe.send_progress,
                     cancelled=self._pipe.is_stopped,
                     power=self._power,
                     watchers=watchers,

@@ -64,7 +64,7 @@ class Bounds:
             raise UnfitError(f"{self._entries:,} entries hold {self.frames:,} frames")
 
 
-class Lines:
+class BoundedLines:
     """Lines of a file, for python-can's text readers.
 
     Ends with the line that contains byte number `size`, even if another program appends; None reads

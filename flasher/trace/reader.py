@@ -30,7 +30,7 @@ from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.text import printable
 from flasher.python_can import can, load_mf4
 from flasher.trace.blf import UnpackedBlf
-from flasher.trace.bounds import FILE_MAX_SIZE, Bounds, Lines, UnfitError, check_unpacked
+from flasher.trace.bounds import FILE_MAX_SIZE, BoundedLines, Bounds, UnfitError, check_unpacked
 from flasher.trace.pcapng import frames_of_capture
 
 _FRAMES: Final = "SELECT ts, arbitration_id, extended, remote, error, data FROM messages"
@@ -131,7 +131,8 @@ def _frames(
     else:
         reader = _LINE_READERS[suffix](
             cast(
-                "TextIO", Lines(source, None if isinstance(source, gzip.GzipFile) else size, bounds)
+                "TextIO",
+                BoundedLines(source, None if isinstance(source, gzip.GzipFile) else size, bounds),
             )
         )
     for message in reader:

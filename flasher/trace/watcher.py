@@ -1,8 +1,8 @@
 """Passive bus watching: an engine that sends nothing, and the latest messages.
 
 `Watcher` is driven like every other engine, so a live bus, the mock and a test share the same code;
-`replay` feeds it the frames of a file. `Board` keeps the latest message of each kind, which of its
-fields changed, and its rate.
+`replay` feeds it the frames of a file. `MessageTable` keeps the latest message of each kind, its
+changed fields, and its rate.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _AT_ONCE: Final = float("-inf")
 
 
 @dataclass(frozen=True)
-class RawFrame:
+class TimedFrame:
     """A received frame, not decoded."""
 
     at: float
@@ -66,7 +66,7 @@ EVERYTHING: Final = Filter()
 
 
 class Watcher:
-    """The engine. Its events are `BusEvent`, `RawFrame` with `raw`, `Pulse` with `pulse_s`.
+    """The engine. Its events are `BusEvent`, `TimedFrame` with `raw`, `Pulse` with `pulse_s`.
 
     Ends after `count` accepted events, or `duration_s` seconds after its first `tick`; otherwise it
     runs until it is cancelled.
@@ -105,7 +105,7 @@ class Watcher:
             return
         self.frames += 1
         if self._raw:
-            self._events.append(RawFrame(now, frame))
+            self._events.append(TimedFrame(now, frame))
         self._take(self._decoder.feed(frame, now))
 
     def tick(self, now: float) -> None:
@@ -211,7 +211,7 @@ class MessageHistory:
 Key = tuple[int, str, int]
 
 
-class Board:
+class MessageTable:
     """The latest events, in the order of CAN ids and commands.
 
     Anything but a message of the documents has one line for each kind and id, and foreign frames

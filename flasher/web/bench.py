@@ -35,7 +35,7 @@ from flasher.report.base import visible
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
-from flasher.trace.watcher import Board, Pulse, Watcher
+from flasher.trace.watcher import MessageTable, Pulse, Watcher
 from flasher.web.bench_state import (
     Activity,
     Adapter,
@@ -59,7 +59,7 @@ SUBJECT: Final = "bench"
 _AGAIN: Final = text("Begin again with the adapter.")
 _RESCUE: Final = text("Then rescue this device.")
 T = TypeVar("T")
-Order = Callable[["Bench"], object]
+Order = Callable[["BenchController"], object]
 """A step for the bench's own thread."""
 _LOG: Final = logging.getLogger("flasher.web")
 
@@ -118,7 +118,7 @@ class BenchBackend(Protocol):
         """Run an upgrade to its end, and store its records."""
 
 
-class Bench:
+class BenchController:
     """`now` is a monotonic clock, `date` the time of day."""
 
     def __init__(
@@ -178,7 +178,7 @@ class Bench:
             try:
                 order = self._orders.get(timeout=TURN_S)
             except Empty:
-                if not self._has_new_files.is_set() or not self.order(Bench.take_files):
+                if not self._has_new_files.is_set() or not self.order(BenchController.take_files):
                     continue
                 order = self._orders.get()
             self.write_planned(order)
@@ -319,7 +319,7 @@ class Bench:
 
     def watch(self) -> None:
         """Show the traffic of the bus until stopped. Sends nothing."""
-        board = Board()
+        board = MessageTable()
         since_s = self._now()
         messages = troubles = 0
 

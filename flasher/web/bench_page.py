@@ -24,7 +24,7 @@ from flasher.protocol.text import printable
 from flasher.report.base import visible
 from flasher.trace.decoder import Field, content_fields
 from flasher.translation import Translator
-from flasher.web.bench import Bench
+from flasher.web.bench import BenchController
 from flasher.web.bench_state import BenchState, Done
 from flasher.web.pages import Pages, streamed
 
@@ -37,22 +37,22 @@ _MANIFEST: Final = ".toml"
 
 
 _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
-    "adapters": (Bench.find_adapters, ()),
-    "adapter": (Bench.use_adapter, ("name",)),
-    "look": (Bench.look, ()),
-    "watch": (Bench.watch, ()),
-    "areas": (Bench.find_areas, ()),
-    "backup": (Bench.back_up, ("source",)),
-    "no-backup": (Bench.leave_backup, ()),
-    "target": (Bench.choose_target, ("name",)),
-    "images": (Bench.judge, ()),
-    "waive": (Bench.waive, ("name", "waiver")),
-    "folder": (Bench.use_folder, ("path",)),
-    "image": (Bench.choose_image, ("name",)),
-    "upgrade": (Bench.upgrade, ("target", "sha256")),
-    "next": (Bench.start_over, ()),
-    "rescue": (partial(Bench.start_over, is_rescue=True), ()),
-    "rescue-it": (Bench.rescue_it, ()),
+    "adapters": (BenchController.find_adapters, ()),
+    "adapter": (BenchController.use_adapter, ("name",)),
+    "look": (BenchController.look, ()),
+    "watch": (BenchController.watch, ()),
+    "areas": (BenchController.find_areas, ()),
+    "backup": (BenchController.back_up, ("source",)),
+    "no-backup": (BenchController.leave_backup, ()),
+    "target": (BenchController.choose_target, ("name",)),
+    "images": (BenchController.judge, ()),
+    "waive": (BenchController.waive, ("name", "waiver")),
+    "folder": (BenchController.use_folder, ("path",)),
+    "image": (BenchController.choose_image, ("name",)),
+    "upgrade": (BenchController.upgrade, ("target", "sha256")),
+    "next": (BenchController.start_over, ()),
+    "rescue": (partial(BenchController.start_over, is_rescue=True), ()),
+    "rescue-it": (BenchController.rescue_it, ()),
 }
 """Orders of a form by its command, with their arguments."""
 
@@ -119,7 +119,9 @@ def upload_limit(usual: int) -> Callable[[str], int]:
 class BenchPage:
     """The routes of the page."""
 
-    def __init__(self, pages: Pages, machine: Bench, shelf: Shelf, *, is_mock: bool) -> None:
+    def __init__(
+        self, pages: Pages, machine: BenchController, shelf: Shelf, *, is_mock: bool
+    ) -> None:
         self._pages = pages
         self._bench = machine
         self._shelf = shelf

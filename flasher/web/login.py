@@ -26,7 +26,7 @@ from flasher.i18n import text
 from flasher.station import pins
 from flasher.station.attempts import Attempts
 from flasher.station.operators import Person, Role
-from flasher.station.records.model import AuditEvent, Clock
+from flasher.station.records.model import AuditEvent, StationClock
 from flasher.web.pages import Pages
 from flasher.web.query_processes import question_of
 from flasher.web.server import client_at
@@ -118,7 +118,7 @@ class Login:
     def __init__(
         self,
         pages: Pages,
-        clock: Clock,
+        clock: StationClock,
         note: Note,
         *,
         checker: Executor,

@@ -23,7 +23,7 @@ from flasher.i18n import text
 from flasher.station.board import Board, Row, Spoken
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
 from flasher.station.health import HealthCheck, HealthWatch
-from flasher.station.shift_counts import EndedRun, Output, ShiftCounts
+from flasher.station.shift_counts import EndedRun, ShiftCounts, ShiftFigures
 from flasher.station.socket import PAGE, Source
 from flasher.translation import Translator
 from flasher.web.feed import Feed
@@ -77,7 +77,7 @@ class ScreenHeader:
     operator: str
     lot: CurrentLot
     virtual: str
-    output: Output
+    output: ShiftFigures
     health: tuple[HealthCheck, ...]
     stopped: LineStopped | None
     spoken: Spoken

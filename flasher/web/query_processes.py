@@ -96,16 +96,16 @@ class QueryProcesses:
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[Answer] = loop.create_future()
 
-        def tell(set_result: Callable[[Any], None], result: Any) -> None:
+        def resolve(set_result: Callable[[Any], None], result: Any) -> None:
             if not answered.done():
                 set_result(result)
 
         self._pool.apply_async(
             _answer,
             (question,),
-            callback=lambda found: loop.call_soon_threadsafe(tell, answered.set_result, found),
+            callback=lambda found: loop.call_soon_threadsafe(resolve, answered.set_result, found),
             error_callback=lambda error: loop.call_soon_threadsafe(
-                tell, answered.set_exception, error
+                resolve, answered.set_exception, error
             ),
         )
         return await asyncio.wait_for(answered, ANSWER_LIMIT_S)

@@ -11,7 +11,7 @@ from datetime import datetime
 from typing import Final
 
 from flasher.station.operators import Person, Role
-from flasher.station.records.model import AuditEvent, Clock
+from flasher.station.records.model import AuditEvent, StationClock
 
 SHIFT_S: Final = 8 * 3600.0
 """Maximum length of a sign-in."""
@@ -35,7 +35,7 @@ class Moment:
     monotonic_s: float
 
     @classmethod
-    def now(cls, clock: Clock) -> Moment:
+    def now(cls, clock: StationClock) -> Moment:
         return cls(clock.utc(), clock.monotonic_s())
 
     def until_s(self, later: Moment) -> float:
@@ -75,7 +75,7 @@ class SignIn:
 class SignIns:
     """The sign-ins of a server. `note` is called for each begin and end. Not thread-safe."""
 
-    def __init__(self, clock: Clock, note: Note) -> None:
+    def __init__(self, clock: StationClock, note: Note) -> None:
         self._clock = clock
         self._note = note
         self._known: dict[str, SignIn] = {}

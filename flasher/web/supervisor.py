@@ -111,7 +111,7 @@ class PartOfCauses(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Supervisor:
+class SupervisorPages:
     """Answers queries of the pages. `shifts`: their begins, in local time."""
 
     store: Store
@@ -445,15 +445,15 @@ def place_of(store: Store) -> Place:
 
 def open_supervisor(
     url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
-) -> Supervisor:
+) -> SupervisorPages:
     """Open the records of a place read-only. Raises what `Store.open` does."""
     store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
-    return Supervisor(store, shifts)
+    return SupervisorPages(store, shifts)
 
 
 def serve_supervisor(
     url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
-) -> Supervisor:
+) -> SupervisorPages:
     """The same, and keep daily figures updated while this process lives."""
     supervisor = open_supervisor(url, folder, keeping, shifts)
     rollup = Rollup(supervisor.store.database)
@@ -463,20 +463,20 @@ def serve_supervisor(
     return supervisor
 
 
-PAGES: Final[dict[str, Callable[[Supervisor, Question], Answer]]] = {
-    "/runs": Supervisor.runs,
-    **dict.fromkeys(_FILES, Supervisor.file_of_runs),
-    "/runs/{run:int}": Supervisor.run,
-    "/runs/{run:int}/trace": Supervisor.trace,
-    "/units": Supervisor.units,
-    "/units/certificate": Supervisor.certificate,
-    "/units/certificate.html": Supervisor.file_of_certificate,
-    CHECK: Supervisor.check,
-    "/images": Supervisor.images,
-    "/images.csv": Supervisor.file_of_holders,
-    "/yield": Supervisor.yields,
-    "/times": Supervisor.times,
-    "/audit": Supervisor.audit,
+PAGES: Final[dict[str, Callable[[SupervisorPages, Question], Answer]]] = {
+    "/runs": SupervisorPages.runs,
+    **dict.fromkeys(_FILES, SupervisorPages.file_of_runs),
+    "/runs/{run:int}": SupervisorPages.run,
+    "/runs/{run:int}/trace": SupervisorPages.trace,
+    "/units": SupervisorPages.units,
+    "/units/certificate": SupervisorPages.certificate,
+    "/units/certificate.html": SupervisorPages.file_of_certificate,
+    CHECK: SupervisorPages.check,
+    "/images": SupervisorPages.images,
+    "/images.csv": SupervisorPages.file_of_holders,
+    "/yield": SupervisorPages.yields,
+    "/times": SupervisorPages.times,
+    "/audit": SupervisorPages.audit,
 }
 """Methods by route."""
 

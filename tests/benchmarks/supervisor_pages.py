@@ -34,8 +34,8 @@ from flasher.station.records.errors import ClaimRefusedError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     AuditEvent,
-    Ending,
     Order,
+    RunEnd,
     RunFilter,
     RunId,
     RunState,
@@ -297,7 +297,7 @@ def _runs(store: Store, clock: FakeClock, recipe: LoadedRecipe, folder: Path) ->
         store.verified(write, BMS_VERSION)
         store.step(claim.run_id, "flash", StepState.PASS, duration_s=8.0)
         file = store.files.add("trace", trace)
-        ending = Ending(RunState.PASS, "OK", "", {"bms": Verified.VERSION}, file.sha256, [file])
+        ending = RunEnd(RunState.PASS, "OK", "", {"bms": Verified.VERSION}, file.sha256, [file])
         worked = time.perf_counter()
         store.finish(claim.run_id, ending)
         ended = time.perf_counter()

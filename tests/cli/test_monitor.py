@@ -21,7 +21,7 @@ from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent
 from flasher.trace.recorder import Recorder
-from flasher.trace.watcher import Board, Watcher, replay
+from flasher.trace.watcher import MessageTable, Watcher, replay
 from tests.cli.conftest import Flasher
 from tests.loops import each
 from tests.peers.wording import REPORT
@@ -239,8 +239,8 @@ def test_on_a_terminal_the_table_is_refreshed_without_erasing_anything(
 # -- the table -------------------------------------------------------------------------------------
 
 
-def board_of(*messages: Iterable[Frame]) -> Board:
-    board = Board()
+def board_of(*messages: Iterable[Frame]) -> MessageTable:
+    board = MessageTable()
 
     def add(event: object) -> None:
         if isinstance(event, BusEvent):
@@ -251,7 +251,7 @@ def board_of(*messages: Iterable[Frame]) -> Board:
     return board
 
 
-def drawn(board: Board, *, width: int, height: int) -> list[str]:
+def drawn(board: MessageTable, *, width: int, height: int) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None)
     view = BoardView(console).draw(board, 0.6, "title [bold]x[/bold]")
     with console.capture() as capture:
@@ -357,7 +357,7 @@ def test_a_layout_that_was_too_long_stays_until_the_window_changes() -> None:
     console = Console(width=120, height=15, file=io.StringIO(), color_system=None)
     view = BoardView(console)
 
-    def rows(board: Board) -> int:
+    def rows(board: MessageTable) -> int:
         with console.capture() as capture:
             console.print(view.draw(board, 0.0, "title"))
         return len(capture.get().splitlines())

@@ -18,7 +18,7 @@ from flasher.bus.simulated import SimulatedLink
 from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.errors import ErrorCode, ExitCode, ImageError
 from flasher.host.waivers import WAIVERS
-from flasher.web.bench import Bench
+from flasher.web.bench import BenchController
 from flasher.web.virtual_bike import BikeFault
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.cli.station_threads import ThreadPort
@@ -130,18 +130,22 @@ def test_the_bench_page_neither_offers_nor_sends_one(
 ) -> None:
     place = BenchPlace(tmp_path)
     (tmp_path / "sample.hex").write_bytes(BMS.read_bytes())
-    looked = (order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms"))
+    looked = (
+        order(BenchController.use_adapter, BikeFault.NONE.value),
+        order(BenchController.choose_target, "bms"),
+    )
     state = place.do(*looked)
     offer = next(each for each in state.offers if each.name == "sample.hex")
     assert offer.refusal is None, "a virtual bike takes it"
     done = place.do(
-        order(Bench.choose_image, offer.name), order(Bench.upgrade, "bms", offer.sha256)
+        order(BenchController.choose_image, offer.name),
+        order(BenchController.upgrade, "bms", offer.sha256),
     ).done
     assert done is not None
     assert done.error is not None
     assert done.error.code is ErrorCode.IMAGE_SAMPLE, "the upgrade itself looks again"
     monkeypatch.setattr(type(place.bikes), "is_physical", lambda *_: True)
-    state = place.do(Bench.start_over, *looked)
+    state = place.do(BenchController.start_over, *looked)
     offer = next(each for each in state.offers if each.name == "sample.hex")
     assert offer.refusal is not None
     assert offer.refusal.code is ErrorCode.IMAGE_SAMPLE

@@ -195,9 +195,9 @@ def test_labels_without_a_socket_wait_until_their_run_begins() -> None:
 
 def test_what_to_do_with_a_label_stands_behind_it() -> None:
     board = board_of(OperatorPrompted("", "Scan the socket."), ScanAccepted("W2", "label"))
-    assert board.said == "W2: label. Scan the socket."
+    assert board.last_reply == "W2: label. Scan the socket."
     board.apply(ScanAccepted("SOCKET 1", "socket", "1"))
-    assert board.said == "SOCKET 1: socket"
+    assert board.last_reply == "SOCKET 1: socket"
 
 
 def test_the_label_of_a_virtual_unit_is_shown_to_be_typed() -> None:
@@ -350,7 +350,7 @@ def test_a_pin_is_not_shown_on_the_terminal(
     badges.write_text(f"[[person]]\n{person}", "utf-8")
     script: list[tuple[Callable[[_Session], bool], bytes]] = [
         (lambda _: True, b"BADGE-1\n"),
-        (lambda session: "badge" in session.view.board.said, b"REASON x\n"),
+        (lambda session: "badge" in session.view.board.last_reply, b"REASON x\n"),
         (lambda session: bool(session.view.board.pin_of), b"4708"),
         (lambda session: session.view.typed == "****", b"15\n"),
     ]
@@ -360,7 +360,7 @@ def test_a_pin_is_not_shown_on_the_terminal(
         real_turn(session)
         if script and script[0][0](session):
             os.write(master, script.pop(0)[1])
-        if session.view.board.said == "REASON x: reason":
+        if session.view.board.last_reply == "REASON x: reason":
             session.station.stop()
 
     real_turn = _Session.turn

@@ -31,7 +31,7 @@ from flasher.conformance.results import (
     CaseVerdict,
     Check,
     CheckOutcome,
-    Measurement,
+    MeasuredTime,
     RunReport,
 )
 from flasher.conformance.runner import SuiteOptions, run
@@ -149,7 +149,7 @@ def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:
 
 def test_times_are_told_with_their_histogram() -> None:
     values = [index / 1000 for index in range(1, 102)]
-    measured = tuple(Measurement("t", value, 0.002) for value in values)
+    measured = tuple(MeasuredTime("t", value, 0.002) for value in values)
     (times,) = document_of(with_status(CaseVerdict.PASS, measurements=measured))["times"]
     assert (times["count"], times["median_s"], times["p95_s"]) == (101, 0.051, 0.096)
     assert times["uncertainty_s"] == 0.002
@@ -299,7 +299,7 @@ def test_a_page_tells_stimulus_expected_got_and_the_decoded_trace() -> None:
 
 
 def test_times_are_drawn_for_a_desk_and_for_a_phone() -> None:
-    measured = tuple(Measurement("t", index / 100, 0.002) for index in range(1, 20))
+    measured = tuple(MeasuredTime("t", index / 100, 0.002) for index in range(1, 20))
     report = with_status(CaseVerdict.PASS, measurements=measured)
     report = replace(report, uncertainty_s=0.002, timestamp_source="host")
     page = Page(page_of(report))

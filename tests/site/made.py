@@ -19,7 +19,7 @@ from sphinx.application import Sphinx
 from sphinx.util.typing import ExtensionMetadata
 
 from flasher.cli import schema
-from flasher.cli.framework import Entry, Program
+from flasher.cli.framework import CommandEntry, Program
 from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
 from flasher.conformance.profile import profile_keys
@@ -75,7 +75,7 @@ def _commands(page: str) -> _Lines:
         yield from _manual(command, f"flasher {name}", level=2)
 
 
-def _group(page: str) -> Mapping[str, Entry]:
+def _group(page: str) -> Mapping[str, CommandEntry]:
     return list(PURPOSES.values())[_PAGES.index(page)]
 
 

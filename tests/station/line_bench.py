@@ -12,14 +12,14 @@ from typing import Any, TypeVar
 from flasher.station.events import SocketState, StationEvent, StepEnded
 from flasher.station.label_printer import LabelPrinter
 from flasher.station.messages import (
+    AdapterReady,
     Ask,
     FromWorker,
+    JournalWrite,
     PresenceChanged,
-    Ready,
     RunResult,
     ToWorker,
     WorkerSetup,
-    Write,
     WriteReply,
     packed,
 )
@@ -141,7 +141,7 @@ class LineBench:
         )
         self.station.start()
         for name in sockets:
-            self.say(name, Ready("a bus", sees_units))
+            self.say(name, AdapterReady("a bus", sees_units))
             if sees_units and are_empty:
                 self.leave(name)
 
@@ -194,7 +194,10 @@ class LineBench:
         return next(m for m in reversed(self.ports[socket].heard) if isinstance(m, Claim))
 
     def ask(
-        self, socket: str, what: Write | StepEnded, measurements: tuple[Measurement, ...] = ()
+        self,
+        socket: str,
+        what: JournalWrite | StepEnded,
+        measurements: tuple[Measurement, ...] = (),
     ) -> WriteReply:
         """Ask the station to save something; its reply."""
         port = self.ports[socket]
@@ -207,7 +210,7 @@ class LineBench:
 
     def work(self, socket: str) -> None:
         """A good run, up to its last step."""
-        write = Write("bms", "flash", "V1")
+        write = JournalWrite("bms", "flash", "V1")
         reply = self.ask(socket, write)
         assert reply.write_id is not None, reply.error
         self.ask(socket, replace(write, write_id=reply.write_id, read_back="V1"))

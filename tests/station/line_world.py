@@ -23,7 +23,7 @@ from flasher.station.events import (
     StationEvent,
 )
 from flasher.station.line import Line
-from flasher.station.messages import AdapterDown, PresenceChanged, Ready
+from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged
 from flasher.station.records.model import Order, RunState
 from flasher.station.socket import Binding, Socket
 from tests.station.line_inputs import RESULT, begun, saved
@@ -222,7 +222,7 @@ class World:
         bay = self.bays[name]
         if not bay.works:
             bay.works = True
-            self.feed(name, Ready("a bus", sees_units=True))
+            self.feed(name, AdapterReady("a bus", sees_units=True))
         if bay.run:
             return
         sees = self.truth(bay)

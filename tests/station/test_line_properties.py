@@ -13,7 +13,7 @@ import pytest
 from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
-from flasher.station.messages import PresenceChanged, Ready, RunResult
+from flasher.station.messages import AdapterReady, PresenceChanged, RunResult
 from flasher.station.records.model import RunState
 from flasher.station.socket import Binding, Occupancy, Socket, SocketPhase, Source
 from tests.loops import each
@@ -72,7 +72,7 @@ def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
         Line._ended(self, socket, what, now)
         Line._saved(self, socket, saved(socket.name, RunState.PASS, ""), now)
         socket.shown = socket.view(None, is_only=False)
-        self._tell(SocketChanged(socket.name, *socket.shown))
+        self._emit(SocketChanged(socket.name, *socket.shown))
         socket.phase = SocketPhase.SAVE
 
     handle(patch, SocketPhase.RUN, RunResult, ended)
@@ -86,13 +86,13 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
         self.occupancy = Occupancy.EMPTY
         return was_there
 
-    def ready(self: Line, socket: Socket, what: Ready, now: float) -> None:
+    def ready(self: Line, socket: Socket, what: AdapterReady, now: float) -> None:
         was_last_there = socket.is_last_there  # else its unit has to say who it is, which helps
         Line._ready(self, socket, what, now)
         socket.is_last_there = was_last_there
 
     patch.setattr(Socket, "fall_silent", fall_silent)
-    handle(patch, SocketPhase.REST, Ready, ready)
+    handle(patch, SocketPhase.REST, AdapterReady, ready)
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:

@@ -268,10 +268,13 @@ def test_an_error_of_a_library_is_a_scanner_that_is_gone(monkeypatch: pytest.Mon
 def test_a_lost_scanner_stays_on_the_screen_until_it_is_back() -> None:
     board = Board()
     board.apply(ScannerChanged("left", is_ready=False, reason="No such device"))
-    assert (board.said, board.is_refusal) == ("Scanner left cannot be read: No such device", True)
+    assert (board.last_reply, board.is_refusal) == (
+        "Scanner left cannot be read: No such device",
+        True,
+    )
     assert list(board.lost_scanners) == ["left"]
     board.apply(ScannerChanged("left", is_ready=True))
-    assert (board.said, board.is_refusal) == ("Scanner left is ready.", False)
+    assert (board.last_reply, board.is_refusal) == ("Scanner left is ready.", False)
     assert not board.lost_scanners
 
 

@@ -28,12 +28,12 @@ from flasher.station.events import (
 from flasher.station.messages import (
     Abort,
     AdapterDown,
+    AdapterReady,
     Beat,
     CannotWork,
+    JournalWrite,
     PresenceChanged,
-    Ready,
     RunResult,
-    Write,
     flash_value,
 )
 from flasher.station.records.errors import DiskFullError, RecordsLockedError
@@ -301,7 +301,7 @@ def test_a_process_that_dies_takes_the_waiting_label_with_it_and_no_pass(line: L
     line.bench.clock.go_on(1.5)
     line.turn()
     for socket in "AB":
-        line.say(socket, Ready("a bus", sees_units=True))
+        line.say(socket, AdapterReady("a bus", sees_units=True))
     line.arrive("A", SERIAL)
     line.arrive("B")
     assert line.state("A") is SocketState.PASS
@@ -378,7 +378,7 @@ def test_a_unit_that_is_not_seen_is_run_after_a_while_where_a_person_put_it(
     line.bench.clock.go_on(4.0)
     line.turn()
     assert line.state("B") is SocketState.SCAN
-    line.say("B", Ready("a bus", sees_units=True))
+    line.say("B", AdapterReady("a bus", sees_units=True))
     line.bench.clock.go_on(2.0)
     line.turn()
     assert line.state("B") is SocketState.RUNNING
@@ -556,8 +556,8 @@ def test_a_run_of_which_a_part_is_not_saved_cannot_pass(
 
         patch.setattr(bench.store, operation, fail)
         replies = [
-            line.ask("A", Write("bms", "flash", "V1")),
-            line.ask("A", Write("bms", "flash", "V1", WriteId(1), "V1")),
+            line.ask("A", JournalWrite("bms", "flash", "V1")),
+            line.ask("A", JournalWrite("bms", "flash", "V1", WriteId(1), "V1")),
             line.ask("A", tried(StepName.FLASH)),
         ]
     assert [bool(reply.error) for reply in replies].count(True) >= 1
@@ -583,7 +583,7 @@ def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -
     bench.store.database.close()
     # A database with room left in its last page saves some more, and then no more.
     for _ in range(200):
-        if line.ask("A", Write("bms", "flash", "V" * 200)).error:
+        if line.ask("A", JournalWrite("bms", "flash", "V" * 200)).error:
             break
     line.end("A")
     assert SocketState.PASS not in {view.state for view in line.station.line.sockets.values()}
@@ -660,7 +660,7 @@ def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> Non
 def test_a_pass_that_the_records_know_better_is_none(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")
-    line.ask("A", Write("bms", "flash", "V1"))  # never verified
+    line.ask("A", JournalWrite("bms", "flash", "V1"))  # never verified
     line.end("A")
     ended = line.last(RunEnded)
     assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
@@ -690,7 +690,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.arrive("A")
     hanging = line.ports["A"]
     line.bench.clock.go_on(9.0)
-    line.say("B", Ready("a bus", sees_units=True))
+    line.say("B", AdapterReady("a bus", sees_units=True))
     line.bench.clock.go_on(2.0)
     line.turn()
     assert hanging.killed == 1
@@ -699,7 +699,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.bench.clock.go_on(1.5)
     line.turn()
     assert line.ports["A"] is not hanging
-    line.say("A", Ready("a bus", sees_units=True))
+    line.say("A", AdapterReady("a bus", sees_units=True))
     line.arrive("A")
     line.scan(SERIAL)
     line.scan("SOCKET A")
@@ -721,7 +721,7 @@ def test_an_unplugged_adapter_is_shown_and_comes_back(line: LineBench) -> None:
     assert line.state("A") is SocketState.ERROR
     line.scan("SOCKET A")
     assert line.last(ScanRefused).code == "SOCKET_BROKEN"
-    line.say("A", Ready("a bus", sees_units=True))
+    line.say("A", AdapterReady("a bus", sees_units=True))
     assert line.state("A") is SocketState.STARTING, "what is in it now is not known yet"
     line.leave("A")
     assert line.state("A") is SocketState.EMPTY
@@ -746,7 +746,7 @@ def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBen
     line.turn()
     line.bench.clock.go_on(1.5)
     line.turn()
-    line.say("A", Ready("a bus", sees_units=True))
+    line.say("A", AdapterReady("a bus", sees_units=True))
     line.arrive("A", SERIAL)
     assert line.state("A") is SocketState.PASS
     assert len(line.of(UnitArrived)) == 1
@@ -902,7 +902,7 @@ def test_what_must_not_change_is_held_over_a_fail_but_not_for_a_reworked_unit(
         known = dict(line.order("A").known_before)
         read = (Measurement("before bms model", text=model),)
         line.ask("A", tried(StepName.CHECK), read)
-        line.ask("A", Write("bms", "flash", "V1"))
+        line.ask("A", JournalWrite("bms", "flash", "V1"))
         line.end("A", RunState.FAIL, "TRANSFER_FAILED")
     assert known == ({} if reason else {"bms model": "BM36"})
 

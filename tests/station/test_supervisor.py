@@ -10,9 +10,9 @@ import pytest
 
 from flasher.errors import BusError
 from flasher.station.config import MockUnits
-from flasher.station.messages import FromWorker, Ready, VirtualUnits, WorkerSetup
+from flasher.station.messages import AdapterReady, FromWorker, VirtualUnits, WorkerSetup
 from flasher.station.power import PowerCommand
-from flasher.station.supervisor import ProcessPort, Supervisor, WorkerLost
+from flasher.station.supervisor import ProcessPort, WorkerLost, WorkerSupervisor
 from tests.loops import each
 from tests.station.factory import make_recipe
 
@@ -28,7 +28,8 @@ def setup_of(folder: Path, name: str) -> WorkerSetup:
 
 
 def until(
-    supervisor: Supervisor, enough: Callable[[list[tuple[str, FromWorker | WorkerLost]]], bool]
+    supervisor: WorkerSupervisor,
+    enough: Callable[[list[tuple[str, FromWorker | WorkerLost]]], bool],
 ) -> list[tuple[str, FromWorker | WorkerLost]]:
     found: list[tuple[str, FromWorker | WorkerLost]] = []
     give_up_at = time.perf_counter() + LIMIT_S
@@ -40,9 +41,9 @@ def until(
 
 
 def test_a_killed_process_is_replaced_and_the_other_goes_on(tmp_path: Path) -> None:
-    supervisor = Supervisor([setup_of(tmp_path, name) for name in "AB"], time.perf_counter)
+    supervisor = WorkerSupervisor([setup_of(tmp_path, name) for name in "AB"], time.perf_counter)
     try:
-        until(supervisor, lambda found: sum(isinstance(m, Ready) for _, m in found) == 2)
+        until(supervisor, lambda found: sum(isinstance(m, AdapterReady) for _, m in found) == 2)
         other = supervisor.ports["B"]
         port = supervisor.ports["A"]
         assert isinstance(port, ProcessPort)

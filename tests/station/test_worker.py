@@ -27,18 +27,18 @@ from flasher.station.events import StepStarted
 from flasher.station.messages import (
     Abort,
     AdapterDown,
+    AdapterReady,
     Ask,
     Beat,
     FromWorker,
     JournalError,
+    JournalWrite,
     PresenceChanged,
     Quit,
-    Ready,
     RunResult,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
-    Write,
     WriteReply,
     packed,
 )
@@ -123,7 +123,7 @@ def test_a_unit_that_comes_is_run_and_its_trace_is_closed(tmp_path: Path) -> Non
     lines = gzip.decompress(packed(socket.trace).read_bytes()).decode("ascii").splitlines()
     assert len(lines) > 50
     assert not socket.trace.exists()
-    assert isinstance(socket.channel.sent[0], Ready)
+    assert isinstance(socket.channel.sent[0], AdapterReady)
     assert socket.channel.of(Beat)
     assert socket.channel.of(StepStarted)
 
@@ -163,7 +163,7 @@ def test_a_person_aborts_between_two_messages(tmp_path: Path) -> None:
         Socket.answer(socket, channel, message)
         if (
             isinstance(message, Ask)
-            and isinstance(message.what, Write)
+            and isinstance(message.what, JournalWrite)
             and not message.what.write_id
         ):
             channel.waiting.append(Abort())
@@ -247,7 +247,7 @@ class RealAdapter(Socket):
         return Connection(self.bus.link(), self.clock, "a bus")
 
     def answer(self, channel: FakeChannel, message: FromWorker) -> None:
-        if isinstance(message, Ready):
+        if isinstance(message, AdapterReady):
             self.ready_at.append(self.clock.now())
             if channel.of(AdapterDown):
                 channel.waiting.append(Quit())
@@ -258,7 +258,7 @@ class RealAdapter(Socket):
 def test_an_adapter_that_goes_is_told_once_and_opened_again(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
     Worker(socket.setup, socket.recipe, socket.line, socket.connection()).work()
-    assert socket.kinds == ["Ready", "AdapterDown", "Ready"]
+    assert socket.kinds == ["AdapterReady", "AdapterDown", "AdapterReady"]
     assert socket.channel.of(AdapterDown)[0].reason
     assert 2.5 <= socket.ready_at[-1] < 3.6
 
@@ -275,7 +275,7 @@ def test_an_adapter_that_cannot_be_opened_is_told_once_and_tried_again(tmp_path:
         yield socket.connection(), None
 
     work_on(socket.line, socket.setup, socket.recipe, opened)
-    assert socket.kinds == ["AdapterDown", "Ready"]
+    assert socket.kinds == ["AdapterDown", "AdapterReady"]
     assert [after - before for before, after in pairwise(tries)] == pytest.approx(
         [1.0] * 3, abs=0.1
     )

@@ -15,7 +15,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.events import StepEnded
-from flasher.station.messages import JournalError, RunEvent, RunResult, Write
+from flasher.station.messages import JournalError, JournalWrite, RunEvent, RunResult
 from flasher.station.power import PowerControl
 from flasher.station.records.model import (
     Claim,
@@ -67,11 +67,11 @@ class Notes:
         self.rows.append(row)
         self.on_note()
 
-    def intent(self, target: str, what: str, value: str) -> Write:
+    def intent(self, target: str, what: str, value: str) -> JournalWrite:
         self._note("intent", target, what)
-        return Write(target, what, value, WriteId(len(self.rows)))
+        return JournalWrite(target, what, value, WriteId(len(self.rows)))
 
-    def verified(self, write: Write, read_back: str | None) -> None:
+    def verified(self, write: JournalWrite, read_back: str | None) -> None:
         self._note("verified", str(read_back))
 
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
@@ -142,7 +142,7 @@ class UnitBench:
             self.connection,
             self.journal,
             taps=self.taps,
-            tell=self.notes.append,
+            send_progress=self.notes.append,
             cancelled=self._is_cancelled,
             power=self.power,
         )

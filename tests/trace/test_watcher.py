@@ -11,7 +11,15 @@ from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent, Kind
-from flasher.trace.watcher import Board, Filter, MessageHistory, Pulse, RawFrame, Watcher, replay
+from flasher.trace.watcher import (
+    Filter,
+    MessageHistory,
+    MessageTable,
+    Pulse,
+    TimedFrame,
+    Watcher,
+    replay,
+)
 from tests.loops import each
 from tests.trace import traffic
 
@@ -69,7 +77,7 @@ def test_it_ends_after_its_time() -> None:
 
 def test_raw_frames_come_before_what_they_say() -> None:
     events = replayed(Watcher(raw=True), at(0.0, traffic.reset()))
-    assert [type(event) for event in events] == [RawFrame, RawFrame, BusEvent]
+    assert [type(event) for event in events] == [TimedFrame, TimedFrame, BusEvent]
 
 
 def test_a_message_that_a_trace_cuts_short_is_told_at_its_end() -> None:
@@ -126,8 +134,8 @@ def test_cancelling_ends_it_at_once() -> None:
 # -- the board -----------------------------------------------------------------------------------
 
 
-def board_of(frames: Iterable[tuple[float, Frame]]) -> tuple[Board, list[frozenset[str]]]:
-    board = Board()
+def board_of(frames: Iterable[tuple[float, Frame]]) -> tuple[MessageTable, list[frozenset[str]]]:
+    board = MessageTable()
     changes = [board.add(e) for e in replayed(Watcher(), frames) if isinstance(e, BusEvent)]
     return board, changes
 
@@ -177,7 +185,7 @@ def test_two_messages_at_the_same_time_have_no_rate() -> None:
 
 
 def test_a_babbling_bus_does_not_fill_the_memory() -> None:
-    board = Board()
+    board = MessageTable()
     for number in range(1000):
         board.add(BusEvent(0.0, Kind.FOREIGN, number, "foreign frame"))
         board.add(BusEvent(0.0, Kind.UNKNOWN, 0x720, "unknown message", command=number))

@@ -18,7 +18,7 @@ from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.supervisor import (
     CHECK,
     PAGES,
-    Supervisor,
+    SupervisorPages,
     open_supervisor,
     upload_limit,
 )
@@ -32,7 +32,7 @@ def app_of(database: Path, keys: Path) -> ASGIApp:
     return app_with(open_supervisor(str(database), folder, KeyLocations(keys), DEFAULT_SHIFTS))
 
 
-def app_with(supervisor: Supervisor, login: Login | None = None, *more: BaseRoute) -> ASGIApp:
+def app_with(supervisor: SupervisorPages, login: Login | None = None, *more: BaseRoute) -> ASGIApp:
     """The pages that it answers, and more; with `login` for who signed in."""
 
     async def ask(question: Question) -> Answer:

@@ -14,12 +14,12 @@ from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
 from flasher.cli.stop import Stop
-from flasher.cli.upgrade.bench_page import Memory, VirtualBikes, backup_folder
+from flasher.cli.upgrade.bench_page import LastChoices, VirtualBikes, backup_folder
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
-from flasher.web.bench import Bench, Order
+from flasher.web.bench import BenchController, Order
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
 from flasher.web.guard import BODY_MAX, BrowserEntry, application
@@ -61,7 +61,9 @@ class HeldBikes(VirtualBikes):
         return super().upgrade(adapter, job, on_event=held, cancelled=cancelled)
 
 
-def order(step: Callable[Concatenate[Bench, P], None], *args: P.args, **named: P.kwargs) -> Order:
+def order(
+    step: Callable[Concatenate[BenchController, P], None], *args: P.args, **named: P.kwargs
+) -> Order:
     """A step with what is said of it."""
     return lambda bench: step(bench, *args, **named)
 
@@ -75,9 +77,9 @@ class BenchPlace:
         self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES, TRACE_SUFFIXES)
         bus = Bus(mock=True, mock_speed=0.0)
         output = Output(verbosity=-1)
-        self.bikes = HeldBikes(bus, output, self.shelf, Stop(None), Memory())
-        self.bench = Bench(self.bikes, now)
-        self.do(Bench.find_adapters)
+        self.bikes = HeldBikes(bus, output, self.shelf, Stop(None), LastChoices())
+        self.bench = BenchController(self.bikes, now)
+        self.do(BenchController.find_adapters)
 
     def do(self, *orders: Order) -> BenchState:
         """Carry out orders; the state then."""

@@ -12,7 +12,7 @@ import pytest
 from intelhex import IntelHex
 
 from flasher import events
-from flasher.cli.upgrade.bench_page import Memory
+from flasher.cli.upgrade.bench_page import LastChoices
 from flasher.errors import (
     BusError,
     ImageError,
@@ -31,7 +31,7 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.translation import translator
-from flasher.web.bench import Bench, Order
+from flasher.web.bench import BenchController, Order
 from flasher.web.bench_page import battery_answers
 from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.virtual_bike import BikeFault
@@ -47,16 +47,16 @@ def place(tmp_path: Path) -> BenchPlace:
 def _upgrade(state: BenchState) -> Order:
     assert state.target is not None
     assert state.offer is not None
-    return order(Bench.upgrade, state.target.name, state.offer.sha256)
+    return order(BenchController.upgrade, state.target.name, state.offer.sha256)
 
 
 def _chosen(
     place: BenchPlace, fault: BikeFault = BikeFault.NONE, target: str = "bms"
 ) -> BenchState:
     return place.do(
-        order(Bench.use_adapter, fault.value),
-        order(Bench.choose_target, target),
-        order(Bench.choose_image, IMAGE),
+        order(BenchController.use_adapter, fault.value),
+        order(BenchController.choose_target, target),
+        order(BenchController.choose_image, IMAGE),
     )
 
 
@@ -114,7 +114,7 @@ def test_an_upgrade_that_the_history_cannot_take_says_so(
 
 def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:
     _done(place)
-    state = place.do(Bench.start_over)
+    state = place.do(BenchController.start_over)
     assert (state.done, state.bike, state.offer, state.adapter) == (None,) * 4
     assert len(state.adapters) == len(BikeFault)
 
@@ -124,13 +124,14 @@ def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> Non
 
 def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPlace) -> None:
     state = place.do(
-        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+        order(BenchController.use_adapter, BikeFault.NONE.value),
+        order(BenchController.choose_target, "bms"),
     )
     assert [(each.name, type(each.refusal)) for each in state.offers] == [
         (IMAGE, type(None)),
         ("broken.hex", ImageError),
     ]
-    state = place.do(order(Bench.choose_image, "broken.hex"))
+    state = place.do(order(BenchController.choose_image, "broken.hex"))
     assert isinstance(state.trouble, UsageError)
     assert state.offer is None
 
@@ -150,7 +151,8 @@ def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
     _for_other_hardware(tmp_path)
     assert _chosen(place).offer is not None
     state = place.do(
-        order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms")
+        order(BenchController.use_adapter, BikeFault.HARDWARE.value),
+        order(BenchController.choose_target, "bms"),
     )
     refusals = {each.name: each.refusal for each in state.offers}
     assert isinstance(refusals[IMAGE], WrongDeviceError)
@@ -161,7 +163,8 @@ def test_a_dropped_image_is_offered_and_what_is_none_is_not_taken(place: BenchPl
     for name in ("run.sh", ".bin", "", "a\nb.bin", "x" * 300 + ".bin"):
         assert place.shelf.take(name, b"x") is None, name
     state = place.do(
-        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+        order(BenchController.use_adapter, BikeFault.NONE.value),
+        order(BenchController.choose_target, "bms"),
     )
     assert [each.name for each in state.offers if not each.refusal] == ["dropped.bin", IMAGE]
 
@@ -172,12 +175,13 @@ def test_a_name_is_shown_as_people_write_it_and_what_hides_is_not(
     for name in ("固件 ü.bin", "a\u202eb.bin"):
         (tmp_path / name).write_bytes(image_of(3, NEW).data)
     state = place.do(
-        order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.choose_target, "bms")
+        order(BenchController.use_adapter, BikeFault.NONE.value),
+        order(BenchController.choose_target, "bms"),
     )
     fitting = {each.name for each in state.offers if not each.refusal}
     assert fitting == {IMAGE, "固件 ü.bin", "a\\u202eb.bin"}
     for name in fitting:
-        assert place.do(order(Bench.choose_image, name)).offer is not None
+        assert place.do(order(BenchController.choose_image, name)).offer is not None
 
 
 def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
@@ -194,8 +198,8 @@ def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: Bench
     state = _chosen(place)
     assert state.offer is not None
     for ordered in (
-        order(Bench.upgrade, "wmc", state.offer.sha256),
-        order(Bench.upgrade, "bms", "0" * 64),
+        order(BenchController.upgrade, "wmc", state.offer.sha256),
+        order(BenchController.upgrade, "bms", "0" * 64),
     ):
         state = place.do(ordered)
         assert isinstance(state.trouble, UsageError)
@@ -207,14 +211,14 @@ def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_pa
     other.mkdir()
     (other / "other.bin").write_bytes(image_of(3, NEW).data)
     state = place.do(
-        order(Bench.use_adapter, BikeFault.NONE.value),
-        order(Bench.choose_target, "bms"),
-        order(Bench.use_folder, str(other)),
+        order(BenchController.use_adapter, BikeFault.NONE.value),
+        order(BenchController.choose_target, "bms"),
+        order(BenchController.use_folder, str(other)),
     )
     assert [each.name for each in state.offers] == ["other.bin"]
-    assert Memory().kept("images") == str(other)
+    assert LastChoices().kept("images") == str(other)
     for wrong in ("", str(other / "other.bin"), "/no/such/folder"):
-        state = place.do(order(Bench.use_folder, wrong))
+        state = place.do(order(BenchController.use_folder, wrong))
         assert isinstance(state.trouble, UsageError)
         assert place.shelf.folder == other
 
@@ -226,8 +230,11 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     place: BenchPlace, tmp_path: Path
 ) -> None:
     _for_other_hardware(tmp_path)
-    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms"))
-    state = place.do(order(Bench.waive, IMAGE, "hardware"))
+    place.do(
+        order(BenchController.use_adapter, BikeFault.HARDWARE.value),
+        order(BenchController.choose_target, "bms"),
+    )
+    state = place.do(order(BenchController.waive, IMAGE, "hardware"))
     assert state.offer is not None
     assert state.offer.waived == ("hardware",)
     done = place.do(_upgrade(state)).done
@@ -236,20 +243,23 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     assert ("hardware", "waived") in {(each.check, each.verdict) for each in done.checks}
     assert FlashHistory().flashes()[0][-1].began.waived == "hardware"
     state = place.do(
-        Bench.start_over,
-        order(Bench.use_adapter, BikeFault.HARDWARE.value),
-        order(Bench.choose_target, "bms"),
+        BenchController.start_over,
+        order(BenchController.use_adapter, BikeFault.HARDWARE.value),
+        order(BenchController.choose_target, "bms"),
     )
     assert IMAGE not in {each.name for each in state.offers if not each.refusal}
 
 
 def test_only_the_check_that_refused_can_be_waived(place: BenchPlace, tmp_path: Path) -> None:
     _for_other_hardware(tmp_path)
-    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value), order(Bench.choose_target, "bms"))
+    place.do(
+        order(BenchController.use_adapter, BikeFault.HARDWARE.value),
+        order(BenchController.choose_target, "bms"),
+    )
     for ordered in (
-        order(Bench.waive, IMAGE, "downgrade"),
-        order(Bench.waive, "broken.hex", ""),
-        order(Bench.waive, "no", "hardware"),
+        order(BenchController.waive, IMAGE, "downgrade"),
+        order(BenchController.waive, "broken.hex", ""),
+        order(BenchController.waive, "no", "hardware"),
     ):
         state = place.do(ordered)
         assert isinstance(state.trouble, UsageError)
@@ -264,7 +274,7 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
     done = _done(place)
     assert isinstance(done.error, WrongDeviceError)
     assert done.error.waiver == "in-use"
-    state = place.do(order(Bench.waive, IMAGE, "in-use"))
+    state = place.do(order(BenchController.waive, IMAGE, "in-use"))
     done = place.do(_upgrade(state)).done or done
     assert done.is_completed
 
@@ -307,7 +317,7 @@ def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> Non
 
 def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
     _done(place, BikeFault.POWER)
-    state = place.do(Bench.rescue_it)
+    state = place.do(BenchController.rescue_it)
     assert state.is_rescue
     assert state.offer is not None
     asked: list[float] = []
@@ -347,7 +357,7 @@ def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
 
     place.bench.feed.put = watched  # type: ignore[method-assign]
     _done(place, BikeFault.POWER)
-    place.do(_upgrade(place.do(Bench.rescue_it)))
+    place.do(_upgrade(place.do(BenchController.rescue_it)))
     assert seen[0] in (59, 60)
     assert len(set(seen)) > 5
     assert seen == sorted(seen, reverse=True)
@@ -357,17 +367,17 @@ def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
     place: BenchPlace,
 ) -> None:
     _done(place, BikeFault.REFUSES)
-    state = place.do(Bench.rescue_it)
+    state = place.do(BenchController.rescue_it)
     assert state.offers
     assert state.offer is None
 
 
 def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: BenchPlace) -> None:
     state = place.do(
-        order(Bench.start_over, is_rescue=True),
-        order(Bench.use_adapter, BikeFault.NO_APPLICATION.value),
-        order(Bench.choose_target, "obc"),
-        order(Bench.choose_image, IMAGE),
+        order(BenchController.start_over, is_rescue=True),
+        order(BenchController.use_adapter, BikeFault.NO_APPLICATION.value),
+        order(BenchController.choose_target, "obc"),
+        order(BenchController.choose_image, IMAGE),
     )
     done = place.do(_upgrade(state)).done
     assert done is not None
@@ -376,7 +386,7 @@ def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: Ben
 
 def test_a_bike_that_is_off_says_so(place: BenchPlace) -> None:
     assert isinstance(
-        place.do(order(Bench.use_adapter, BikeFault.OFF.value)).trouble, NoAnswerError
+        place.do(order(BenchController.use_adapter, BikeFault.OFF.value)).trouble, NoAnswerError
     )
 
 
@@ -391,9 +401,9 @@ def _at_packet(number: int, do: Callable[[], None]) -> Callable[[object], None]:
     return hold
 
 
-@pytest.mark.parametrize("end", [Bench.stop, Bench.close])
+@pytest.mark.parametrize("end", [BenchController.stop, BenchController.close])
 def test_who_stops_it_is_told_in_which_state_the_device_is_left(
-    place: BenchPlace, end: Callable[[Bench], None]
+    place: BenchPlace, end: Callable[[BenchController], None]
 ) -> None:
     place.bikes.hold = _at_packet(7, lambda: end(place.bench))
     done = _done(place)
@@ -409,23 +419,23 @@ def test_a_terminal_that_is_gone_does_not_end_an_upgrade(place: BenchPlace) -> N
 
 
 def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> None:
-    assert place.bench.order(Bench.find_adapters)
-    assert not place.bench.order(Bench.start_over)
+    assert place.bench.order(BenchController.find_adapters)
+    assert not place.bench.order(BenchController.start_over)
 
 
 @pytest.mark.parametrize(
     "ordered",
     [
-        Bench.look,
-        Bench.judge,
-        Bench.watch,
-        Bench.find_areas,
-        order(Bench.back_up, ""),
-        order(Bench.choose_target, "bms"),
-        order(Bench.use_adapter, "none"),
-        Bench.rescue_it,
-        order(Bench.upgrade, "bms", ""),
-        order(Bench.waive, IMAGE, "hardware"),
+        BenchController.look,
+        BenchController.judge,
+        BenchController.watch,
+        BenchController.find_areas,
+        order(BenchController.back_up, ""),
+        order(BenchController.choose_target, "bms"),
+        order(BenchController.use_adapter, "none"),
+        BenchController.rescue_it,
+        order(BenchController.upgrade, "bms", ""),
+        order(BenchController.waive, IMAGE, "hardware"),
     ],
 )
 def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Order) -> None:
@@ -441,7 +451,7 @@ def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Or
 def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value))
+    place.do(order(BenchController.use_adapter, BikeFault.HARDWARE.value))
     looks: list[BenchState] = []
 
     def put(_subject: str, state: BenchState, **_: object) -> None:
@@ -450,7 +460,7 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
             place.bench.stop()
 
     monkeypatch.setattr(place.bench.feed, "put", put)
-    state = place.do(Bench.watch)
+    state = place.do(BenchController.watch)
     assert state.trouble is None
     assert state.watched is not None
     assert {each.doing for each in looks} == {Activity.WATCHING, Activity.NOTHING}
@@ -459,15 +469,15 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     assert running.route == "BMS > all"
     assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
     assert any(each.seen.is_trouble for each in state.watched.board)  # the fault of this bike
-    assert place.do(order(Bench.use_adapter, BikeFault.NONE.value)).watched is None
+    assert place.do(order(BenchController.use_adapter, BikeFault.NONE.value)).watched is None
 
 
 def test_a_bus_that_fails_while_it_is_watched_says_so(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(order(Bench.use_adapter, BikeFault.NONE.value))
+    place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
     monkeypatch.setattr("flasher.web.bench.drive", _lost)
-    state = place.do(Bench.watch)
+    state = place.do(BenchController.watch)
     assert isinstance(state.trouble, BusError)
     assert state.doing is Activity.NOTHING
 
@@ -477,10 +487,12 @@ def _lost(*_: object, **__: object) -> None:
 
 
 def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
-    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), Bench.find_areas)
+    state = place.do(
+        order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.find_areas
+    )
     assert state.areas is not None
     (area,) = state.areas  # new.bin has no addresses, and broken.hex is no image
-    saved = place.do(order(Bench.back_up, area.source)).saved
+    saved = place.do(order(BenchController.back_up, area.source)).saved
     assert saved is not None
     assert saved.path.parent.name == "backups"
     assert saved.path.name.startswith("bms-W2605001-")
@@ -497,16 +509,20 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
     image = IntelHex()
     image.frombytes(image_of(3, NEW).data, offset=0x0800_4000)
     image.write_hex_file(str(tmp_path / "running.hex"))
-    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), Bench.find_areas)
+    state = place.do(
+        order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.find_areas
+    )
     assert [each.start for each in state.areas or ()] == [AREA_START, 0x0800_4000]
-    state = place.do(order(Bench.back_up, (state.areas or ())[1].source))
+    state = place.do(order(BenchController.back_up, (state.areas or ())[1].source))
     assert state.saved is not None
     assert state.saved.area is not None
     assert state.saved.area.source.endswith("running.hex")
 
 
 def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
-    saved = place.do(order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.back_up, "")).saved
+    saved = place.do(
+        order(BenchController.use_adapter, BikeFault.NONE.value), order(BenchController.back_up, "")
+    ).saved
     assert saved is not None
     assert (saved.area, saved.names_running_version) == (None, None)
     assert "memory" in saved.missing
@@ -515,24 +531,28 @@ def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> No
 def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_written(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    state = place.do(order(Bench.use_adapter, BikeFault.OFF.value), order(Bench.back_up, ""))
+    state = place.do(
+        order(BenchController.use_adapter, BikeFault.OFF.value), order(BenchController.back_up, "")
+    )
     assert isinstance(state.trouble, NoAnswerError)
     assert state.saved is None
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
-    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value), order(Bench.back_up, ""))
+    state = place.do(
+        order(BenchController.use_adapter, BikeFault.NONE.value), order(BenchController.back_up, "")
+    )
     assert isinstance(state.trouble, UsageError)
     assert state.saved is None
 
 
 def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
-    state = place.do(order(Bench.use_adapter, BikeFault.NONE.value))
+    state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
     found = dict(battery_answers(state))
     assert found["faults"] == [("faults", "none received")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
     ((_, faults),) = dict(
-        battery_answers(place.do(order(Bench.use_adapter, BikeFault.HARDWARE.value)))
+        battery_answers(place.do(order(BenchController.use_adapter, BikeFault.HARDWARE.value)))
     )["faults"]
     assert faults == "over discharge protection"
     assert translator("de")(faults) == "Schutz: Tiefentladung"

@@ -34,7 +34,7 @@ from flasher.station.records.overview import By, Overview, Span
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web import supervisor
 from flasher.web.query_processes import Answer, Question
-from flasher.web.supervisor import Supervisor, open_supervisor, shifts_of, spans_of
+from flasher.web.supervisor import SupervisorPages, open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.station.postgres import Server
 from tests.web.answering import app_of, app_with, client_of
@@ -152,13 +152,13 @@ def test_a_file_breaks_off_where_a_part_cannot_be_read(
         str(plant.path), plant.store.files.folder, KeyLocations(plant.keys), DEFAULT_SHIFTS
     )
     asked: list[Question] = []
-    usual = supervisor.Supervisor.answer
+    usual = supervisor.SupervisorPages.answer
 
-    def answer(self: Supervisor, question: Question) -> Answer:
+    def answer(self: SupervisorPages, question: Question) -> Answer:
         asked.append(question)
         return Answer(status=503) if len(asked) == 3 else usual(self, question)
 
-    monkeypatch.setattr(supervisor.Supervisor, "answer", answer)
+    monkeypatch.setattr(supervisor.SupervisorPages, "answer", answer)
     with closing(pages.store), pytest.raises(RuntimeError, match="cannot be read"):
         client_of(app_with(pages)).get("/runs.csv")
     assert [question.fields.get("after") for question in asked] == [None, "2", "4"]

@@ -71,7 +71,7 @@ def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
             line
             for text, result in cases
             if result.verdict is status
-            for line in _told(text, result, verbose=verbose)
+            for line in _case_lines(text, result, verbose=verbose)
         ]
         if lines:
             yield ""
@@ -92,15 +92,15 @@ def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
 
 
-def _told(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]:
+def _case_lines(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]:
     """One line: case, expected, actual, and the command to repeat it."""
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
-    said = result.reason
+    reason = result.reason
     if result.verdict is CaseVerdict.DEVIATION:
-        said = f"{said} (profile: {text.deviation})"
+        reason = f"{reason} (profile: {text.deviation})"
     head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
     replay = f" | replay: {result.replay}" if result.replay else ""
-    yield printable(f"{head}: {_short(said)}") + replay
+    yield printable(f"{head}: {_short(reason)}") + replay
     failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
         for label, content in text.clauses.items():
@@ -232,8 +232,8 @@ def difference_lines(found: Difference) -> Iterator[str]:
             before = "not judged" if change.before is None else change.before.text
             after = "not judged" if change.after is None else change.after.text
             why = f": {_short(change.reason)}" if change.reason else ""
-            said = f"{change.id} {_short(change.title)}: {before}, now {after}{why}"
-            yield printable(f"{kind:<6}  {said}")
+            line = f"{change.id} {_short(change.title)}: {before}, now {after}{why}"
+            yield printable(f"{kind:<6}  {line}")
     for one in (*found.slower, *found.faster):
         kind = "slower" if one.after_s > one.before_s else "faster"
         yield printable(

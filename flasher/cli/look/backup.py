@@ -104,7 +104,7 @@ DOCUMENTS: Final = (BackupDocument,)
 
 
 @dataclass(frozen=True)
-class Backup:
+class DeviceBackup:
     """Data read from a device, ready to be written to a file."""
 
     document: BackupDocument
@@ -210,7 +210,7 @@ def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> A
 
 def backup_of(
     found: DeviceInfo, area: Area | None, data: bytes, connection: str, file: Path
-) -> Backup:
+) -> DeviceBackup:
     """Build the backup. Raises NoAnswerError for a device that did not answer."""
     if not found.is_there:
         raise silence(found)
@@ -242,7 +242,7 @@ def backup_of(
         items=[*(name for name, answer in info.items.items() if answer is not None), "faults"],
         not_in_it=not_in_it | info.unanswered,
     )
-    return Backup(document, archive, running)
+    return DeviceBackup(document, archive, running)
 
 
 def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> bytes:

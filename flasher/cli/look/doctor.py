@@ -123,7 +123,7 @@ _WORDS: Final = {
 @bus_options()
 def doctor(output: Output, bus: Bus, *, listen: float) -> int:
     """Check the adapters, the selected one, its bus and the traffic."""
-    examination = Examination(bus, listen, output)
+    examination = Diagnostics(bus, listen, output)
     with stop_on_signal() as stopped:
         if bus.mock:
             examination.look_at_mock(stopped)
@@ -153,7 +153,7 @@ def lines(findings: Sequence[Finding], *, is_coloured: bool) -> list[str]:
     return shown
 
 
-def _document(examination: Examination) -> DoctorDocument:
+def _document(examination: Diagnostics) -> DoctorDocument:
     heard = examination.listened
     return DoctorDocument(
         findings=examination.findings,
@@ -182,7 +182,7 @@ def _document(examination: Examination) -> DoctorDocument:
 # -- the checks ------------------------------------------------------------------------------------
 
 
-class Examination:
+class Diagnostics:
     """Runs the checks and collects their findings."""
 
     def __init__(self, bus: Bus, listen_s: float, output: Output) -> None:

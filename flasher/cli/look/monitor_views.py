@@ -21,7 +21,7 @@ from flasher.cli.documents import FieldValue
 from flasher.cli.output import Output, counted
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import NOT_IN_DIALECT, BusEvent, Field, Kind
-from flasher.trace.watcher import Board, MessageHistory, Pulse, RawFrame
+from flasher.trace.watcher import MessageHistory, MessageTable, Pulse, TimedFrame
 
 _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
@@ -81,7 +81,7 @@ class MonitorView:
 
     def __init__(self, output: Output) -> None:
         self.output = output
-        self.board = Board()
+        self.board = MessageTable()
         self.name = ""
         self.messages = 0
         self.troubles = 0
@@ -100,7 +100,7 @@ class MonitorView:
                 self.messages += 1
                 self.troubles += event.is_trouble
                 self.show(event, self.since(event.at), self.board.add(event))
-            case RawFrame(at, frame):
+            case TimedFrame(at, frame):
                 self.show_frame(frame, self.since(at))
             case Pulse(at):
                 self.refresh(at)
@@ -218,7 +218,7 @@ class BoardView:
         self._too_long_for: ConsoleDimensions | None = None
         """Size at which one row per field was too long: keeps the layout from alternating."""
 
-    def draw(self, board: Board, now: float, title: str) -> RenderableType:
+    def draw(self, board: MessageTable, now: float, title: str) -> RenderableType:
         size = self._console.size
         lines = list(board.lines())
         faults = _fault_lines(lines, size.width, size.height - _FRAME_LINES - 1)

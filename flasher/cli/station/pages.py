@@ -36,7 +36,7 @@ from flasher.station.health import HealthWatch
 from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import Clock, RunFilter, RunState, utc_moment
+from flasher.station.records.model import RunFilter, RunState, StationClock, utc_moment
 from flasher.station.records.store import SystemClock
 from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
 from flasher.station.station import Station
@@ -195,7 +195,7 @@ def served(
     keeping: KeyLocations | None,
     people: Sequence[Person] = (),
     is_supervised: Callable[[str], bool],
-    clock: Clock,
+    clock: StationClock,
     note: Note,
     checker: Executor,
 ) -> Iterator[str]:

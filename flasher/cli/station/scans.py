@@ -21,7 +21,7 @@ from typing import Any, Final, TextIO
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import read
 from flasher.protocol.text import printable
-from flasher.station.scans import Command, Label, Word, understand
+from flasher.station.scans import Label, ScanCommand, Word, understand
 from flasher.station.socket import Socket
 
 _ESCAPES: Final = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
@@ -77,7 +77,7 @@ class ScanFile:
         """`badges`: scans that are not labels. Raises UsageError for an unknown socket."""
         names = {name.lower() for name in sockets}
         for each in map(understand, scans):
-            if not isinstance(each, Command) or each.word is not Word.SOCKET:
+            if not isinstance(each, ScanCommand) or each.word is not Word.SOCKET:
                 continue
             if each.argument.lower() not in names:
                 raise UsageError(
@@ -124,7 +124,7 @@ class ScanFile:
         scan = understand(self._left[0])
         if self._is_label(self._left[0]):
             self._label(sockets, borne)
-        elif isinstance(scan, Command) and scan.word is Word.SOCKET and len(self._left) > 1:
+        elif isinstance(scan, ScanCommand) and scan.word is Word.SOCKET and len(self._left) > 1:
             named = next(e for e in sockets if e.name.lower() == scan.argument.lower())
             if named.awaits_label:
                 self._submit(self._left.popleft())

@@ -17,13 +17,15 @@ from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
 from flasher.station.operators import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
-from flasher.station.recipe import SerialNumber
+from flasher.station.recipe import SerialNumberRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.scanners import Scanner
 from flasher.station.station import Station
 
 
-def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNumber) -> Crew | None:
+def crew_of(
+    options: RunOptions, config: StationConfig, serial_number: SerialNumberRule
+) -> Crew | None:
     """The people of the badge table; None without a table. Raises UsageError."""
     table = options.badges or (Path(config.badges) if config.badges else None)
     if table is None:

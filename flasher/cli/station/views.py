@@ -216,7 +216,7 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
             for text in _stopped_lines(board.stopped, width - 2, room)
         ]
     reply_lines = _REPLY_LINES if height >= _HIGH else 1
-    reply = textwrap.wrap(board.said, width)[:reply_lines]
+    reply = textwrap.wrap(board.last_reply, width)[:reply_lines]
     reply += [""] * (reply_lines - len(reply))
     lines += [_cut(line, "bold red" if board.is_refusal else "") for line in reply]
     if typed is not None:

@@ -46,7 +46,7 @@ from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
-from flasher.web.bench import Bench
+from flasher.web.bench import BenchController
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Activity, Adapter, Saved
 from flasher.web.guard import BODY_MAX, BrowserEntry, application
@@ -60,7 +60,7 @@ _MEMORY_MAX: Final = 4096
 """Limit in bytes of the file with the last adapter."""
 
 
-class Memory:
+class LastChoices:
     """The adapter and image folder last chosen on the page."""
 
     def __init__(self) -> None:
@@ -77,11 +77,11 @@ class Memory:
         """The last choice; empty without one."""
         return self._all().get(name, "")
 
-    def keep(self, **told: str) -> None:
+    def keep(self, **choices: str) -> None:
         """Store choices. They are a convenience only: a failed write is ignored."""
         with contextlib.suppress(OSError):
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._path.write_text(json.dumps({**self._all(), **told}), "utf-8")
+            self._path.write_text(json.dumps({**self._all(), **choices}), "utf-8")
 
 
 @dataclass
@@ -92,7 +92,7 @@ class _Place:
     _output: Output
     _shelf: Shelf
     _stop: Stop
-    _memory: Memory
+    _memory: LastChoices
 
     def __post_init__(self) -> None:
         self.dialect = self._bus.dialect
@@ -183,8 +183,8 @@ class _Place:
                     record.leave_terminal(output)
                 return self._stop.has_hung_up
 
-            told = self._told(adapter, job, on_event)
-            yield {"on_event": told, "cancelled": cancelled, "hung_up": hung_up}
+            listener = self._listener(adapter, job, on_event)
+            yield {"on_event": listener, "cancelled": cancelled, "hung_up": hung_up}
 
         upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
         result = None
@@ -195,7 +195,7 @@ class _Place:
         bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
         return bench.UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
 
-    def _told(
+    def _listener(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
     ) -> Callable[[object], None]:
         """Builds the listener for events of an upgrade that begins."""
@@ -295,17 +295,17 @@ class VirtualBikes(_Place):
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
 
-    def _told(
+    def _listener(
         self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
     ) -> Callable[[object], None]:
         bike = self._bikes[adapter.name]
         bike.begin(job)
 
-        def told(event: object) -> None:
+        def listener(event: object) -> None:
             on_event(event)
             bike.happened(event)
 
-        return told
+        return listener
 
 
 def serve(
@@ -322,12 +322,12 @@ def serve(
         TemporaryDirectory(prefix="flasher-images-") as dropped,
         stop_on_signal(lambda: output.error_line("stopping ...")) as stop,
     ):
-        memory = Memory()
+        memory = LastChoices()
         shelf = Shelf(_folder(images, memory), Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
         answering = QueryProcesses(partial(Archive, bundle_folder(), backup_folder(), shelf.traces))
         stack.callback(answering.close)
         kind = VirtualBikes if bus.mock else Adapters
-        machine = Bench(kind(bus, output, shelf, stop, memory), time.perf_counter)
+        machine = BenchController(kind(bus, output, shelf, stop, memory), time.perf_counter)
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
             [*page.routes, *answer_routes(pages, answering.ask, KEPT)],
@@ -343,7 +343,7 @@ def serve(
 
         worker = threading.Thread(target=work, name="bench", daemon=True)
         with Server(app, "127.0.0.1", port) as server:
-            machine.order(Bench.find_adapters)
+            machine.order(BenchController.find_adapters)
             worker.start()
             opened(server.url.rstrip("/") + entry.path)
             was_upgrading = _wait(machine, worker, stop)
@@ -352,7 +352,7 @@ def serve(
     return done.error if was_upgrading and done is not None else None
 
 
-def _folder(images: Path | None, memory: Memory) -> Path:
+def _folder(images: Path | None, memory: LastChoices) -> Path:
     """The image folder: the given one, else the last one used, else the working directory. Raises
     UsageError if it is not a folder.
     """
@@ -366,7 +366,7 @@ def _folder(images: Path | None, memory: Memory) -> Path:
     return (images or (last if last.is_dir() else Path())).expanduser().resolve()
 
 
-def _wait(machine: Bench, worker: threading.Thread, stop: Stop) -> bool:
+def _wait(machine: BenchController, worker: threading.Thread, stop: Stop) -> bool:
     """Wait until the user ends it; True during an upgrade. A lost terminal ends it too, but an
     upgrade then finishes by itself.
     """

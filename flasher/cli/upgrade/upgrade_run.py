@@ -103,9 +103,9 @@ class UpgradeRun:
                                 case QueryAnswered(content=VersionInformation() as version):
                                     serial_number = printable(str(version.serial_number))
                                     self._serial_number = serial_number or None
-                            tell = watch.get("on_event")
-                            if tell is not None:
-                                tell(event)
+                            listener = watch.get("on_event")
+                            if listener is not None:
+                                listener(event)
 
                         if left is not None:
                             on_event(left)

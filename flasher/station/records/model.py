@@ -17,7 +17,7 @@ DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
 """How long a write waits for another program that holds the database."""
 
 
-class Clock(Protocol):
+class StationClock(Protocol):
     """The records' source of time; tests pass their own."""
 
     def utc(self) -> datetime:
@@ -246,7 +246,7 @@ class AttachmentFile:
 
 
 @dataclass(frozen=True)
-class Ending:
+class RunEnd:
     """The end of a run: everything that `Store.finish` saves in one transaction."""
 
     state: RunState

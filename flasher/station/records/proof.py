@@ -61,7 +61,7 @@ class Restarts:
     """It has answered since the last announcement."""
     _is_due: bool = False
     """A burst follows what was sent, at any time."""
-    _is_told: bool = False
+    _has_update_command: bool = False
     """An update command was sent, and no application has answered since."""
     _requested_at: float | None = None
     _announced_at: float | None = None
@@ -72,7 +72,7 @@ class Restarts:
         """The tool sent something to it."""
         self._has_acted = self._has_acted or message.mode == Mode.WRITE
         if isinstance(row, messages.UpdateCommand):
-            self.is_identified = self._is_told = True
+            self.is_identified = self._has_update_command = True
             self._is_due, self._requested_at = False, None
         elif isinstance(row, Reset | messages.EndOfTransfer | messages.Unknown):
             # Products may have a reset of their own.
@@ -89,11 +89,11 @@ class Restarts:
     def answered(self) -> None:
         """Its application named its version."""
         self.is_identified = self._is_running = True
-        self._is_due = self._is_told = False
+        self._is_due = self._has_update_command = False
 
     def take(self, row: object, at_s: float) -> None:
         """Its bootloader sent something."""
-        if isinstance(row, messages.RequestTransfer) and self._is_told:
+        if isinstance(row, messages.RequestTransfer) and self._has_update_command:
             self._requested_at = at_s
         if not isinstance(row, messages.BootVersion):
             return
@@ -152,7 +152,7 @@ class TraceOfTarget:
     def __post_init__(self) -> None:
         self._watcher = TargetWatcher(_Usual(self.target, Profile(self.target)))
 
-    def hear(self, frame: Frame, at_s: float, gap_s: float) -> None:
+    def watch(self, frame: Frame, at_s: float, gap_s: float) -> None:
         """Any frame before it is identified, `gap_s` after the last one; the computer may have
         stood still meanwhile.
         """
@@ -250,7 +250,7 @@ def traces_of_targets(
         gap_s, before_s = at_s - before_s, at_s
         for each in traces.values():
             if not each.restarts.is_identified:
-                each.hear(frame, at_s, gap_s)
+                each.watch(frame, at_s, gap_s)
         if not frame.is_payload or frame.can_id not in streams:
             continue
         stream, each = streams[frame.can_id]

@@ -28,7 +28,7 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
-from flasher.station.records.rollup import Ended, Rest, Rollup, Units
+from flasher.station.records.rollup import EndCounts, Rest, Rollup, Units
 from flasher.station.records.rows import batches
 
 _EVERYTHING: Final = RunFilter()
@@ -107,7 +107,7 @@ class Records:
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        ended = Ended()
+        ended = EndCounts()
         units: Units | None = None
         rests = [Rest(chosen, [])]
         with self._rollup.rolled(chosen) as rolled:

@@ -129,7 +129,7 @@ class Rest:
 
 
 @dataclass
-class Ended:
+class EndCounts:
     """Counts of how runs ended."""
 
     by_state: Counter[str] = field(default_factory=Counter)
@@ -585,7 +585,7 @@ class Rolled:
         yield from months
         yield from (str(day.number) for day in whole if day.month not in months)
 
-    def ended(self, ended: Ended) -> list[Rest]:
+    def ended(self, ended: EndCounts) -> list[Rest]:
         """Add how runs ended; what the sums are without."""
         whole = self._whole()
         for state, code, is_virtual, runs in self.bad("state", "code", "is_virtual"):

@@ -8,7 +8,7 @@
     store.verified(write, "V1r0r4_20220512")
     store.step(claim.run_id, "flash", StepState.PASS, ...)
     trace = store.files.add("trace", path)
-    store.finish(claim.run_id, Ending(RunState.PASS, "OK", "", ...))   # only now show PASS
+    store.finish(claim.run_id, RunEnd(RunState.PASS, "OK", "", ...))   # only now show PASS
 
 Whatever raises RecordError has saved nothing; a run that could not be finished stays RUNNING, and
 `finish` may be tried again with the same ending. Threads may share a store that is in a file: every
@@ -56,14 +56,14 @@ from flasher.station.records.model import (
     AuditEvent,
     Backup,
     Claim,
-    Clock,
-    Ending,
     Examination,
     Measurement,
     Order,
+    RunEnd,
     RunExamination,
     RunId,
     RunState,
+    StationClock,
     StepState,
     WriteId,
     utc_text,
@@ -91,7 +91,7 @@ class Store:
     """The records. Open with `Store.open`; a context manager."""
 
     def __init__(
-        self, database: Database, station: str, clock: Clock, keeping: KeyLocations = _USUAL
+        self, database: Database, station: str, clock: StationClock, keeping: KeyLocations = _USUAL
     ) -> None:
         self.database = database
         self.station = station
@@ -107,7 +107,7 @@ class Store:
         url: str,
         *,
         station: str,
-        clock: Clock | None = None,
+        clock: StationClock | None = None,
         folder: Path | None = None,
         lock_timeout_s: float = DEFAULT_LOCK_TIMEOUT_S,
         create: bool = True,
@@ -302,7 +302,7 @@ class Store:
 
     # -- ending -----------------------------------------------------------------------------------
 
-    def finish(self, run_id: RunId, ending: Ending) -> None:
+    def finish(self, run_id: RunId, ending: RunEnd) -> None:
         """Save how a run ended, in one transaction. Only after it returned may PASS be shown.
 
         May be called again with the same ending after an error. Raises RuleBrokenError for a PASS

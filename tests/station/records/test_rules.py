@@ -12,7 +12,7 @@ import psycopg
 import pytest
 
 from flasher.station.records.errors import RuleBrokenError
-from flasher.station.records.model import Ending, Measurement, RunId, RunState, StepState, Verified
+from flasher.station.records.model import Measurement, RunEnd, RunId, RunState, StepState, Verified
 from flasher.station.records.schema import metadata
 from flasher.station.records.triggers import RULES
 from tests.station.factory import BMS_VERSION, Bench
@@ -154,10 +154,10 @@ def test_the_rules_of_one_row_hold_without_triggers(
         assert why in refused(other, ENDED.format(reached=reached, log=log))
 
 
-def ending_with(bench: Bench, **changes: object) -> Ending:
+def ending_with(bench: Bench, **changes: object) -> RunEnd:
     """A good ending with changes."""
     good = bench.ending()
-    return Ending(**{**good.__dict__, **changes})
+    return RunEnd(**{**good.__dict__, **changes})
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def ending_with(bench: Bench, **changes: object) -> Ending:
     ],
 )
 def test_a_false_pass_is_not_saved(
-    any_bench: Bench, spoil: Callable[[Bench], Ending], why: str
+    any_bench: Bench, spoil: Callable[[Bench], RunEnd], why: str
 ) -> None:
     run_id = any_bench.claim().run_id
     any_bench.work(run_id)
