@@ -99,8 +99,8 @@ def build() -> Schema:
     return {
         "$schema": DIALECT,
         "title": f"Output of flasher --json, version {SCHEMA_VERSION}",
-        "description": "One document; where events are wanted or a command streams, one line for "
-        "each of them before it, told by their key `event`.",
+        "description": "One document. With events, or from a streaming command, lines precede it, "
+        "one for each event; the key `event` names its type.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in found],
         "$defs": dict(sorted({**_needed(found, known), **found}.items())),
     }
@@ -132,7 +132,7 @@ def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:
     """A line: an event by the name of its class, or a type that has the key `event`."""
     properties = {"schema": version, **own["properties"]}
     if "event" not in own["properties"]:
-        text = {"type": "string", "description": "The same in words, where a command has them."}
+        text = {"type": "string", "description": "The event as text, from commands that have one."}
         properties |= {"event": {"const": kind.__name__}, "text": text}
     required = [name for name in properties if name != "text" or name in own["properties"]]
     name = properties["event"]["const"]
@@ -142,15 +142,15 @@ def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:
 def _documents(command: str | None, own: Sequence[Schema], envelope: Schema) -> Iterator[Schema]:
     """The documents of a command: each of its own, and the document of a failure."""
     around = {**envelope["properties"], "command": {"const": command}}
-    told: dict[str, list[Schema]] = {}
+    by_key: dict[str, list[Schema]] = {}
     for each in own:
         for key, value in each["properties"].items():
-            if value not in told.setdefault(key, []):
-                told[key].append(value)
+            if value not in by_key.setdefault(key, []):
+                by_key[key].append(value)
         properties = {**each["properties"], **around}
         yield _closed(properties, list(properties), each["description"])
     by_then = {
-        key: forms[0] if len(forms) == 1 else {"anyOf": forms} for key, forms in told.items()
+        key: forms[0] if len(forms) == 1 else {"anyOf": forms} for key, forms in by_key.items()
     }
     yield _closed(
         {**by_then, **around, "ok": {"const": False}, "error": {}},

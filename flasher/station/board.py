@@ -48,9 +48,9 @@ STEPS: Final = {
     StepName.VERIFY: text("verify"),
     StepName.SAVE: text("save"),
 }
-"""What a socket does."""
+"""Steps of a run, for people."""
 _PAGES_MAX: Final = 100
-"""Pages whose last answers are kept."""
+"""Maximum number of pages whose last reply is stored."""
 NO_BADGES: Final = text("No badge table: people are taken at their word.")
 
 
@@ -65,44 +65,44 @@ def _doing(step: StepName, target: str, try_number: int) -> str:
 
 @dataclass
 class Row:
-    """One socket. Texts are safe to show."""
+    """The display of one socket. Its texts are safe to show."""
 
     socket: str
     state: SocketState = SocketState.STARTING
     serial: str = ""
     step: str = ""
     share: float | None = None
-    """Of the step, from 0 to 1."""
+    """Progress of the step, from 0 to 1."""
     left_s: float | None = None
     note: str = ""
-    """What is awaited, what is wrong, or what to do."""
+    """An error, or the next action of the operator."""
     code: str = ""
-    """Of the last run here, while its unit is in the socket and did not pass."""
+    """Code of the last run, while its unit is in the socket and did not pass."""
     is_virtual: bool = False
-    """Its units are virtual: no product comes out of it."""
+    """Its units are virtual: it makes no products."""
     borne: str = ""
-    """The label that the virtual unit in it bears: what a trainee has to type."""
+    """The label of the virtual unit in it, which a trainee has to type."""
 
 
 @dataclass(frozen=True)
 class ScanReply:
-    """The answer to a scan, or a prompt to a person."""
+    """The reply to a scan, or a prompt to a person."""
 
     text: str = ""
     is_refusal: bool = False
     number: int = 0
-    """Later ones have higher numbers."""
+    """Number that orders the replies of all sources."""
 
 
 @dataclass(frozen=True)
 class Spoken:
-    """The last answers: to what each page scanned, and all others."""
+    """The last reply to each page, and the last one to all other sources."""
 
     to_all: ScanReply = ScanReply()
     to_pages: Mapping[str, ScanReply] = field(default_factory=dict)
 
     def to(self, source: str) -> ScanReply:
-        """The last answer for this source; other pages' answers are not shown."""
+        """The newest reply that this source may see: its own, or the last to all."""
         return max(
             self.to_all, self.to_pages.get(source, ScanReply()), key=lambda each: each.number
         )
@@ -118,7 +118,7 @@ class Spoken:
 
 @dataclass
 class Board:
-    """The whole station."""
+    """The display of a station; `apply` updates it with each event."""
 
     rows: dict[str, Row] = field(default_factory=dict)
     title: str = ""
@@ -129,38 +129,38 @@ class Board:
     figures: Figures | None = None
     stopped: LineStopped | None = None
     page: str = ""
-    """Address of the operator page, where there is one."""
+    """URL of the operator page; empty without one."""
     records_fault: str = ""
-    """Why the last record was not saved; empty when the last one was."""
+    """Why the last record was not saved; empty when it was."""
     spoken: Spoken = Spoken()
     scanners: set[str] = field(default_factory=set)
-    """Where something was scanned, beside pages."""
+    """Sources of scans so far, without pages."""
     prompt: str = ""
-    """What somebody has to do about the label that was scanned last."""
+    """The next action for the label that was scanned last."""
     pin_of: str = ""
-    """Whose PIN is typed next: what is typed must not be shown. Empty: no PIN is awaited."""
+    """Person whose PIN is typed next: typed text must not be shown. Empty: no PIN is awaited."""
     has_badges: bool = True
-    """False once a station without a badge table has begun."""
+    """False after the start of a station without a badge table."""
     labels: dict[str, str] = field(default_factory=dict)
-    """Label of the virtual unit in a socket."""
+    """Labels of the virtual units in sockets, by socket."""
     ended: dict[str, RunEnded] = field(default_factory=dict)
-    """The last run of each unit, by its serial number."""
+    """The last run of each unit, by serial number."""
     refused: list[ScanRefused] = field(default_factory=list)
     waiting: dict[str, str] = field(default_factory=dict)
-    """Labels that were accepted and have no socket yet, and where they were scanned."""
+    """Sources of accepted labels without a socket, by label."""
     lost_scanners: dict[str, ScannerChanged] = field(default_factory=dict)
-    """Scanners that cannot be read, by their names."""
+    """Scanners that cannot be read, by name."""
     unprinted: dict[str, LabelFailed] = field(default_factory=dict)
-    """Labels that were not printed, by the serial numbers of their units."""
+    """Labels that were not printed, by serial number."""
     arrived: set[str] = field(default_factory=set)
-    """Labels of the virtual units that came so far."""
+    """Labels of all virtual units so far."""
     virtual_sockets: tuple[str, ...] = ()
     broken: dict[str, str] = field(default_factory=dict)
-    """Sockets that will not work any more, with the reason."""
+    """Reasons of the sockets that will not work until the station is restarted, by socket."""
 
     @property
     def last_reply(self) -> str:
-        """The answer to the last scan outside pages, or a prompt."""
+        """The reply to the last scan outside pages, or a prompt."""
         return self.spoken.to_all.text
 
     @property
@@ -183,7 +183,7 @@ class Board:
             case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed() | ScannerChanged():
                 self._beside(event)
             case OperatorPrompted("", text, _, source):
-                # It comes just before the scan that it belongs to is accepted.
+                # The next event accepts the scan that it belongs to.
                 self.prompt = shown(text)
                 self.speak(self.prompt, source=source)
             case UnitArrived(socket, _, label):
@@ -215,7 +215,7 @@ class Board:
     def _beside(
         self, event: PinAwaited | PinEnded | LabelPrinted | LabelFailed | ScannerChanged
     ) -> None:
-        """What stands beside the way of a unit."""
+        """Apply an event of PINs, labels or scanners."""
         if isinstance(event, ScannerChanged):
             self._scanner(event)
             return
@@ -257,29 +257,29 @@ class Board:
             if self.waiting.get(event.text) == event.source:
                 del self.waiting[event.text]
             reason, remedy = shown(event.reason), shown(event.remedy)
-            said = text("{text}: {reason} {remedy}", text=sentence, reason=reason, remedy=remedy)
-            self.speak(said, event.source, is_refusal=True)
+            reply = text("{text}: {reason} {remedy}", text=sentence, reason=reason, remedy=remedy)
+            self.speak(reply, event.source, is_refusal=True)
         else:
             meaning = text(event.meaning)
             if event.socket and event.meaning != Word.SOCKET.value.lower():
                 socket = printable(event.socket)
-                said = text(
+                reply = text(
                     "{text}: {meaning} for socket {socket}",
                     text=sentence, meaning=meaning, socket=socket,
                 )  # fmt: skip
             else:
-                said = text("{text}: {meaning}", text=sentence, meaning=meaning)
+                reply = text("{text}: {meaning}", text=sentence, meaning=meaning)
             if event.meaning == "label" and not event.socket:
                 self.waiting[event.text] = event.source
-                said = text("{said}. {prompt}", said=said, prompt=self.prompt)
+                reply = text("{said}. {prompt}", said=reply, prompt=self.prompt)
             elif event.meaning == Word.CANCEL.value.lower():
                 kept = {n: source for n, source in self.waiting.items() if source != event.source}
                 self.waiting = kept
-            self.speak(said, event.source)
+            self.speak(reply, event.source)
         self.prompt = ""
 
     def speak(self, answer: str, source: str = "", *, is_refusal: bool = False) -> None:
-        """Show an answer where its scan came from; of several scanners, named."""
+        """Show a reply at the source of its scan; names the source if there are several."""
         if source and not source.startswith(PAGE):
             self.scanners.add(source)
             if len(self.scanners) > 1:
@@ -329,7 +329,7 @@ class Board:
 
     @property
     def exchanged(self) -> frozenset[str]:
-        """Units that had left their sockets when their last runs ended."""
+        """Units whose last runs ended because they were exchanged."""
         changed = codes.UNIT_CHANGED.name
         return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
@@ -340,7 +340,7 @@ class Board:
 
 
 def beside_words(event: LabelFailed | ScannerChanged) -> str:
-    """An event of a label or a scanner, with its remedy, for people."""
+    """Format an event of a label or a scanner, with its remedy."""
     if isinstance(event, LabelFailed):
         return text(
             "No label for {serial}: {reason} {remedy}",
@@ -355,6 +355,6 @@ def beside_words(event: LabelFailed | ScannerChanged) -> str:
 
 
 def shown(text: str) -> str:
-    """A text that is safe to show; a sentence keeps what it is translated by."""
+    """Make a text safe to show. A safe `Text` is returned as it is, since it can be translated."""
     safe = printable(text)
     return text if safe == text else safe

@@ -179,7 +179,7 @@ def test_faults_and_an_idle_shutdown_can_be_set(flasher: Flasher, serve: Serve) 
     serve(tool, 2000.0)
     run = flasher("mock", "-t", "bms", "--set", "idle_shutdown=on", "--set", "battery_use=resting")
     assert "power:   SHUTDOWN sent: bus idle\n" in run.out
-    assert "power:   off; ready: nobody; no answer from WMC, OBC\n" in run.out
+    assert "power:   off; ready: none; no answer from WMC, OBC\n" in run.out
     assert "state:   off\n" in run.out
     tool = Tool()
     serve(tool, 1.05)

@@ -429,7 +429,7 @@ def test_a_command(tmp_path: Path) -> None:
     printer_of(configured(command=(sys.executable, "-c", program, str(made))))(b"^XA", LIMIT_S)
     assert made.read_bytes() == b"^XA"
     bad = "import sys; sys.exit('out of paper')"
-    with pytest.raises(NotPrinted, match="ended with 1: out of paper"):
+    with pytest.raises(NotPrinted, match="failed with exit code 1: out of paper"):
         printer_of(configured(command=(sys.executable, "-c", bad)))(b"^XA", LIMIT_S)
     with pytest.raises(NotPrinted, match="cannot be reached"):
         printer_of(configured(command=("no-such-program",)))(b"^XA", LIMIT_S)

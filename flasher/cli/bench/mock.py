@@ -152,8 +152,8 @@ def mock(
     ):
         if not dialect.has_upgrade:
             output.progress(
-                f"note: the {dialect.name.upper()} document has no upgrade; behind its RESET "
-                "stands Welling's bootloader here"
+                f"note: the {dialect.name.upper()} document has no upgrade; after its RESET the "
+                "model runs Welling's bootloader"
             )
         served = "a whole bicycle" if system else target.node.name
         if variant is not None:
@@ -278,7 +278,7 @@ class _Watcher:
                 self._say("power", f"SHUTDOWN sent: {why}", event)
             case events.ShutdownEnded(ready, silent):
                 others = f"; no answer from {', '.join(silent)}" if silent else ""
-                self._say("power", f"off; ready: {', '.join(ready) or 'nobody'}{others}", event)
+                self._say("power", f"off; ready: {', '.join(ready) or 'none'}{others}", event)
             case events.DeviceReported(what):
                 self._say("note", what, event)
             case events.BytesDamaged(can_id, reason, data):

@@ -90,12 +90,12 @@ examples:
   flasher export trace upgrade.blf --joined -o joined.blf
   flasher export trace upgrade.blf --joined -o joined.log
 
-A DBC describes single frames; the messages of the drive system take several. So it describes each
-message as one CAN FD frame: `flasher export trace --joined` makes such a trace. It can say numbers
-and flags, with their units, within the first 64 bytes of a message; it cannot say texts (versions,
-serial numbers), plain bytes (image, memory, ids), what lies behind byte 64, or whether a CRC is
-right. Signals are named after message and field (running_information_voltage_mv), the message by
-the signal `command`. The encoding is Windows-1252.
+A DBC describes single frames, but messages of the drive system take several. So this DBC describes
+each message as one CAN FD frame, as in traces of `flasher export trace --joined`. It covers numbers
+and flags, with their units, in the first 64 bytes of a message; it cannot express texts (versions,
+serial numbers), plain bytes (image, memory, ids), bytes after the 64th, or CRC errors. Signals are
+named after message and field (running_information_voltage_mv); the signal `command` selects the
+message. The encoding is Windows-1252.
 """
 _CSV_EXAMPLES: Final = """\
 examples:
@@ -159,7 +159,7 @@ def _needs_file() -> UsageError:
 
 
 def _protocol_file(output: Output, file: Path | None, text: str, *, encoding: str = "utf-8") -> int:
-    """What is made of the protocol alone."""
+    """Write a file that depends on the protocol only, not on a trace."""
     if file is None:
         if output.json_wanted:
             raise _needs_file()
@@ -271,7 +271,9 @@ def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[SignalRow], str]
 
 
 def _warn(output: Output, trace: Path, damage: str, *, made: int) -> None:
-    """What the count of frames or messages `made` does not say."""
+    """Warn about a damaged trace, or one without classic CAN frames. `made`: number of exported
+    frames or messages.
+    """
     from flasher.trace.source import frames_until_damage, trace_file  # noqa: PLC0415  python-can
 
     shown = printable(str(trace))

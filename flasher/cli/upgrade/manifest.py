@@ -210,7 +210,7 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
             code=ErrorCode.MANIFEST,
         )
     checks = checks_of(release, loaded, target)
-    output.result(f"{printable(release.source)}, held against {printable(image.image)}")
+    output.result(f"{printable(release.source)}, compared with {printable(image.image)}")
     output.table(((f"{each.check}:", each.detail) for each in checks), indent=2)
     document = ManifestCheckDocument(image.image, release.source, release, checks)
     try:
@@ -221,7 +221,7 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
     return output.document(document)
 
 
-# -- in words and as JSON --------------------------------------------------------------------------
+# -- as text and as JSON ---------------------------------------------------------------------------
 
 
 def stated_rows(release: Release) -> dict[str, str]:
