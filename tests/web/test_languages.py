@@ -20,12 +20,12 @@ from flasher.protocol.spec import BMS
 from flasher.station.board import Board
 from flasher.station.health import HealthWatch
 from flasher.station.label_printer import LabelPrinter, send_tcp
-from flasher.station.messages import Write
+from flasher.station.messages import JournalWrite
 from flasher.station.shift_counts import ShiftCounts
 from flasher.station.socket import Source
 from flasher.translation import NAMES, translator
 from flasher.web.archive import Archive
-from flasher.web.bench import Bench as BikeBench
+from flasher.web.bench import BenchController as BikeBench
 from flasher.web.bench_page import BenchPage
 from flasher.web.bench_state import BenchState
 from flasher.web.operator import CurrentLot, Screen
@@ -225,7 +225,7 @@ def test_a_full_disk(bench: Bench) -> None:
     bench.store.database.close()
     event.listen(bench.store.database.engine, "connect", _no_room)
     for _ in range(200):
-        if line.ask("A", Write("bms", "flash", "V" * 200)).error:
+        if line.ask("A", JournalWrite("bms", "flash", "V" * 200)).error:
             break
     line.end("A")
     event.remove(bench.store.database.engine, "connect", _no_room)
