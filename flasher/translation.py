@@ -1,8 +1,9 @@
 """Translations of pages and certificates: Babel catalogues in `locale`, by English sentences.
 
-A page translates a `Text` by its template. Errors, stories and records hold plain English, made by
-f-strings: the catalogue has these with their values in braces, and a sentence is translated by the
-entry that matches it. What no entry matches stays as it is.
+A `Text` is translated by its template. Errors, stories and records hold plain English made by
+f-strings; the catalogue has these with their values in braces ("There is no run {run_id}."), so
+that the entry which matches a sentence gives its translation and its values. A text that joins
+several sentences is translated one by one; what matches no entry stays English.
 """
 
 from __future__ import annotations
@@ -25,10 +26,15 @@ _COMMA_LANGUAGES: Final = frozenset({"de"})
 """They write 1.234,5."""
 _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
 _MARKS_MIN: Final = 4
-"""In an entry without its values: fewer would match anything."""
+"""Characters of an entry besides values and spaces: with fewer it would match anything."""
+_LENGTH_MAX: Final = 2000
+"""Characters of a text that is matched; longer ones come from devices and files."""
 _QUANTITY: Final = re.compile(r"-?[\d,]+(?:\.\d+)? [A-Za-z%\N{MICRO SIGN}]{1,4}")
+"""A number and its unit."""
 _LEADING: Final = re.compile(r"(?<![^.!? \N{IDEOGRAPHIC FULL STOP}])\{\w+\} ?")
+"""A value at the beginning of a sentence, in place of another sentence."""
 _BETWEEN: Final = re.compile(r"(?<=[.!?]) (?=\S)|(?<=\N{IDEOGRAPHIC FULL STOP})(?=\S)")
+"""Between two sentences."""
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
 _CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
 _BRACKETS: Final = re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL)
@@ -37,7 +43,7 @@ _COLON: Final = re.compile(r"(.+?)(: )(.+)()", re.DOTALL)
 _WHOLE: Final = re.compile(r"(?:(?![.!?] [A-Z]|; ).)*", re.DOTALL)
 """Values that are not joined themselves."""
 _ANY: Final = re.compile(r".*", re.DOTALL)
-_STOPS: Final = {"zh": "\N{IDEOGRAPHIC FULL STOP}"}
+_FULL_STOPS: Final = {"zh": "\N{IDEOGRAPHIC FULL STOP}"}
 
 
 class _Entry(NamedTuple):
@@ -48,8 +54,8 @@ class _Entry(NamedTuple):
     landmark: str
 
 
-class _Shown(str):
-    """A value as it was formatted in English."""
+class _Formatted(str):
+    """A value out of an English sentence, formatted there."""
 
     __slots__ = ()
 
@@ -61,9 +67,10 @@ class Translator(Formatter):
         self.code = code
         self._gettext = catalogue.gettext
         self._entries = sorted(_entries(catalogue), key=lambda entry: -len(entry.landmark))
-        self._stop = _STOPS.get(code, ".")
+        self._stop = _FULL_STOPS.get(code, ".")
         self._sentences = dict(_sentences(catalogue))
         self._plain = lru_cache(4096)(self._translate_plain)
+        """Translate plain English."""
 
     def __call__(self, sentence: str, **values: object) -> str:
         """Translate a sentence; `values` fill a page's own ones."""
@@ -72,8 +79,8 @@ class Translator(Formatter):
             sentence = sentence.template
         elif not values:
             return self._plain(sentence)
-        said = self._gettext(sentence) if sentence else ""
-        return self.vformat(said, (), values) if values else said
+        template = self._gettext(sentence) if sentence else ""
+        return self.vformat(template, (), values) if values else template
 
     def numbers(self, text: str) -> str:
         """Write the numbers of a text, 1,234.5 in English, as the language does."""
@@ -82,9 +89,10 @@ class Translator(Formatter):
         return _NUMBER.sub(lambda number: number[0].translate(_COMMA), text)
 
     def _translate_plain(self, sentence: str) -> str:
-        said = self._known(sentence)
-        if said or " " not in sentence or not self._entries:
-            return said or sentence
+        translated = self._known(sentence)
+        is_matched = " " in sentence and self._entries and len(sentence) <= _LENGTH_MAX
+        if translated or not is_matched:
+            return translated or sentence
         if _QUANTITY.fullmatch(sentence):
             return self.numbers(sentence)
         return (
@@ -110,17 +118,18 @@ class Translator(Formatter):
     def _labelled(self, sentence: str) -> str:
         """Translate after a known word and a colon; "" without one."""
         label, colon, rest = sentence.partition(": ")
-        said = self._sentences.get(label, "")
-        return f"{said}{colon}{self._plain(rest)}" if rest and said else ""
+        translated = self._sentences.get(label, "")
+        return f"{translated}{colon}{self._plain(rest)}" if rest and translated else ""
 
     def _matched(self, sentence: str, values: re.Pattern[str]) -> str:
         """Translate by the entry that matches with such values; "" without one."""
         for entry in self._entries:
             found = entry.pattern.fullmatch(sentence) if entry.landmark in sentence else None
-            is_odd = values is _WHOLE and sentence[-1:] == "." != entry.template[-1:]
-            if found is not None and not is_odd and all(map(values.fullmatch, found.groups())):
-                shown = {name: _Shown(text) for name, text in found.groupdict().items()}
-                return self.vformat(self._gettext(entry.template), (), shown)
+            has_other_end = values is _WHOLE and sentence[-1:] == "." != entry.template[-1:]
+            if found is None or has_other_end or not all(map(values.fullmatch, found.groups())):
+                continue
+            formatted = {name: _Formatted(text) for name, text in found.groupdict().items()}
+            return self.vformat(self._gettext(entry.template), (), formatted)
         return ""
 
     def _split(self, sentence: str, joint: re.Pattern[str]) -> str:
@@ -129,21 +138,21 @@ class Translator(Formatter):
         if parts is None:
             return ""
         first, between, second, end = parts.groups()
-        said = "".join([self._plain(first), between, self._plain(second), end])
-        return said if said != sentence else ""
+        joined = "".join([self._plain(first), between, self._plain(second), end])
+        return joined if joined != sentence else ""
 
     def _without_stop(self, sentence: str) -> str:
         """Translate what the catalogue has without its full stop; "" otherwise."""
         bare = sentence.removesuffix(".")
-        said = self._plain(bare) if bare != sentence else bare
-        return "" if said == bare else f"{said}{self._stop}"
+        translated = self._plain(bare) if bare != sentence else bare
+        return "" if translated == bare else f"{translated}{self._stop}"
 
     # -- filling in values ------------------------------------------------------------------------
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, Text):
             return self(value)
-        if isinstance(value, _Shown):
+        if isinstance(value, _Formatted):
             text = str(value)
             bare = text.strip()
             return self.numbers(text) if format_spec else text.replace(bare, self._plain(bare))
@@ -153,14 +162,14 @@ class Translator(Formatter):
         return self.numbers(text)
 
     def convert_field(self, value: Any, conversion: Any) -> Any:
-        return value if isinstance(value, _Shown) else super().convert_field(value, conversion)
+        return value if isinstance(value, _Formatted) else super().convert_field(value, conversion)
 
 
 def _sentences(catalogue: gettext.NullTranslations) -> Iterator[tuple[str, str]]:
     """Each sentence of an entry with several; then the entries, which count more."""
-    entries = {key: said for key, said in getattr(catalogue, "_catalog", {}).items() if key}
-    for entry, said in entries.items():
-        english, other = (_BETWEEN.split(_LEADING.sub("", each)) for each in (entry, said))
+    entries = {key: text for key, text in getattr(catalogue, "_catalog", {}).items() if key}
+    for entry in entries.items():
+        english, other = (_BETWEEN.split(_LEADING.sub("", each)) for each in entry)
         if len(english) == len(other) > 1:
             yield from (pair for pair in zip(english, other, strict=True) if "{" not in pair[0])
     yield from entries.items()
@@ -187,7 +196,7 @@ def translator(code: str) -> Translator:
         raise KeyError(code)
     if code == "en":
         return Translator(code, gettext.NullTranslations())
-    from babel.messages.mofile import write_mo  # noqa: PLC0415  not everybody has it
+    from babel.messages.mofile import write_mo  # noqa: PLC0415  of an extra
     from babel.messages.pofile import read_po  # noqa: PLC0415
 
     source = resources.files("flasher").joinpath("locale", f"{code}.po")

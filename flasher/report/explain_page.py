@@ -303,8 +303,8 @@ def _field(text: str, translate: Translator) -> str:
     words = text.split(" ")
     for count in range(len(words), 0, -1):
         label = " ".join(words[:count])
-        if (said := translate(label)) != label:
-            return " ".join([said, translate(" ".join(words[count:]))]).rstrip()
+        if (translated := translate(label)) != label:
+            return " ".join([translated, translate(" ".join(words[count:]))]).rstrip()
     return text
 
 

@@ -161,8 +161,8 @@ def diagram(
 
 def _part(rows: Sequence[DiagramRow], lifelines: tuple[Lifeline, ...], width: float) -> Part:
     names = ", ".join(shortened(line.name, _NAME_LIMIT) for line in lifelines)
-    said = f"{len(rows)} steps between {names}, from {rows[0].time or 'the start'} on."
-    return Part(width, rows[-1].y + 2 * _EDGE, lifelines, tuple(rows), said)
+    description = f"{len(rows)} steps between {names}, from {rows[0].time or 'the start'} on."
+    return Part(width, rows[-1].y + 2 * _EDGE, lifelines, tuple(rows), description)
 
 
 def _lifelines(participants: Sequence[str], width: float) -> tuple[Lifeline, ...]:
@@ -227,13 +227,13 @@ def _block(item: DiagramItem, top: float, width: float) -> DiagramRow:
 
 def _label(item: DiagramItem, room: float) -> tuple[str, tuple[str, ...]]:
     """The bold part of the first line, and all lines: the title, then the text."""
-    said = f"{item.title}{item.text}"
-    wide = sum(unicodedata.east_asian_width(char) in "WF" for char in said)
-    columns = max(8, int(room / _CHAR_WIDTH / (1 + wide / max(1, len(said)))))
+    label = f"{item.title}{item.text}"
+    wide = sum(unicodedata.east_asian_width(char) in "WF" for char in label)
+    columns = max(8, int(room / _CHAR_WIDTH / (1 + wide / max(1, len(label)))))
     title = visible(shortened((_MARK if item.is_trouble else "") + item.title))
-    said = f"{title}: {item.text}" if item.text else title
+    label = f"{title}: {item.text}" if item.text else title
     lines = textwrap.wrap(
-        visible(shortened(said)),
+        visible(shortened(label)),
         columns,
         max_lines=_LABEL_LINES,
         placeholder=" \N{HORIZONTAL ELLIPSIS}",

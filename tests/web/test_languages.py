@@ -174,13 +174,13 @@ def _line_pages(line: LineBench) -> dict[str, str]:
     screen.turn(board, operator="Jo", lot=CurrentLot("L17", 500, 12))
     screen.feed.close()
 
-    async def said(language: str) -> list[object]:
+    async def messages_in(language: str) -> list[object]:
         follow = messages(screen.feed, translator(language), Source())
         return [message async for message in follow]
 
     return {
         language: "".join(
-            f"<p>{html.escape(text)}</p>" for text in _strings(asyncio.run(said(language)))
+            f"<p>{html.escape(text)}</p>" for text in _strings(asyncio.run(messages_in(language)))
         )
         for language in NAMES
     }
