@@ -17,7 +17,7 @@ import pytest
 from flasher.api import Connection, connect_mock
 from flasher.bus.detect import DetectedAdapter, DetectionResult
 from flasher.bus.inspect_interface import Interface, Unseen
-from flasher.errors import ExitCode
+from flasher.errors import ErrorCode, ExitCode
 from tests.api.battery import Battery, wire_to
 from tests.cli.conftest import SAMPLES, Flasher
 
@@ -189,7 +189,7 @@ def test_of_several_none_is_chosen_and_all_are_listed_to_copy(
     machine.detected.found = [CAN0, PCAN]
     run = flasher(*words, "--json")
     assert run.code == run.document["exit_code"] == ExitCode.USAGE
-    assert "2 adapters are there" in run.document["error"]["what"]
+    assert run.document["error"]["code"] == ErrorCode.WHICH_ADAPTER
     listed = [line.strip() for line in run.document["error"]["remedy"].splitlines()[1:]]
     assert [line.partition("   ")[0] for line in listed] == [CAN0.arguments, PCAN.arguments]
     assert "up, 250 kbit/s" in listed[0]
@@ -200,7 +200,7 @@ def test_without_any_the_next_step_is_named(flasher: Flasher, machine: Machine) 
     machine.ports = [DetectedAdapter("slcan", "/dev/ttyACM0")]
     run = flasher("info", "-t", "bms", "--json")
     assert run.code == ExitCode.BUS
-    assert "none was found" in run.document["error"]["what"]
+    assert run.document["error"]["code"] == ErrorCode.NO_ADAPTER
     assert "`flasher adapters`" in run.document["error"]["remedy"]
     assert "\n    -i slcan -c /dev/ttyACM0" in run.document["error"]["remedy"]
 

@@ -200,7 +200,7 @@ def test_a_trace_that_cannot_be_written_is_wrong_usage(flasher: Flasher, tmp_pat
         "flash", OBC, "-t", "obc", "--mock", "--trace-file", tmp_path / "no" / "upgrade.asc"
     )
     assert run.code == ExitCode.USAGE
-    assert "cannot be written" in run.err
+    assert "[E202]" in run.err
 
 
 # -- what goes wrong ------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def test_an_image_outside_of_the_application_area_is_rejected(flash: Flasher) ->
     area = "[bms.application_area]\nstart = 0x08010000\nsize_bytes = 0x20000\n"
     run = flash(area, BMS, "-t", "bms")
     assert run.code == ExitCode.IMAGE
-    assert "outside the device's application area" in run.err
+    assert "[E307]" in run.err
     assert "0x08010000..0x0802FFFF" in run.err
 
 
@@ -50,7 +50,7 @@ def test_an_image_that_is_too_large_for_the_device_is_rejected_even_by_force(
 ) -> None:
     run = flash(limit, BMS, "-t", "bms", "--force")
     assert run.code == ExitCode.IMAGE
-    assert "exceed the limit of the device" in run.err
+    assert "[E303]" in run.err
 
 
 def test_an_image_that_fits_is_flashed(flash: Flasher, short_bms: Path) -> None:

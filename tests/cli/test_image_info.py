@@ -46,7 +46,7 @@ def test_what_is_no_program_is_shown_and_refused_as_flash_refuses_it(
     run = flasher("image-info", path)
     assert run.code == ExitCode.IMAGE
     assert "not plausible for a Cortex-M" in run.out
-    assert "begins with no Cortex-M vector table" in run.err
+    assert "[E306]" in run.err
     document = flasher("image-info", path, "--json").document
     assert document["image"]["vector_table"]["plausible"] is False
     run = flasher("image-info", path, "--allow-implausible")

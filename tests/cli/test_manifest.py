@@ -86,7 +86,7 @@ def test_create_never_writes_over_the_image(flasher: Flasher, image: Path) -> No
 def test_create_says_where_it_cannot_write(flasher: Flasher, image: Path, output: str) -> None:
     run = flasher("manifest", "create", image, "-t", "bms", "-o", image.parent / output)
     assert run.code == ExitCode.USAGE
-    assert "cannot be written" in run.err
+    assert "[E202]" in run.err
     assert list(image.parent.iterdir()) == [image]
 
 
@@ -178,7 +178,7 @@ def test_check_finds_a_changed_image(flasher: Flasher, image: Path, manifest: Pa
     run = flasher("manifest", "check", image)
     assert run.code == ExitCode.IMAGE
     assert "size_bytes:            78351: differs, the image has 11776" in run.out
-    assert "is not the image of its manifest" in run.err
+    assert "[E308]" in run.err
     assert str(manifest) in run.err
 
 
@@ -198,20 +198,20 @@ def test_check_refuses_another_target(flasher: Flasher, image: Path) -> None:
     run = flasher("manifest", "check", image, "-t", "wmc")
     assert run.code == ExitCode.WRONG_DEVICE
     assert "requested_target:      BMS: differs, the command line has WMC" in run.out
-    assert "is for the BMS, not the WMC" in run.err
+    assert "[E601]" in run.err
 
 
 def test_check_refuses_an_image_that_names_another_target(flasher: Flasher, image: Path) -> None:
     flasher("manifest", "create", image, "-t", "wmc")
     run = flasher("manifest", "check", image)
     assert run.code == ExitCode.WRONG_DEVICE
-    assert "The image names the BMS inside, not the WMC" in run.err
+    assert "[E601]" in run.err
 
 
 def test_check_needs_a_manifest_and_a_right_one(flasher: Flasher, image: Path) -> None:
     run = flasher("manifest", "check", image)
     assert run.code == ExitCode.IMAGE
-    assert "There is no manifest" in run.err
+    assert "[E308]" in run.err
     assert flasher("manifest", "check", image, "--manifest", "none.toml").code == ExitCode.USAGE
     wrong = image.with_name("wrong.toml")
     wrong.write_text("format = 1\ntagret = 'bms'\n")

@@ -166,10 +166,7 @@ def test_a_label_that_is_scanned_while_sockets_start_goes_to_no_unit(bench: Benc
     line = LineBench(bench, are_empty=False)
     line.scan(OTHER)
     refused = line.last(ScanRefused)
-    assert (refused.code, refused.reason) == (
-        "STARTING",
-        "Socket A is still starting: it is not known what is in it.",
-    )
+    assert refused.code == "STARTING"
     line.arrive("A")
     line.arrive("B")
     assert line.of(RunStarted) == []

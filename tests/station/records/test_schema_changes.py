@@ -146,7 +146,7 @@ def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old_file: Old
 
 def test_who_reads_changes_no_schema(old: Old) -> None:
     before = old.catalogue()
-    with pytest.raises(OldSchemaError, match="schema 2; this") as caught:
+    with pytest.raises(OldSchemaError) as caught:
         old.open(read_only=True)
     assert "flasher station upgrade" in caught.value.remedy
     assert old.catalogue() == before
@@ -306,7 +306,7 @@ def test_a_full_disk_leaves_everything(old_file: Old, monkeypatch: pytest.Monkey
         connection.execute(f"PRAGMA max_page_count = {pages}")
 
     monkeypatch.setattr(database.Database, "_prepare_sqlite", small)
-    with pytest.raises(DiskFullError, match="keep schema 2: the disk is full"):
+    with pytest.raises(DiskFullError):
         old_file.open()
     monkeypatch.undo()
     assert old_file.rows() == rows

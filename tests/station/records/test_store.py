@@ -337,7 +337,7 @@ def test_figures_tell_units_from_runs_and_first_tries_from_last(bench: Bench) ->
 
 def test_a_serial_number_is_never_that_of_a_real_and_a_virtual_unit(bench: Bench) -> None:
     bench.make(is_virtual=True)
-    with pytest.raises(ClaimRefusedError, match="is a virtual unit") as caught:
+    with pytest.raises(ClaimRefusedError) as caught:
         bench.claim()
     assert caught.value.refusal is Refusal.OTHER_NATURE
     assert bench.store.read.unit_kinds() == {True}
