@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from html.parser import HTMLParser
 from typing import Final
@@ -60,11 +60,11 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
             seal=as_text(sealed),
         )
         left_out = sealed.earlier_left_out
-        for language in _languages(page_text):
-            page = render_certificate(life, made_at, proof, left_out, language)
-            where = _difference_of_page(page, data, pages)
-            if not where:
-                break
+        expected = [
+            render_certificate(life, made_at, proof, left_out, language)
+            for language in _languages(page_text)
+        ]
+        where = _difference_of_page(_closest(expected, page_text), data, pages)
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
             text("The certificate was changed: its signed content is not a run."),
@@ -198,6 +198,12 @@ def _languages(page_text: str) -> Iterable[str]:
     return (named[1],) if named and named[1] in NAMES else NAMES
 
 
+def _closest(pages: Sequence[str], page_text: str) -> str:
+    """The page with most words of the file."""
+    words = set(page_text.split())
+    return max(pages, key=lambda page: len(words & set(" ".join(_parsed(page).text).split())))
+
+
 def _difference_of_page(page: str, data: bytes, prints: list[str]) -> str:
     """Where the file, or the pages of a PDF, differ from the page; empty where they do not, and for
     signed lines alone.
@@ -236,10 +242,14 @@ class _Text(HTMLParser):
                 self.heads[-1] += data
 
 
-def _text_of(page: str) -> str:
+def _parsed(page: str) -> _Text:
     parser = _Text()
     parser.feed(page)
-    return _bare("".join(parser.text))
+    return parser
+
+
+def _text_of(page: str) -> str:
+    return _bare("".join(_parsed(page).text))
 
 
 def _bare(text: str) -> str:
@@ -264,8 +274,7 @@ def _difference_of_print(page: str, pages: list[str]) -> str:
     """Describe the first difference of a print from its page; "" without one. Lines that a browser
     prints at the edges of the paper, and repeated heads of tables, are ignored.
     """
-    parser = _Text()
-    parser.feed(page)
+    parser = _parsed(page)
     expected = _bare("".join(parser.text))
     heads = [_bare(each) for each in parser.heads]
     title = re.search(r"<title>(.*?)</title>", page, re.DOTALL)

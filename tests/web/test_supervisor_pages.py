@@ -119,12 +119,14 @@ def test_a_certificate_is_checked_by_a_page(
     assert tab.wrong == []
 
 
-@pytest.mark.parametrize("has_edges", [False, True])
+@pytest.mark.parametrize(
+    ("language", "has_edges"), [("en", False), ("en", True), ("de", True), ("zh", False)]
+)
 def test_a_printed_certificate_is_checked(
-    tab: Tab, url: str, plant: Bench, *, has_edges: bool
+    tab: Tab, url: str, plant: Bench, language: str, *, has_edges: bool
 ) -> None:
     page = tab.page
-    page.goto(f"{url}units/certificate?serial=W2605009")
+    page.goto(f"{url}units/certificate?serial=W2605009&lang={language}")
     page.emulate_media(media="print")
     whole = page.pdf(format="A4", prefer_css_page_size=True, display_header_footer=has_edges)
     found = check_certificate(plant.store, whole)
@@ -133,10 +135,10 @@ def test_a_printed_certificate_is_checked(
     page.evaluate(
         """() => {
           const walker = document.createTreeWalker(document.querySelector("main"), 4);
-          while (!walker.nextNode().data.includes("voltage"));
-          walker.currentNode.data = walker.currentNode.data.replace("voltage", "voltags");
+          while (!walker.nextNode().data.includes("Battery 36"));
+          walker.currentNode.data = walker.currentNode.data.replace("Battery", "Batterz");
         }"""
     )
     changed = page.pdf(format="A4", prefer_css_page_size=True, display_header_footer=has_edges)
     (problem,) = check_certificate(plant.store, changed).problems
-    assert "voltags" in problem
+    assert "Batterz36" in problem
