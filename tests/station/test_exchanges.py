@@ -143,6 +143,7 @@ class Exchange:
 # -- units that change places ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @BOTH_KINDS
 @BOTH_GAPS
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
@@ -155,6 +156,7 @@ def test_a_unit_that_is_exchanged_while_it_is_flashed(
     assert "its application is erased or half written" in result.text, "the first one is left so"
 
 
+@pytest.mark.slow
 @BOTH_GAPS
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_a_controller_that_is_exchanged_while_it_is_flashed(
@@ -190,6 +192,7 @@ BETWEEN = [
 ]
 
 
+@pytest.mark.slow
 @BOTH_KINDS
 @pytest.mark.parametrize("gap_s", [0.5, 3.5])
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
@@ -219,6 +222,7 @@ def test_a_write_is_not_repeated_to_the_unit_that_came_meanwhile(tmp_path: Path)
     assert world.is_done
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("numbers", "gap_s"), [(BLANK, 3.5), (OF_MAKER, 3.5), (OF_MAKER, 0.3)])
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
 def test_a_unit_that_keeps_its_supply_and_announces_nothing(
@@ -238,6 +242,7 @@ def test_a_unit_that_is_exchanged_at_once_or_much_later(tmp_path: Path, gap_s: f
     world.check_caught()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
 def test_a_unit_that_is_exchanged_while_nobody_listens(
     tmp_path: Path, note: tuple[str, ...]
@@ -323,6 +328,7 @@ def test_a_burst_too_many_around_an_own_restart(tmp_path: Path, gap_s: float, st
     world.check_caught()
 
 
+@pytest.mark.slow
 @BOTH_KINDS
 @pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5, 8.0])
 @pytest.mark.parametrize("resets", [0, 1], ids=["before the flash", "after the writes"])

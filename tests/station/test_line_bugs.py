@@ -26,6 +26,7 @@ def test_a_planted_bug_applies_and_is_python(bug: Bug) -> None:
         assert text != before
 
 
+@pytest.mark.slow
 @each_bug
 def test_the_oracle_condemns_the_story_of_a_planted_bug_and_of_no_other_station(bug: Bug) -> None:
     story, goes_home = Story.parse(bug.story), bug.kind in AT_HOME

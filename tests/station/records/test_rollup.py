@@ -199,6 +199,7 @@ def summed_up_to(lines: Lines) -> int | None:
         return None if rolled is None else rolled.run
 
 
+@pytest.mark.slow
 def test_sums_and_records_give_the_same_figures(lines: Lines) -> None:
     lines.add(300)
     add_up(lines)
@@ -212,6 +213,7 @@ def test_sums_and_records_give_the_same_figures(lines: Lines) -> None:
     check(lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [("Europe/Berlin", "sqlite")], indirect=True)
 def test_days_of_a_clock_in_another_zone_are_cut(
     lines: Lines, monkeypatch: pytest.MonkeyPatch
