@@ -97,6 +97,7 @@ def environment(loader: BaseLoader, translate: Translator) -> Environment:
     made.filters["percent"] = lambda share: translate.numbers(translate(percent(share)))
     made.filters["fixed"] = lambda value, digits: translate.numbers(f"{value:.{digits}f}")
     made.filters["number"] = translate.numbers
+    made.filters["translated"] = translate
     made.filters["shortened"] = shortened
     made.globals.update(Status=Status, _=translate, lang=translate.code)
     return made

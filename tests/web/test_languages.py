@@ -106,7 +106,9 @@ def _bench_pages(place: BenchPlace, state: BenchState) -> dict[str, str]:
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> BenchPlace:
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchPlace:
+    """With a history of its own, which a page shows."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     return BenchPlace(tmp_path)
 
 
