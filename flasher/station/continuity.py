@@ -1,7 +1,7 @@
 """Detects that the unit in a socket may have been exchanged since it was identified; pure.
 
-A `Continuity` is a driver's tap for one target of a run. `lost` holds the evidence against the
-same, uninterrupted unit:
+A `Continuity` is a driver's tap for one target of a run. `lost` is the evidence that the unit may
+have been exchanged, or had no power:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
   switched its power (R28); or after a silence in which it has not confirmed the reset or its image;
@@ -12,7 +12,7 @@ same, uninterrupted unit:
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
   in a field that the run has not written.
 
-It does not detect that an application fell silent: whoever asks the application knows.
+It does not detect an application that fell silent: its next request does.
 
 Not evidence, because a single unit may cause it: announcements of one burst, however many; another
 burst after every reset that was sent and not ignored, as the first one may have come too late; a
@@ -61,7 +61,7 @@ _UNOBSERVED: Final = (
 
 
 class Continuity:
-    """Traffic of one target since it was identified.
+    """Judges the traffic of one target since it was identified.
 
     `blind_s`: a longer time between two calls is unobserved.
     """
@@ -80,7 +80,7 @@ class Continuity:
         timings = loaded.profile.timings
         self.watcher = watcher
         self.lost = ""
-        """Evidence against the same unit; empty without any."""
+        """Evidence of an exchange, as a sentence; empty without any."""
         self.unobserved = (
             _UNOBSERVED.format("before the run began") if was_missed and not goes_on else ""
         )
@@ -88,10 +88,10 @@ class Continuity:
         self.is_running = False
         """Its application has answered since the last restart."""
         self.is_told_to_update = False
-        """An update command has left, and no application has answered since."""
+        """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
         self._goes_on, self._was_silent = goes_on, was_silent and not goes_on
-        """A restart is no evidence; nothing was heard when the run began, and a start is some."""
+        """A restart is no evidence; a start is evidence, since the run began with silence."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -100,32 +100,31 @@ class Continuity:
         self._supplied_until = -inf
         self._timings = timings
         self.quiet_s = max(_QUIET_MIN_S, _SPACINGS_OF_QUIET * timings.boot_version_spacing_s)
-        """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
+        """Time without an announcement after which the burst (4 of them, 50 ms apart) is over."""
         self._gap_s = self.quiet_s
         self._longest_pause_s = 0.0
         """Longest pause between two announcements before identification."""
         self._blind_s, self._missed_s = blind_s, 0.0
-        """How long nobody has listened since the last announcement, or since the reset of one
-        that announced nothing.
+        """Unobserved time since the last announcement, or since the reset of a device that has not
+        announced itself.
         """
         self._now, self._listened_s, self._reset_s = -inf, 0.0, -inf
-        """Up to when, and how long, somebody has listened so far; how long when the last reset was
-        sent.
+        """Time of the last call, observed time up to then, and observed time up to the last reset.
         """
         self._announced_s: float | None = None
-        """The same when the last announcement of the burst came that goes on; None: none does."""
+        """Observed time up to the last announcement of the current burst; None: no burst."""
         self._burst_until = -inf
-        """Up to when a burst may begin that the run has caused."""
+        """Time until which a burst may begin that the run has caused."""
         self._heard_s = 0.0
-        """How long somebody had listened when the unit was heard last."""
+        """Observed time up to the last frame of the unit."""
         self._announced_on = 0
-        """Announcements of the burst that goes on, since the last reset."""
+        """Announcements of the current burst since the last reset."""
         self._awaits_confirmation = self._awaits_complete = self._awaits_application = False
-        """A reset was sent to an application that runs, or the end of the transfer, and is not
-        confirmed; the end of the transfer was sent, and no application has sent anything since.
+        """A reset was sent to a running application, and is not confirmed; the end of the transfer
+        was sent, and is not confirmed; or no application has sent a frame since it.
         """
         self._requested_s: float | None = None
-        """The same for when the transfer that goes on was requested; None: none does."""
+        """Observed time up to the request of the current transfer; None: no transfer."""
         self._is_identified = False
         self._has_acted = False
         """The run has sent a message after which the unit may restart, or switched its power."""
@@ -137,11 +136,11 @@ class Continuity:
         if was_exchanged:
             self._lose("was exchanged, or had no power, before the run began")
 
-    # -- what the run knows -----------------------------------------------------------------------
+    # -- reports of the run -----------------------------------------------------------------------
 
     def begin(self, content: Content | None) -> None:
-        """Note that the unit was identified by this version answer; None: it gave none. From now on
-        it must stay. A unit that cannot be asked must stay from the first update command on.
+        """Note that the unit was identified by this version answer; None: it did not answer. From
+        now on it must stay. A unit that cannot be asked must stay from the first update command on.
         """
         if self._is_identified or self.watcher.request is None:
             return
@@ -181,21 +180,21 @@ class Continuity:
         self._announced_on = _ANNOUNCED_ON  # the power may go a moment later
 
     def allow(self, content: Content) -> None:
-        """Note that the run is about to write this: old and new value are both valid."""
+        """Note that the run is about to write these values: old and new ones are both valid."""
         for name, text in _identity(content).items():
             if name in self._known:
                 self._known[name] |= {text}
 
     def wrote(self, content: Content) -> None:
-        """Note that this was written and read back: only the new value is valid."""
+        """Note that these values were written and read back: only the new ones are valid."""
         for name, text in _identity(content).items():
             if name in self._known:
                 self._known[name] = frozenset({text})
 
-    # -- what is sent and received ----------------------------------------------------------------
+    # -- traffic ----------------------------------------------------------------------------------
 
     def listened(self, now: float) -> None:
-        """Note that the bus was read up to now; called repeatedly during a run."""
+        """Note that the bus was observed up to now; called repeatedly during a run."""
         passed_s = now - self._now
         if passed_s <= self._blind_s:
             self._listened_s += passed_s
@@ -204,7 +203,7 @@ class Continuity:
         self._now = now
 
     def was_away(self, away_s: float) -> None:
-        """Note that the adapter was away for so long up to now."""
+        """Note that the adapter was away for `away_s` up to now."""
         self._listened_s -= away_s
         self._miss(away_s)
 
@@ -248,7 +247,7 @@ class Continuity:
             self._compare(watcher.answer)
 
     def _returns(self) -> bool:
-        """Note that it was heard; True after a silence that allows an exchange."""
+        """Note a frame of the unit. Returns True after a silence that allows an exchange."""
         before, self._heard_s = self._heard_s, self._listened_s
         return self._listened_s - before > _EXCHANGE_S
 
@@ -262,33 +261,33 @@ class Continuity:
                 )
         if frame.can_id != self._sent.can_id:
             return
-        for found in self._sent.feed(frame.data, now):
-            if not isinstance(found, Message) or found.mode != Mode.WRITE:
+        for message in self._sent.feed(frame.data, now):
+            if not isinstance(message, Message) or message.mode != Mode.WRITE:
                 continue
-            # An application that answers no question confirms its first reset too.
+            # An application that does not answer requests confirms its first reset too.
             may_be_running = self.watcher.request is not None and not self.is_announcing
             awaits = self._awaits_confirmation or (may_be_running and not self._has_acted)
             self._has_acted = True
-            is_reset = found.command in (self._reset_command, Command.RESET)
+            is_reset = message.command in (self._reset_command, Command.RESET)
             self._reset_s = self._listened_s if is_reset else self._reset_s
             self._announced_on = 0 if is_reset else self._announced_on
             if is_reset and not self.is_announcing:
                 self._missed_s = 0.0
-            if found.command == Command.RESET and self.is_running:
-                # As long as it has not confirmed that, it goes on running.
+            if message.command == Command.RESET and self.is_running:
+                # Without a confirmation it keeps running.
                 self._awaits_confirmation = True
                 self._burst_until, self._requested_s = inf, None
             elif is_reset:
                 self._restart()
-                self._awaits_confirmation = awaits and found.command == Command.RESET
-            elif found.command == Command.UPDATE:
+                self._awaits_confirmation = awaits and message.command == Command.RESET
+            elif message.command == Command.UPDATE:
                 if not self._is_identified:
                     self._stay()
                 self.is_running = self._awaits_confirmation = self._awaits_complete = False
                 self.is_told_to_update, self._awaits_application = True, False
-                # A burst that the reset before it has caused may still come: it was lost then.
+                # A burst that an earlier reset has caused may still come.
                 self._requested_s = None
-            elif found.command == Command.END_OF_TRANSFER:
+            elif message.command == Command.END_OF_TRANSFER:
                 self._end_transfer()
 
     @property
@@ -303,7 +302,7 @@ class Continuity:
 
     def _end_transfer(self) -> None:
         if self._requested_s is not None:
-            # The burst before the transfer is over, and the unit has stayed: it went on with it.
+            # The burst before the transfer is over, and the unit has stayed: it took the transfer.
             self._requested_s = self._announced_s = None
             self._missed_s = 0.0
         self._burst_until, self._awaits_complete, self._awaits_application = inf, True, True
@@ -313,14 +312,14 @@ class Continuity:
         self.is_running = self._awaits_confirmation = self._awaits_complete = False
         self._has_acted, self._awaits_application = True, False
         self._requested_s = None
-        # However late: only an answer of the application shows that no burst will follow.
+        # Without a time limit: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
 
     def _take_power_up(self, now: float, *, was_heard: bool) -> None:
         """Judge a power-up of a device that was known or silent before."""
         if self._has_acted or now <= self._supplied_until:
             return
-        # A unit is held from its identification on; before that, another one may be put in.
+        # A socket holds its unit from the identification on; before, another one may be put in.
         if self._goes_on and (self._is_identified or self.watcher.request is None):
             return
         if not was_heard:
@@ -339,7 +338,7 @@ class Continuity:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
             if self.watcher.request is None:
-                # It has to stay as soon as it is told to update: this one the reset has caused.
+                # It has to stay from the update command on; the reset caused this announcement.
                 self._count_caused(goes_on=goes_on)
             return
         if self._requested_s is not None:
@@ -363,8 +362,8 @@ class Continuity:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
 
     def _count_caused(self, *, goes_on: bool) -> bool:
-        """Count an announcement after a restart that the run has caused; no further burst is due
-        then. True for the first one of that burst.
+        """Count an announcement. Returns True for the first one of a burst that the run has caused,
+        after which it expects no further burst.
         """
         is_caused = self._now <= self._burst_until
         if goes_on:
@@ -374,7 +373,7 @@ class Continuity:
         return is_caused and not goes_on
 
     def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
-        """Judge whether the announcement may be of another unit that came in unobserved time."""
+        """Judge whether another unit may have been put in during unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
             was_sent = self._announced_on < _ANNOUNCED_ON or self.is_told_to_update
@@ -390,10 +389,10 @@ class Continuity:
             self._lose(f"announced its bootloader {when}")
 
     def _compare(self, content: Content) -> None:
-        found = _identity(content)
+        identity = _identity(content)
         if not self._known:
-            self._known = {name: frozenset({text}) for name, text in found.items()}
-        for name, text in found.items():
+            self._known = {name: frozenset({text}) for name, text in identity.items()}
+        for name, text in identity.items():
             known = self._known.get(name, frozenset({text}))
             if text not in known:
                 first = " or ".join(f"{each!a:.40}" for each in sorted(known))

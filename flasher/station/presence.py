@@ -28,10 +28,10 @@ from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
 BLIND_S: Final = 0.15
-"""A longer time between two polls of the bus, in real seconds, counts as unobserved; polls are 0.1
-s apart. With the frames that are discarded before the next poll it must stay below `PAUSE_S`."""
+"""A longer time between two polls of the bus, in real seconds, counts as unobserved. Polls are 0.1
+s apart. It must stay below `PAUSE_S`, with the frames discarded before the next poll."""
 SILENCE_S: Final = 2.0
-"""A unit that has sent nothing for this time is out."""
+"""A unit that has sent nothing for this time counts as removed."""
 PROBE_S: Final = 0.5
 """Interval between requests to a unit."""
 PAUSE_S: Final = 0.25
@@ -41,7 +41,7 @@ _ANNOUNCEMENT: Final = (
     + bytes((Mode.REPORT, COMMAND_SIZE + data_size(Command.BOOT_VERSION)))
     + Command.BOOT_VERSION.to_bytes(COMMAND_SIZE, "big")
 )
-"""Begins the first frame of an announcement."""
+"""First bytes of the first frame of an announcement."""
 _LATE_LOOKS: Final = 2
 """Calls of `Presence.change` after which all frames that came in unobserved time have been read."""
 _RHYTHM_S: Final = 1.0
@@ -75,30 +75,30 @@ class TargetWatcher:
         self._item = item
         self._answers = None if item is None else Reassembler(item.can_id, limit_s)
         self.announcements = self.begun_announcements = 0
-        """Of its bootloader: complete ones, and those whose first frame was received."""
+        """Announcements of its bootloader: complete ones, and those whose first frame came."""
         self.version = ""
-        """The boot version that was announced last, escaped."""
+        """The last announced boot version, escaped."""
         self.heard_at: float | None = None
         """Time of the last frame of the device."""
         self.has_sent_message = False
-        """A whole message of its bootloader, or anything of its application, was received."""
+        """A whole message of its bootloader, or any frame of its application, was received."""
         self.announced_at: float | None = None
         self.transfer_requests = 0
-        """Of its bootloader."""
+        """Number of transfer requests of its bootloader."""
         self.confirmations = 0
-        """Of writes and resets."""
+        """Number of confirmed writes and resets."""
         self.completions = 0
-        """Of images, by its bootloader."""
+        """Number of images that its bootloader confirmed as complete."""
         self.answers = 0
-        """Number of version answers, whoever asked."""
+        """Number of version answers, to any tool."""
         self.answer: Content | None = None
         """The last version answer."""
         self.power_ups = 0
-        """Number of times that another unit may have come: announcements after a pause or after
-        traffic of the application, or traffic of the application after announcements that were not
-        expected to end."""
+        """Number of times that another unit may have been put in: announcements after a pause or
+        after traffic of the application, or traffic of the application after announcements that
+        were not expected to end."""
         self.has_application = False
-        """The application has sent since the last announcement."""
+        """The application has sent a frame since the last announcement."""
         self.application_frames = 0
         self._announcing_on_s = timings.announcing_on_s
         self._announcing_s = 0.0
@@ -106,9 +106,10 @@ class TargetWatcher:
         self._burst = self._recurrences = 0
         """Announcements since the last pause, and how often an alike pause has recurred."""
         self._paused = (0.0, 0)
-        """The last pause between announcements, 0 before one, and the number of those before it."""
+        """The last pause between announcements (0 before the first), and the number of
+        announcements in the burst before it."""
         self._paused_at = float("-inf")
-        """When it ended."""
+        """Time at which that pause ended."""
         self._is_pace_unknown = False
         """There was only one announcement before the last pause, the first one."""
         self._missed_s = 0.0
@@ -126,13 +127,13 @@ class TargetWatcher:
                 self.has_sent_message = True
         if frame.can_id == self._boot.can_id:
             self.begun_announcements += frame.data.startswith(_ANNOUNCEMENT)
-            for found in self._boot.feed(frame.data, now):
-                if isinstance(found, Message):
-                    self._hear_bootloader(found, now)
+            for message in self._boot.feed(frame.data, now):
+                if isinstance(message, Message):
+                    self._hear_bootloader(message, now)
         if self._answers is not None and frame.can_id == self._answers.can_id:
-            for found in self._answers.feed(frame.data, now):
-                if isinstance(found, Message):
-                    self._take(found)
+            for message in self._answers.feed(frame.data, now):
+                if isinstance(message, Message):
+                    self._take(message)
 
     @property
     def is_in_bootloader(self) -> bool:
@@ -263,24 +264,24 @@ class Presence:
         self._began_at: float | None = None
         self._told_in_bootloader = False
         self.exchanged_number = self.missed_number = 0
-        """Numbers of the last change after which another unit may be present, and of the last one
-        after unobserved time."""
+        """Number of the last change after which another unit may be present, and of the last
+        change after unobserved time."""
         self._forget_unit()
 
     def _forget_unit(self) -> None:
         self.watchers = [TargetWatcher(each) for each in self._targets]
-        """One watcher a target, for the unit that is present."""
+        """A watcher for each target of the present unit."""
         self._told_serial: str | None = None
         self._told_power_ups = 0
         self._was_missed = False
-        """Another unit may have come in unobserved time."""
+        """Another unit may have been put in during unobserved time."""
         self._late_looks = 0
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """Handle one frame of an idle bus."""
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
-            # The end of an announcement that began before is no evidence of its own.
+            # The rest of an announcement that began earlier does not count.
             if watcher.heard_at == now and watcher.has_sent_message:
                 self._heard_at = now
 
@@ -318,13 +319,13 @@ class Presence:
             return None
         is_power_up = heard and self._power_ups > self._told_power_ups
         # The serial number that the unit reports; None before its first answer.
-        said = [each.serial for each in self.watchers if each.serial is not None]
-        serial = next(filter(None, said), "") if said else None
-        told = (self.is_there, self._told_serial, self._told_in_bootloader)
-        # A unit is reported first, and then that it may be two.
+        serials = [each.serial for each in self.watchers if each.serial is not None]
+        serial = next(filter(None, serials), "") if serials else None
+        reported = (self.is_there, self._told_serial, self._told_in_bootloader)
+        # The unit itself is reported first; that it may be another one, in the next call.
         was_missed = heard and self._was_missed and self.is_there is True
         self._was_missed &= heard and not was_missed
-        if (heard, serial, in_bootloader) == told and not (is_power_up or was_missed):
+        if (heard, serial, in_bootloader) == reported and not (is_power_up or was_missed):
             return None
         self._number += 1
         is_other = None not in (self._told_serial, serial) and self._told_serial != serial

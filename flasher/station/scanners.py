@@ -30,14 +30,14 @@ _ENDS: Final = b"\r\n\t"
 
 
 class NoScanner(Exception):  # noqa: N818  it may be plugged in later
-    """Why a scanner cannot be read, as a sentence."""
+    """A scanner cannot be read; the argument is the reason, a sentence."""
 
 
 class Reads(Protocol):
-    """A scanner that is open. Both raise OSError when it is gone."""
+    """An open scanner. Both methods raise OSError when it was unplugged."""
 
     def read(self, limit_s: float) -> None:
-        """Take what it has scanned; waits for it up to `limit_s`."""
+        """Read scanned characters, and wait for them up to `limit_s`."""
 
     def close(self) -> None: ...
 
@@ -47,7 +47,7 @@ Open = Callable[[ScanBuilder], Reads]
 
 
 class Scanner:
-    """One scanner, whether it is plugged in or not. A thread reads it while the block runs."""
+    """One configured scanner, plugged in or not. A thread reads it while the block runs."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Scanner:
         self._open = open_scanner or _opener(config)
         self._device: Reads | None = None
         self._why: str | None = None
-        """Why it could not be read last; None before the first look."""
+        """Why the last read failed; None before the first one."""
         self._ended = threading.Event()
         self._thread = threading.Thread(
             target=self._work, name=f"scanner {config.name}", daemon=True
@@ -85,7 +85,7 @@ class Scanner:
         self.close()
 
     def step(self, limit_s: float) -> bool:
-        """Open it, or read what it has; False while it cannot be read."""
+        """Open or read the scanner. Returns False while it cannot be read."""
         try:
             if self._device is None:
                 self._device = self._open(self._builder)
@@ -107,7 +107,7 @@ class Scanner:
             self._device = None
 
     def _gone(self, why: str) -> None:
-        """Said when it goes, and when there is another reason; not each time it is looked for."""
+        """Report that it cannot be read; once for each reason."""
         self._builder.drop()
         was_open = self._device is not None
         try:
@@ -140,7 +140,7 @@ class InputScanner:
     def __init__(self, device: Any, builder: ScanBuilder) -> None:
         self._device = device
         self._decoder = KeyDecoder(builder, device.active_keys)
-        device.grab()  # nobody else gets its keys: no console, no window
+        device.grab()  # no console or window gets its keys
 
     def read(self, limit_s: float) -> None:
         if not select.select([self._device.fd], [], [], limit_s)[0]:
@@ -153,7 +153,7 @@ class InputScanner:
 
 
 def input_device(config: ScannerConfig, sys_input: Path = _SYS_INPUT) -> Path:
-    """The device of a scanner, by its path or by its place on the USB. Raises NoScanner."""
+    """Find the input device of a scanner by its path or USB path. Raises NoScanner."""
     if config.input:
         return Path(config.input)
     for entry in sorted(sys_input.glob("event*"), key=lambda each: int(each.name[5:])):

@@ -1,27 +1,27 @@
 """Scans of the operator: labels of units, and commands, which are barcodes on a card.
 
-SOCKET A      the unit is, or will be, in socket A; for the label before or after it
-CANCEL        forget the label and the socket that wait, of the scanner that reads it
+SOCKET A      the unit of the label before or after this scan is, or will be, in socket A
+CANCEL        drop the label and the card that wait at this scanner
 ABORT A       stop the run in socket A
-FREE A        the unit is out of socket A, where the station cannot see it
-LOT 4711      the lot of the units that follow
-OPERATOR Jo   who works here now
-REASON text   why units that have passed are done again; holds for the next label
-REPRINT W1    print the label of a unit that has passed once more
-RESUME        what stopped the line is mended: save what is open, and go on
+FREE A        the unit was taken out of socket A, which the station cannot detect
+LOT 4711      the lot of the following units
+OPERATOR Jo   the operator from now on
+REASON text   why units that passed are flashed again; applies to the next label
+REPRINT W1    print the label of a passed unit again
+RESUME        the cause of a stopped line was removed: save open outcomes, and continue
 
-`place` is the rule by which a label is never given to a unit that reports first. A label that is
-scanned alone belongs to
+`place` assigns a label that is scanned alone. No label is assigned to a unit only because it is the
+first to report. The label belongs to
 
-- the only socket of a station that has one;
-- the socket whose unit says that this is its serial number;
-- the socket that the station names, when the unit comes there afterwards. It names only one of
-  which it knows that nothing is in it.
+- the only socket of a station with one socket;
+- the socket whose unit reports this serial number;
+- the socket that the station names, when the unit is put in afterwards. It only names a socket that
+  is known to be empty.
 
 In all other cases the operator scans the card of the socket.
 
-Each scanner, page and terminal is a `Source` with a card or a label of its own that waits for the
-other (`Waiting`): what two people scan at once does not mix.
+Each scanner, page and terminal is a `Source` with its own card or label that waits for the other
+(`Waiting`): scans of two people do not mix.
 """
 
 from __future__ import annotations
@@ -58,27 +58,27 @@ class Word(StrEnum):
 
 @dataclass
 class Waiting:
-    """A scan of one source that waits for the scan that belongs to it."""
+    """A scan of one source that waits for the other scan of its pair, card and label."""
 
     source: Source
     label: str = ""
-    """It waits for the card of its socket."""
+    """A label that waits for the card of its socket."""
     card: Socket | None = None
-    """The socket whose card waits for its label."""
+    """A socket whose card waits for its label."""
     is_in_doubt: bool = False
-    """Something was refused that belongs to what is scanned next, which must not be taken for
-    another unit or socket: a card, or a second card or label beside the one that waits.
+    """A card, or a second card or label, was refused; the next scan may belong to it, and must not
+    be assigned to another unit or socket.
     """
     refused_label: tuple[str, float] | None = None
-    """The last label refused for that, and when. Scanned once more, after its refusal could be
-    read, it counts; another one does not: people who share the source may each have scanned the
-    card.
+    """The last label refused for that, and when. It is accepted when it is scanned again after its
+    refusal could be read. Another label is not: people who share the source may each have scanned
+    the card.
     """
     forget_at_s: float | None = None
 
     @property
     def text(self) -> str:
-        """As it was scanned; empty: nothing waits."""
+        """The waiting scan; empty without one."""
         return self.label or ("" if self.card is None else f"{Word.SOCKET.value} {self.card.name}")
 
     def forget(self) -> None:
@@ -89,7 +89,7 @@ class Waiting:
 
 
 ALONE: Final = frozenset({Word.CANCEL, Word.RESUME})
-"""Commands that are one word."""
+"""Commands without an argument."""
 
 
 @dataclass(frozen=True)
@@ -115,19 +115,19 @@ class NotUnderstood:
 
 
 def understand(scan: str) -> Label | ScanCommand | NotUnderstood:
-    """Parse a scan. Whether a label fits the recipe is checked later."""
+    """Parse a scan. Labels are compared with the recipe later."""
     scanned = scan.strip()
     if not scanned:
         return NotUnderstood(text("Nothing was scanned."))
     if not scanned.isprintable() or len(scanned) > _COMMAND_MAX:
-        return NotUnderstood(text("It holds characters that no label has, or too many."))
+        return NotUnderstood(text("It contains characters that no label has, or too many."))
     first, _, rest = scanned.partition(" ")
     word = next((each for each in Word if each.value == first.upper()), None)
     if word is not None and (word in ALONE) == (not rest.strip()):
         return ScanCommand(word, rest.strip())
     if word is not None:
         return NotUnderstood(
-            text("{word} stands alone.", word=word.value)
+            text("{word} has no argument.", word=word.value)
             if word in ALONE
             else text("{word} what?", word=word.value)
         )
@@ -140,8 +140,8 @@ WAIT: Final = text("Wait for its end.")
 Sockets = Mapping[str, Socket]
 
 
-class Refused(Exception):  # noqa: N818  a scan that changes nothing
-    """Why a scan is refused: a stable word, a sentence, and what to do."""
+class Refused(Exception):  # noqa: N818  not an error of the program
+    """A scan is refused, without effect: a stable code, a sentence, and a remedy."""
 
     def __init__(self, code: str, reason: str, remedy: str) -> None:
         super().__init__(reason)
@@ -151,9 +151,8 @@ class Refused(Exception):  # noqa: N818  a scan that changes nothing
 
 
 def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Binding] | None:
-    """The socket of a label that was scanned alone; None when the operator has to scan its card.
-
-    Raises Refused.
+    """Find the socket of a label that was scanned alone. Returns None when the operator has to scan
+    the card of its socket. Raises Refused.
     """
     if len(sockets) == 1:
         (only,) = sockets.values()
@@ -163,9 +162,9 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
         for e in sockets.values()
         if e.can_work and e.phase is SocketPhase.REST and not e.is_chosen
     ]
-    said = [each for each in idle if each.is_there and each.own == serial]
-    if len(said) == 1:
-        return said[0], Binding.SAID
+    reporting = [each for each in idle if each.is_there and each.own == serial]
+    if len(reporting) == 1:
+        return reporting[0], Binding.SAID
     starting = next((each for each in sockets.values() if each.is_starting), None)
     if starting is not None:
         raise Refused(
@@ -185,7 +184,7 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
 
 
 def was_in(sockets: Sockets, serial: str) -> Socket | None:
-    """The socket in which the unit was last, as far as it has no PASS."""
+    """The socket in which the unit had its last run, unless it passed; None without one."""
     for each in sockets.values():
         last = each.verdict
         if each.interrupted == serial or (last is not None and last.serial == serial):
@@ -206,7 +205,7 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
     if only.occupancy is not Occupancy.SILENT:
         return Binding.NAMED  # the next one, when this one is out
     if last.outcome is not RunState.PASS and not last.has_talked and only.sees_units:
-        # It may sit in its bootloader, and announce itself at any time.
+        # It may be in its bootloader, and announce itself at any time.
         raise Refused(
             "TAKE_OUT",
             text(
@@ -228,7 +227,7 @@ def check_free(socket: Socket) -> None:
 
 
 def check_service(socket: Socket) -> None:
-    """Raises Refused for a socket that cannot work; one that starts will."""
+    """Raises Refused for a socket that cannot work; not for one that is starting."""
     if socket.out_of_service:
         reason = text(
             "Socket {socket} is out of service: {why}",
@@ -251,8 +250,8 @@ def check_known(sockets: Sockets, serial: str) -> None:
 
 
 def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
-    """Raises Refused for a label that was scanned already, or while another one waits: `waiting`
-    is that of the same source.
+    """Raises Refused for a label that was scanned already, or while another one waits. `waiting`:
+    the waiting scan of the same source.
     """
     for each in sockets.values():
         if each.label == serial:
@@ -294,11 +293,11 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
 
 def _said_by(socket: Socket) -> str:
     own = printable(socket.own or "")
-    return text("The unit in socket {socket} says that it is {own}.", socket=socket.name, own=own)
+    return text("The unit in socket {socket} reports {own}.", socket=socket.name, own=own)
 
 
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Source) -> None:
-    """Raises Refused for a label that a person gave to another socket."""
+    """Raises Refused for a label that was already assigned to another socket by its card."""
     for each in sockets.values():
         if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
             reason = text("It was scanned for socket {socket}.", socket=each.name)
@@ -308,12 +307,12 @@ def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Sour
 
 
 def _way_out(socket: Socket, source: Source) -> str:
-    """The scan that releases a label which waits for its unit."""
+    """The scan that drops a label which waits for its unit."""
     return Word.CANCEL.value if socket.source == source else f"{Word.FREE.value} {socket.name}"
 
 
 def card_waits(socket: Socket) -> Refused:
-    """For a scan at one source that means a socket whose card was scanned at another one."""
+    """The refusal of a scan for a socket whose card was scanned at another source."""
     return Refused(
         "CARD_WAITS",
         text("The card of socket {socket} was scanned elsewhere.", socket=socket.name),
@@ -322,13 +321,13 @@ def card_waits(socket: Socket) -> Refused:
 
 
 def one_at_a_time(label: str, wanted: str, way: str = Word.CANCEL.value) -> Refused:
-    """For a label that is scanned while another one waits."""
+    """The refusal of a label while another one waits."""
     reason = text("{label} was scanned before and waits for its unit.", label=printable(label))
     return Refused("LABEL_WAITS", reason, text("{wanted} Or scan {way}.", wanted=wanted, way=way))
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:
-    """The refusal of a scan for another unit than the detected one."""
+    """The refusal of a scan while the unit of the last run is in the socket."""
     return Refused(
         "TAKE_OUT",
         text(

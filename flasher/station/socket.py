@@ -357,9 +357,7 @@ class Socket:
             own = printable(self.own or "")
             wanted = self.wanted
             if self.is_of_another(self.label):
-                wanted = text(
-                    "The unit in it says that it is {own}. {wanted}", own=own, wanted=self.wanted
-                )
+                wanted = text("The unit in it reports {own}. {wanted}", own=own, wanted=self.wanted)
             return SocketState.SCAN, self.label, wanted
         if self.is_starting:
             return SocketState.STARTING, "", text("Listening for a unit.")
@@ -390,7 +388,7 @@ class Socket:
     def _asked_for(self, card: str) -> str:
         if self.is_own_known:
             own = printable(self.own or "")
-            return text("It says that it is {own}: scan its label.", own=own)
+            return text("It reports {own}: scan its label.", own=own)
         last = self.last
         if last is None or last.outcome is None:
             return text("Scan the label of the unit{card}.", card=card)

@@ -20,24 +20,24 @@ from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 NOT_IDENTIFIED: Final = "not identified before flashing"
 BEFORE: Final = "before "
-"""Begins the names of measurements of what must not change."""
+"""Prefix of measurements of values that must not change, as read before the first write."""
 OF_CHECK: Final = {
     IdentityCheck.HARDWARE: codes.WRONG_HARDWARE,
     IdentityCheck.DOWNGRADE: codes.OLD_VERSION,
     IdentityCheck.PREVIOUS: codes.OLD_VERSION,
     IdentityCheck.IN_USE: codes.IN_USE,
 }
-"""The code of a failed check, where it is not NOT_FOR_DEVICE."""
+"""Codes of failed checks; NOT_FOR_DEVICE for all others."""
 
 
-def check_texts(allowed: Sequence[str], found: str | None, code: Code) -> None:
-    """Check reported texts against the patterns of a recipe. Raises StepFailedError."""
-    if not allowed or found is None:
+def check_texts(allowed: Sequence[str], reported: str | None, code: Code) -> None:
+    """Check a reported text against the patterns of a recipe. Raises StepFailedError."""
+    if not allowed or reported is None:
         return
-    # Only * has a meaning in these patterns.
+    # These patterns have only *.
     plain = [each.replace("[", "[[]").replace("?", "[?]") for each in allowed]
-    if not any(fnmatchcase(found, each) for each in plain):
-        raise StepFailedError(code, f"It has {found}, the recipe lists {', '.join(allowed)}.")
+    if not any(fnmatchcase(reported, each) for each in plain):
+        raise StepFailedError(code, f"It has {reported}, the recipe lists {', '.join(allowed)}.")
 
 
 def check_measured(measured: Sequence[Measurement]) -> None:
@@ -58,9 +58,9 @@ def wanted_text(plan: WritePlan) -> str:
     return ", ".join(change.new for change in field_changes(plan, None))
 
 
-def identity_measurements(target: UnitTarget, found: Identified) -> list[Measurement]:
+def identity_measurements(target: UnitTarget, identified: Identified) -> list[Measurement]:
     """The reported identity of a device, as measurements without limits."""
-    name, version = target.name, found.seen.version
+    name, version = target.name, identified.seen.version
     if version is None:
         return [Measurement(f"{name} identity", text=NOT_IDENTIFIED)]
     words = ("model", "serial_number", "hardware_version", "firmware_version")
@@ -72,16 +72,16 @@ def identity_measurements(target: UnitTarget, found: Identified) -> list[Measure
     ]
 
 
-def state_text(target: UnitTarget, found: Identified) -> str:
-    if found.is_in_bootloader:
+def state_text(target: UnitTarget, identified: Identified) -> str:
+    if identified.is_in_bootloader:
         return f"in its bootloader {target.watcher.version}, {NOT_IDENTIFIED}".replace(" ,", ",")
-    if found.seen.version is None:
+    if identified.seen.version is None:
         return "cannot be asked" if target.version_request is None else "silent"
-    return found.seen.firmware_version or "answers"
+    return identified.seen.firmware_version or "answers"
 
 
 class UnitReads:
-    """Reads of one run."""
+    """The reads of one run, and their checks."""
 
     def __init__(
         self, claim: Claim, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
@@ -95,8 +95,8 @@ class UnitReads:
     def limits(
         self, step: StepName, askable: Collection[str] | None = None
     ) -> Iterator[Measurement]:
-        """The measurements that the recipe wants in this step; a target that is not `askable` is
-        measured in no step before it runs an application. Raises NoAnswerError.
+        """Take the measurements of a step. `askable`: the targets that run an application; others
+        are not measured. Raises NoAnswerError.
         """
         for limit in self._recipe.recipe.limit:
             if limit.step is step and (askable is None or limit.target in askable):
@@ -110,14 +110,14 @@ class UnitReads:
         if limit.expected is not None:
             return Measurement(name, text=shown, expected=fill(limit.expected, self._scan))
         if not isinstance(value, int | float):
-            raise StepFailedError(codes.RECIPE, f"{name} is no number.")
+            raise StepFailedError(codes.RECIPE, f"{name} is not a number.")
         return Measurement(name, float(value), codec.unit, low=limit.low, high=limit.high)
 
-    # -- what must not change ---------------------------------------------------------------------
+    # -- values that must not change --------------------------------------------------------------
 
     def before(self, askable: Collection[str]) -> Iterator[Measurement]:
-        """Read what must not change, and remember it. What an interrupted run of this unit read
-        first holds before what is read now; a device that has no application cannot be asked.
+        """Read the values that must not change, and remember them. Values that an interrupted run
+        of this unit read first take precedence. Targets that are not `askable` run no application.
         """
         known = self._claim.known_before
         for target, readable in self._unchanged():
@@ -157,10 +157,10 @@ class UnitReads:
         fields = self._targets[target].read(readable)
         return {f"{target} {readable.name} {name}": shown for name, (_, shown) in fields.items()}
 
-    # -- what was written -------------------------------------------------------------------------
+    # -- written values ---------------------------------------------------------------------------
 
     def written(self, plans: Sequence[WritePlan], measured: list[Measurement]) -> None:
-        """Read every written field once more. Raises StepFailedError for one that differs."""
+        """Read every written field again. Raises StepFailedError for a different value."""
         for plan in plans:
             key = write_key(plan.target.name, plan.writable.name)
             try:
@@ -168,13 +168,13 @@ class UnitReads:
             except NoAnswerError as error:
                 raise StepFailedError(codes.NOT_RUNNING, error.what) from error
             wanted = [name for name, _ in type(plan.content).LAYOUT if name in fields]
-            found = ", ".join(fields[name][1] for name in wanted)
+            value = ", ".join(fields[name][1] for name in wanted)
             expected = wanted_text(plan)
             if self._claim.kind is RunKind.VERIFY_ONLY:
-                # Made on another day, perhaps: what it was given then is what it must have.
+                # It was perhaps made on another day, with another date.
                 expected = self._claim.written_before.get(key, expected)
-            measured.append(Measurement(key, text=found, expected=expected))
-            if found != expected:
+            measured.append(Measurement(key, text=value, expected=expected))
+            if value != expected:
                 raise StepFailedError(
-                    codes.WRITE_DIFFERS, f"{key} reads {found!a} instead of {expected!a}."
+                    codes.WRITE_DIFFERS, f"{key} reads {value!a} instead of {expected!a}."
                 )

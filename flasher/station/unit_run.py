@@ -1,8 +1,8 @@
 """The run of one unit, from first request to last: blocking, on an open connection.
 
-It knows no database: a `Journal` stores what must be on disk before the run may continue, and an
-act that cannot be recorded is not done. `unit_steps` has the steps; this module begins, retries,
-times, records and judges them.
+It does not use the database: a `Journal` stores what must be on disk before the run continues, and
+a write that cannot be recorded is not sent. `unit_steps` has the steps; this module begins,
+retries, times, records and judges them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _BY_ERROR: Final = (
 
 
 class _NotedPower:
-    """The power of a socket: a unit that restarts then does so for a cause."""
+    """The power of a socket. Notes each cycle, so that the restart is not taken for an exchange."""
 
     def __init__(self, power: PowerControl, units: Iterable[Continuity]) -> None:
         self._power = power
@@ -64,15 +64,14 @@ class _NotedPower:
 
 
 class UnitRun:
-    """A run. `cancelled` is asked again and again while it runs, and stays True once it was.
+    """A run. `cancelled` is called repeatedly, and stays True once it was.
 
-    `watchers` know what was heard of the unit before the run, one for each target; the run goes on
-    with them. `was_exchanged`: another unit may have come since the label was bound to the socket;
-    `was_missed`: nobody has listened for a while since then; `was_silent`: somebody has listened,
-    and nothing is heard.
+    `watchers`: for each target the traffic before the run. `was_exchanged`: another unit may have
+    been put in since the label was assigned to the socket; `was_missed`: part of that time was
+    unobserved; `was_silent`: the bus was observed, and nothing was received.
     """
 
-    def __init__(  # noqa: PLR0913  what a run is made of
+    def __init__(  # noqa: PLR0913  all parts of a run
         self,
         claim: Claim,
         recipe: LoadedRecipe,
@@ -122,12 +121,12 @@ class UnitRun:
         self._hear_waiting: Callable[[], None] = lambda: None
 
     def listen_meanwhile(self) -> None:
-        """Read the bus while the records save something, so that this is no unobserved time."""
-        with suppress(BusError):  # whoever uses the adapter next says so
+        """Read the bus while the station saves a record, so that the time counts as observed."""
+        with suppress(BusError):  # the next use of the adapter raises it again
             self._hear_waiting()
 
     def run(self) -> RunResult:
-        """Do it. Raises nothing but what is a bug."""
+        """Run all steps and return the result. An exception is a bug."""
         began_at = self._clock.now()
         code, text, verified = codes.OK, "", {}
         try:
@@ -256,8 +255,8 @@ class UnitRun:
         return StepFailedError(code, f"{lost or unobserved} {steps.left_behind}".strip())
 
     def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
-        """Something has no answer: an application that had answered, and does not any more, means
-        that the unit is gone.
+        """The error for a missing answer: the unit was removed if an application that had answered
+        before no longer does.
         """
         try:
             for target in steps.targets:
@@ -265,12 +264,12 @@ class UnitRun:
         except StepFailedError as silent:
             return silent
         except (InterruptedByUserError, BusError):
-            pass  # what ends the run is noticed by whoever goes on
+            pass  # the next step raises it again
         return failed
 
     def _before_next_try(self, steps: UnitSteps, failed: StepFailedError, rule: StepRule) -> None:
         if failed.code is codes.BUS:
-            # It may be back; when it is not, the next try says so.
+            # The adapter may be back; if not, the next try fails.
             with suppress(BusError):
                 self._connection.link.reopen()
         try:
@@ -283,15 +282,15 @@ class UnitRun:
             raise StepFailedError(codes.BUS, error.what) from error
 
     def _is_over(self) -> bool:
-        """Asked between frames: a person stopped it, the step's time is over, or the unit may be
-        another one.
+        """True when a person stopped the run, the step's time is over, or the unit may have been
+        exchanged; called between frames.
         """
         ends_at = self._step_ends_at
         is_late = ends_at is not None and self._clock.now() >= ends_at
         return self._is_lost() or self._cancelled() or is_late
 
     def _is_lost(self) -> bool:
-        """Asked between frames: the unit may be another one."""
+        """True when the unit may have been exchanged; called between frames."""
         now = self._clock.now()
         for each in self._continuity.values():
             each.listened(now)

@@ -59,13 +59,13 @@ _OF_VERDICT: Final = {
     Verdict.SECOND_TOOL: codes.SECOND_TOOL,
     Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
 }
-"""Codes of the records for failed verifications."""
+"""Codes of failed verifications."""
 _SPACINGS_OF_WATCH: Final = 3
 Act = Callable[[list[Measurement]], str]
 
 
 class UnitSteps:
-    """The acts of one run, and what they know of the unit so far."""
+    """The steps of one run, with their results so far."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class UnitSteps:
         self.verified: dict[str, Verified] = {}
         """Verification level of each target in this run."""
         self.left_behind = ""
-        """The state in which a device would be left now, where that matters."""
+        """The state in which a device is left now, as a sentence, if it needs a rescue."""
         self._claim = claim
         self._is_verify_only = claim.kind is RunKind.VERIFY_ONLY
         self._recipe = recipe
@@ -98,7 +98,7 @@ class UnitSteps:
         self._reads = UnitReads(claim, recipe, scan, targets)
 
     def acts(self) -> Sequence[tuple[StepName, str, Act | None]]:
-        """Every step in order, with its target, if any; None: not needed."""
+        """All steps in order, with their targets ("": all) and functions (None: not needed)."""
         may_write = not self._is_verify_only
         flashes: list[tuple[StepName, str, Act | None]] = [
             (StepName.FLASH, target.name, partial(self._flash, target) if may_write else None)
@@ -118,13 +118,13 @@ class UnitSteps:
     @property
     def has_lost_its_session(self) -> bool:
         """True when a device got an update command and has run no application since: it cannot
-        identify itself, so nothing may begin again with it.
+        identify itself, so no step may be tried again.
         """
         return any(each.continuity.is_told_to_update and not each.goes_on for each in self.targets)
 
     def wait(self, limit_s: float) -> None:
-        """Wait between two tries, and keep asking a running application to identify itself. Raises
-        StepFailedError when it falls silent.
+        """Wait between two tries, while running applications are asked for their versions. Raises
+        StepFailedError when one falls silent.
         """
         clock = self.targets[0].clock
         ends_at = clock.now() + limit_s
@@ -133,57 +133,58 @@ class UnitSteps:
                 target.confirm()
             self.targets[0].listen(min(left_s, PROBE_S))
 
-    # -- before anything is written ---------------------------------------------------------------
+    # -- before the first write -------------------------------------------------------------------
 
     def _connect(self, measured: list[Measurement]) -> str:
         connection = self.targets[0].device.connection
-        self.targets[0].hear_waiting()  # it belongs to what was heard before the run
+        self.targets[0].hear_waiting()  # queued frames date from before the run
         error = connection.link.health().error(connection.name)
         if error is not None:
             raise error
         return connection.name
 
     def _identify(self, measured: list[Measurement]) -> str:
-        said = []
+        states = []
         for target in self.targets:
-            found = target.identify()
-            if target.is_silent(found) and self._power is not None:
+            identified = target.identify()
+            if target.is_silent(identified) and self._power is not None:
                 target.restart(self._power)
-                found = target.identify()
-            self._identified[target.name] = found
-            if found.two_devices:
+                identified = target.identify()
+            self._identified[target.name] = identified
+            if identified.two_devices:
                 raise StepFailedError(
-                    codes.TWO_DEVICES, f"Two devices answer as {target.name}: {found.two_devices}."
+                    codes.TWO_DEVICES,
+                    f"Two devices answer as {target.name}: {identified.two_devices}.",
                 )
             is_known = target.continuity.has_answered and not target.goes_on
-            if is_known and found.seen.version is None:
+            if is_known and identified.seen.version is None:
                 raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
             may_await_power = self._power is not None or target.goes_on
             is_rescue = self._claim.kind is RunKind.RECHECK and may_await_power
-            if target.is_silent(found) and not is_rescue:
+            if target.is_silent(identified) and not is_rescue:
                 raise StepFailedError(
                     codes.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
                 )
             must_answer = target.version_request is not None and not self._claim.has_card
-            if must_answer and found.seen.version is None:
+            if must_answer and identified.seen.version is None:
                 raise StepFailedError(codes.NO_CARD, f"The {target.name} does not answer.")
-            target.continuity.begin(found.seen.version)
+            target.continuity.begin(identified.seen.version)
             target.check_cancelled()
-            measured += identity_measurements(target, found)
-            said.append(f"{target.name}: {state_text(target, found)}")
+            measured += identity_measurements(target, identified)
+            states.append(f"{target.name}: {state_text(target, identified)}")
         if self.targets[0].goes_on:
             measured.append(Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value))
         self._check_label()
         measured += self._reads.limits(StepName.IDENTIFY)
         check_measured(measured)
-        return "; ".join(said)
+        return "; ".join(states)
 
     def _check_label(self) -> None:
-        """Compare the device's serial number with the label. A new unit has none yet, or its
-        maker's; a number of this recipe belongs to that unit alone.
+        """Compare reported serial numbers with the label. A new unit has none, or one of its maker;
+        a serial number of this recipe identifies the unit. Raises StepFailedError.
         """
-        for found in self._identified.values():
-            own = found.serial_number
+        for identified in self._identified.values():
+            own = identified.serial_number
             if own in ("", self._claim.serial):
                 continue
             try:
@@ -193,7 +194,7 @@ class UnitSteps:
                     continue  # it gets its number in this run
             raise StepFailedError(
                 codes.WRONG_UNIT,
-                f"The unit says that it is {own!a:.40}, the label says {self._claim.serial!a:.40}.",
+                f"The unit reports {own!a:.40}, the label has {self._claim.serial!a:.40}.",
             )
 
     def _check(self, measured: list[Measurement]) -> str:
@@ -203,7 +204,7 @@ class UnitSteps:
         if self._is_verify_only and any(each.version_request is None for each in self.targets):
             raise StepFailedError(codes.CANNOT_VERIFY, "A target has no query for its version.")
         in_application = {
-            name for name, found in self._identified.items() if found.seen.version is not None
+            name for name, each in self._identified.items() if each.seen.version is not None
         }
         measured += self._reads.limits(StepName.CHECK, in_application)
         measured += self._reads.before(in_application)
@@ -211,7 +212,7 @@ class UnitSteps:
         return "; ".join(finding.text for finding in findings)
 
     def _judge(self, target: UnitTarget, measured: list[Measurement]) -> list[CheckResult]:
-        """The manifest's rules and the recipe's. Raises StepFailedError."""
+        """Check the rules of manifest and recipe. Raises StepFailedError."""
         loaded, seen = target.loaded, self._identified[target.name].seen
         image, identity = target.job.plan.image, target.job.identity
         findings = list(judge_device(image, loaded.target, identity, seen))
@@ -223,7 +224,7 @@ class UnitSteps:
                 raise StepFailedError(code, finding.text)
         firmware = loaded.firmware
         check_texts(firmware.hardware_versions, seen.hardware_version, codes.WRONG_HARDWARE)
-        # Who failed after its flash runs the new version already.
+        # A unit that failed after its flash already runs the new version.
         is_new = seen.firmware_version == loaded.version
         if self._claim.kind is RunKind.PRODUCTION and not is_new:
             check_texts(firmware.previous_versions, seen.firmware_version, codes.OLD_VERSION)
@@ -232,16 +233,16 @@ class UnitSteps:
     # -- flashing ---------------------------------------------------------------------------------
 
     def _flash(self, target: UnitTarget, measured: list[Measurement]) -> str:
-        """Flash it unless it is proven to be done: record it before, rescue it by a power cycle
-        where it falls silent, record it after.
+        """Flash a target, unless an interrupted run has. Records it before and after; tries a power
+        cycle when the device falls silent.
         """
-        name, found = target.name, self._identified[target.name]
+        name, identified = target.name, self._identified[target.name]
         if (
-            # An interrupted run had flashed it, and the device says the same: both have to agree.
+            # The records of an interrupted run and the device have to agree.
             self._claim.kind is RunKind.RECHECK
             and target.version_request is not None
             and name in self._claim.flashed_before
-            and found.seen.firmware_version == target.loaded.version
+            and identified.seen.firmware_version == target.loaded.version
         ):
             return "flashed before the interruption, and the device names the version"
         self._check_flashed()
@@ -250,7 +251,7 @@ class UnitSteps:
         self._progress(0.0)
         target.confirm()
         try:
-            result = self._upgrade(target, at_power_up=target.is_silent(found))
+            result = self._upgrade(target, at_power_up=target.is_silent(identified))
         except StepFailedError as failed:
             may_rescue = self._power is not None or failed.needs_rescue
             if failed.code not in codes.NEED_POWER_CYCLE:
@@ -275,8 +276,8 @@ class UnitSteps:
         return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}"
 
     def _check_flashed(self) -> None:
-        """A target that was in its bootloader can report its serial number since its flash, before
-        anything is sent to the next one. Raises StepFailedError.
+        """Compare the serial numbers of flashed targets before the next one is flashed: a target
+        that was in its bootloader could not report it before. Raises StepFailedError.
         """
         for target in self.targets:
             if target.name in self._flashed and target.version_request is not None:
@@ -284,7 +285,7 @@ class UnitSteps:
         self._check_label()
 
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
-        """One upgrade to a good end. Raises StepFailedError."""
+        """Run one upgrade. Raises StepFailedError."""
         limit_s = self._recipe.recipe.rule(StepName.FLASH).time_limit_s
         lost_at, completions_when_lost = 0.0, -1
 
@@ -307,12 +308,12 @@ class UnitSteps:
         if limit_s is not None:
             options = replace(options, timeout_s=limit_s)
         if is_in_bootloader and target.continuity.is_announcing:
-            # Its next announcement comes by itself. It ignores a reset (R18), after which that of
-            # another unit would be taken for its own.
+            # It announces itself without a reset. It would ignore one (R18), and the announcement
+            # of another unit would be taken for its own.
             wait_s = options.timings.boot_version_timeout_s
             options = replace(options, at_power_up=True, power_up_timeout_s=wait_s)
         if is_in_bootloader:
-            # It goes on announcing itself: whether it ignores a reset shows before it is erased.
+            # Watch it before the erase: a bootloader that ignores a reset keeps announcing itself.
             timings = options.timings
             watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s
             watched = replace(timings, boot_watch_s=max(timings.boot_watch_s, watch_s))
@@ -353,15 +354,15 @@ class UnitSteps:
             )
         return StepFailedError(
             codes.UNIT_CHANGED,
-            f"The adapter was away, and the {target.name} did not go on where it stood.",
+            f"The adapter was away, and the {target.name} did not continue its transfer.",
         )
 
-    # -- writing ----------------------------------------------------------------------------------
+    # -- writes -----------------------------------------------------------------------------------
 
     def _write(self, measured: list[Measurement]) -> str:
         by_name = {target.name: target for target in self.targets}
         for name in dict.fromkeys(plan.target.name for plan in self._plans):
-            # Who sat in its bootloader could not say its serial number before.
+            # A device that was in its bootloader could not report its serial number before.
             self._await(by_name[name])
         self._check_label()
         for number, plan in enumerate(self._plans, 1):
@@ -373,7 +374,7 @@ class UnitSteps:
         return f"{len(self._plans)} written"
 
     def _await(self, target: UnitTarget) -> Content:
-        """Its version answer once the application runs. Raises StepFailedError."""
+        """Wait for the version answer of the application. Raises StepFailedError."""
         was_running = target.continuity.is_running and not target.goes_on
         answer = target.await_application()
         if answer is None and was_running:
@@ -399,10 +400,10 @@ class UnitSteps:
         read = [change.read_back for change in written.changes if change.read_back is not None]
         self._journal.verified(write, ", ".join(read) if read else None)
 
-    # -- restarting and verifying -----------------------------------------------------------------
+    # -- restart and verification -----------------------------------------------------------------
 
     def _restarts(self, target: UnitTarget) -> bool:
-        """It can be told to restart, and asked afterwards."""
+        """True for a target that can be restarted, and asked for its version afterwards."""
         can_reset = self._power is not None or target.loaded.target.has_version_query
         return can_reset and target.version_request is not None
 
@@ -423,13 +424,13 @@ class UnitSteps:
         return BY_POWER if self._power is not None else "by reset"
 
     def _verify(self, measured: list[Measurement]) -> str:
-        said = []
+        levels = []
         for target in self.targets:
             level = self._verify_image(target, measured)
             self.verified[target.name] = level
             if level < target.loaded.required:
                 raise StepFailedError(codes.CANNOT_VERIFY, f"{target.name}: {level.words}.")
-            said.append(f"{target.name}: {level.words}")
+            levels.append(f"{target.name}: {level.words}")
         self._check_label()
         self._reads.written(self._plans, measured)
         self._reads.unchanged(measured)
@@ -438,10 +439,10 @@ class UnitSteps:
             target.confirm()
         measured += self._continuity()
         check_measured(measured)
-        return "; ".join(said)
+        return "; ".join(levels)
 
     def _continuity(self) -> Iterator[Measurement]:
-        """The record's sentence on how long the unit was watched."""
+        """Whether each target was observed without a gap, as measurements for the records."""
         for target in self.targets:
             is_watched = target.continuity.is_running and not target.goes_on
             words = "observed" if is_watched else "not observed"
@@ -451,18 +452,18 @@ class UnitSteps:
             yield Measurement(POWER_CYCLES, float(cycles))
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
-        """The verification level of the image. Raises StepFailedError."""
+        """Verify the image of a target. Returns the level reached; raises StepFailedError."""
         loaded, name = target.loaded, target.name
         needs_memory = loaded.required is Verified.MEMORY
         if target.version_request is None:
             return self._completed(target)
         running = firmware_version(self._await(target))
-        # What a bootloader alone could not tell before.
+        # A device that was in its bootloader could not report its hardware before.
         hardware = self._identified[name].seen.hardware_version
         check_texts(loaded.release.hardware_versions, hardware, codes.WRONG_HARDWARE)
         check_texts(loaded.firmware.hardware_versions, hardware, codes.WRONG_HARDWARE)
         if not loaded.version and not needs_memory:
-            return self._completed(target)  # an answer compared with nothing proves nothing
+            return self._completed(target)  # there is no version to compare the answer with
         version = Measurement(f"{name} version", text=running, expected=loaded.version or None)
         measured.append(version)
         if not version.is_within:
@@ -478,16 +479,20 @@ class UnitSteps:
 
         check = memory_check(target.job.plan, target.job.options, running)
         target.run(check, on_event)
-        found = check.result
-        if not found.ok:
-            code = _OF_VERDICT.get(found.verdict, codes.MEMORY_DIFFERS)
-            raise StepFailedError(code, f"{name}: {wording(found.verdict)} {found.detail}".strip())
+        result = check.result
+        if not result.ok:
+            code = _OF_VERDICT.get(result.verdict, codes.MEMORY_DIFFERS)
+            raise StepFailedError(
+                code, f"{name}: {wording(result.verdict)} {result.detail}".strip()
+            )
         return Verified.MEMORY
 
     def _completed(self, target: UnitTarget) -> Verified:
-        """Nothing is read back: only the word of the bootloader, in this very run, counts."""
+        """The level of a target that cannot be read back: its bootloader must have confirmed the
+        image in this run. Raises StepFailedError.
+        """
         if target.name not in self._flashed:
             raise StepFailedError(codes.CANNOT_VERIFY, f"The {target.name} cannot be asked.")
         if not self._recipe.recipe.allow_completed_not_read_back:
-            raise StepFailedError(codes.CANNOT_VERIFY, "The recipe wants it read back.")
+            raise StepFailedError(codes.CANNOT_VERIFY, "The recipe requires it to be read back.")
         return Verified.COMPLETED

@@ -1,6 +1,6 @@
 """One target of the unit in a socket: its `Device`, and the station's own requests.
 
-It does not judge bad answers: `unit_steps` does.
+`unit_steps` judges the answers.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
 _SHARE_OF_TRIES: Final = 0.8
-"""Of the time in which a packet is tried: a device that is there has sent something in it."""
+"""Share of the time of all tries of a packet, within which a present device sends something."""
 _WAITING_MAX: Final = 10_000
-"""Frames that are taken at once: a babbling bus must not hold up a run."""
+"""Frames that are processed at once, so that a babbling bus does not block a run."""
 
 
 class StepFailedError(Exception):
@@ -59,7 +59,7 @@ class Identified:
 
     @property
     def serial_number(self) -> str:
-        """The one that it reports; empty without one."""
+        """The reported serial number; empty without one."""
         return str(getattr(self.seen.version, "serial_number", ""))
 
 
@@ -83,9 +83,9 @@ class UnitTarget:
         self.continuity = continuity
         self.watcher = continuity.watcher
         self.goes_on = goes_on
-        """The recipe lets it restart by itself (`AfterRestart.CONTINUE`)."""
+        """The recipe allows it to restart by itself (`AfterRestart.CONTINUE`)."""
         self._taps = taps
-        # Nobody else has this adapter, and each flash listens itself.
+        # No other program uses this adapter, and each flash listens for other tools itself.
         self.device = connection.device(
             profile=loaded.profile,
             is_alone=True,
@@ -98,36 +98,36 @@ class UnitTarget:
             loaded.image,
             loaded.profile,
             bitrate_bps=None if rate is None else rate.bps,
-            # A unit that does not take its image in one session, or where it may go on in some
-            # attempts, is a failed one, and another tool a fault of the station.
+            # A unit fails that does not take its image in one session (`goes_on`: in some
+            # attempts); another tool is a fault of the station.
             options=loaded.profile.upgrade_options(
                 attempts=loaded.profile.attempts,
                 waits_for_other_tool=False,
                 single_session=not goes_on,
             ),
-            # A unit without an application is rescued here.
+            # Units without an application are flashed too.
             identity=loaded.profile.identity(release=loaded.release, goes_on_unchecked=True),
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
         """Its version request; None without a known one."""
         self._cancelled = cancelled
 
-    # -- asking -----------------------------------------------------------------------------------
+    # -- requests ---------------------------------------------------------------------------------
 
     def identify(self) -> Identified:
-        """Request its version; silence is not an error here. A device that was just switched on
-        passes through its bootloader (R19): only one that keeps announcing has no application.
+        """Request its version; silence is not an error here. A device passes through its bootloader
+        after power-up (R19): it has no application only if it keeps announcing.
         """
-        found = self._identify_once()
-        if not found.is_in_bootloader or self.version_request is None:
-            return found
+        identified = self._identify_once()
+        if not identified.is_in_bootloader or self.version_request is None:
+            return identified
         until = self.clock.now() + self.loaded.profile.timings.announcing_on_s
         with suppress(NoAnswerError):
-            # It is not reset: an application beside it would show itself only by its answer.
+            # Asked without a reset: the answer reveals the application of a second unit.
             self.device.version()
         self.listen(until - self.clock.now(), self._is_quiet)
         if not self._is_quiet(self.clock.now()) or self.await_application() is None:
-            return found
+            return identified
         return self._identify_once()
 
     def _identify_once(self) -> Identified:
@@ -138,14 +138,14 @@ class UnitTarget:
         announced = asked.announcement is not None or self.watcher.announcements > before
         return Identified(asked.seen, announced, asked.two_devices)
 
-    def is_silent(self, found: Identified) -> bool:
-        """True when it could have answered and did not."""
+    def is_silent(self, identified: Identified) -> bool:
+        """True when it did not answer a version request."""
         asked = self.version_request is not None
-        return asked and found.seen.version is None and not found.is_in_bootloader
+        return asked and identified.seen.version is None and not identified.is_in_bootloader
 
     def await_application(self) -> Content | None:
-        """Its version answer as soon as the application runs; None when it does not start in time,
-        or was running and is silent.
+        """Request its version until the application answers. Returns None when the application does
+        not start in time, or no longer answers.
         """
         may_start = self.goes_on or not self.continuity.is_running
         start_s = self.loaded.profile.timings.application_start_timeout_s
@@ -162,8 +162,8 @@ class UnitTarget:
                 return answer
 
     def find_out_who_is_there(self) -> None:
-        """Ask and listen after a failed transfer; `continuity` records the traffic. Waits for a
-        silent device, which announces itself when its supply returns.
+        """Request and listen after a failed transfer, so that `continuity` can compare the unit.
+        Waits for a silent device, which announces itself when its supply returns.
         """
         timings = self.loaded.profile.timings
         tried_s = timings.packet_tries * timings.ack_timeout_s
@@ -178,9 +178,8 @@ class UnitTarget:
                 self.device.version()
 
     def confirm(self) -> None:
-        """Request its version again; `continuity` compares the answer. Raises StepFailedError when
-        an application that had answered no longer does; a device that has restarted since is not
-        asked.
+        """Request its version again, unless it has restarted since its last answer; `continuity`
+        compares the answer. Raises StepFailedError when the application no longer answers.
         """
         self.hear_waiting()
         self.check_cancelled()
@@ -200,7 +199,9 @@ class UnitTarget:
                 tap(frame, sent=False, now=self.clock.now())
 
     def read(self, what: Readable) -> Mapping[str, tuple[object, str]]:
-        """The fields of something readable: value, and as it is shown. Raises NoAnswerError."""
+        """Read an item. Returns for each field its value, and the value as text. Raises
+        NoAnswerError.
+        """
         content = self.device.ask(Request(what.item))
         return {
             name: (getattr(content, name), codec.show(getattr(content, name)))
@@ -208,11 +209,11 @@ class UnitTarget:
             if what.field in ("", name)
         }
 
-    # -- restarting -------------------------------------------------------------------------------
+    # -- restart ----------------------------------------------------------------------------------
 
     def restart(self, power: PowerControl | None) -> bool:
-        """Switch it off and on, or reset it as documented; True when its bootloader then announced
-        itself. Raises NoAnswerError.
+        """Switch it off and on, or without `power` reset it by message. Returns True when its
+        bootloader announced itself afterwards. Raises NoAnswerError.
         """
         watcher, before = self.watcher, self.watcher.announcements
         if power is not None:
@@ -238,20 +239,20 @@ class UnitTarget:
         announced_at = self.watcher.announced_at
         return announced_at is None or now - announced_at >= self.continuity.quiet_s
 
-    # -- running ----------------------------------------------------------------------------------
+    # -- engines ----------------------------------------------------------------------------------
 
     def check_cancelled(self) -> None:
         """Raises InterruptedByUserError when the run must end."""
         if self._cancelled():
-            raise InterruptedByUserError("The run is to end.")
+            raise InterruptedByUserError("The run has to end.")
 
     def listen(self, limit_s: float, enough: Callable[[float], bool] = lambda _now: False) -> None:
-        """Send nothing, and let time pass until `enough(now)`, or for `limit_s`."""
+        """Receive without sending for `limit_s`, or until `enough(now)` is true."""
 
         def stage(run: Runner[None]) -> Stage[None]:
             ends_at = run.now + limit_s
             while run.now < ends_at and not run.is_cancelled and not enough(run.now):
-                yield min(run.now + _LOOK_EVERY_S, ends_at)  # what is enough may be a silence
+                yield min(run.now + _LOOK_EVERY_S, ends_at)  # `enough` may wait for a silence
 
         self.run(Runner(stage, bitrate_bps=self.loaded.profile.dialect.bitrate_bps))
 

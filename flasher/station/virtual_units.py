@@ -40,13 +40,13 @@ from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import SERIAL_NUMBER
 
 NO_NUMBER: Final = "NONE"
-"""What a new unit has for a serial number."""
+"""Serial number of a new unit: empty."""
 OTHER_HARDWARE: Final = "V0r0r1_20200101"
 POWER_OFF_S: Final = 1.0
 EXCHANGE_GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
 """How long a socket is empty while its unit is exchanged."""
 SLOW_PROGRAM_S: Final = 0.01
-"""Ten times as long for each packet as a good unit takes."""
+"""Slow units take ten times as long for each packet."""
 SLOW_ERASE_S: Final = 0.02
 _DIGITS: Final = re.compile(r"[0-9]+")
 _SERIALS_TRIED: Final = 2000
@@ -54,7 +54,7 @@ _NUMBERS_TRIED: Final = 10_000
 
 
 class Health(StrEnum):
-    """What a virtual unit is like."""
+    """Health of a virtual unit."""
 
     GOOD = "good"
     SLOW = "slow"
@@ -68,7 +68,7 @@ def _chance(units: MockUnits, what: str, serial: str) -> random.Random:
 
 
 def health_of(units: MockUnits, serial: str) -> Health:
-    """What the unit with this serial number is like."""
+    """Draw the health of the unit with this serial number."""
     chance = random.Random(f"{units.seed} {serial}")  # noqa: S311  a play, no secret
     at = chance.random()
     if at < units.bad:
@@ -119,10 +119,10 @@ class VirtualUnit:
     """A unit that keeps its paper label, its contents and its numbers wherever it is put."""
 
     label: str
-    """On the paper."""
+    """Text of the paper label."""
     health: Health
     devices: Mapping[str, MockDevice]
-    """By their targets; without power while it is in no socket."""
+    """Devices by target; without power while the unit is in no socket."""
 
 
 class _Seat:
@@ -133,7 +133,7 @@ class _Seat:
     def __init__(self, look: Callable[[float], None]) -> None:
         self.device: FaultInjector | None = None
         self.due_at: float | None = None
-        """When the next unit is put in."""
+        """Time at which the next unit is put in."""
         self._look = look
 
     @property
@@ -191,7 +191,7 @@ class VirtualSocket:
         )
         self._left = virtual.count
         self.unit: VirtualUnit | None = None
-        """The one in the socket."""
+        """The unit in the socket."""
         self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
         self._exchanged: set[str] = set()
         self._returns: deque[VirtualUnit] = deque()
@@ -206,17 +206,17 @@ class VirtualSocket:
 
     @property
     def serial(self) -> str:
-        """The label of the unit in the socket; empty: none is."""
+        """The label of the unit in the socket; empty without a unit."""
         return "" if self.unit is None else self.unit.label
 
     @property
     def devices(self) -> Mapping[str, FaultInjector]:
-        """Those of the unit in the socket, by their targets."""
+        """The devices of the unit in the socket, by target."""
         seats = self._seats.items()
         return {name: seat.device for name, seat in seats if seat.device is not None}
 
     def step(self) -> PresenceChanged | None:
-        """Let a unit come or go in its time; None when nothing happened."""
+        """Put a unit in or take it out when it is due. Returns the change, or None."""
         now = self.clock.now()
         if self._next_at is None or now < self._next_at:
             return None
@@ -238,7 +238,7 @@ class VirtualSocket:
         return PresenceChanged(is_there=True, how=how, label=self.serial, is_power_up=True)
 
     def _new_unit(self) -> VirtualUnit | None:
-        """The next one from the box; None when it is empty."""
+        """The next unit; None after the last one."""
         if self._left == 0:
             return None
         if self._left is not None:
@@ -246,7 +246,7 @@ class VirtualSocket:
         return self.make(next(self._serials))
 
     def make(self, label: str) -> VirtualUnit:
-        """The unit with this label, as it comes to the end of the line."""
+        """Make the unit with this label, as it arrives at the end of the line."""
         health, number = health_of(self._virtual.units, label), self._own_number(label)
         devices, now = {}, self.clock.now()
         for target in self._recipe.targets if health is not Health.DEAD else ():
@@ -256,13 +256,13 @@ class VirtualSocket:
         return VirtualUnit(label, health, devices)
 
     def arrive(self, serial: str) -> Health:
-        """Put a new unit with this label in."""
+        """Put in a new unit with this label."""
         unit = self.make(serial)
         self.put(unit)
         return unit.health
 
     def put(self, unit: VirtualUnit) -> None:
-        """Put a unit in. Its power comes with the socket: it passes through its bootloader."""
+        """Put a unit in. The socket powers it, so it starts through its bootloader."""
         self.unit, now = unit, self.clock.now()
         for name, device in unit.devices.items():
             device.power_on(now)
@@ -270,7 +270,7 @@ class VirtualSocket:
         self._exchange_at_operation = self._planned_exchange(unit)
 
     def take_out(self) -> VirtualUnit | None:
-        """Take the unit out, with its power; None: none was in."""
+        """Take the unit out, which switches it off. Returns it; None without one."""
         unit, self.unit, now = self.unit, None, self.clock.now()
         self._exchange_at_operation = None
         for seat in self._seats.values():
@@ -280,7 +280,7 @@ class VirtualSocket:
         return unit
 
     def _planned_exchange(self, unit: VirtualUnit) -> int | None:
-        """During which operation of its flash somebody exchanges this unit; None: nobody does."""
+        """Draw the operation of its flash during which the unit is exchanged; None: none."""
         chance, units = _chance(self._virtual.units, "exchanged", unit.label), self._virtual.units
         was_exchanged = unit.label in self._exchanged
         if not unit.devices or was_exchanged or chance.random() >= units.exchanged:
@@ -291,7 +291,7 @@ class VirtualSocket:
         return unit.devices[name].operations_done + int(packets * chance.uniform(0.2, 0.9))
 
     def _look(self, now: float) -> None:
-        """Exchange the unit, when it is time for it."""
+        """Exchange the unit when it is due."""
         if self._in_hand is not None:
             if now >= self._put_at:
                 self.put(self._in_hand)
@@ -319,8 +319,8 @@ class VirtualSocket:
             seat.due_at = at_s
 
     def _own_number(self, label: str) -> str:
-        """What the unit says that it is: none yet where the recipe gives it its number, else what
-        its label says, as far as it has room for it; another one's where it is mislabelled.
+        """The serial number that the unit reports: none if the recipe writes it, else that of its
+        label, cut to the field's length; of another unit if it is mislabelled.
         """
         chance, units = _chance(self._virtual.units, "label", label), self._virtual.units
         number = label
@@ -337,10 +337,10 @@ class VirtualSocket:
         return number
 
     def run_ended(self) -> None:
-        """The run has ended: the unit leaves after a while."""
+        """Take the unit out a while after the end of its run."""
         self._next_at = self.clock.now() + self._virtual.leave_after_s
         self._exchange_at_operation = None
-        if self._in_hand is not None:  # nobody drove the bus up to the moment
+        if self._in_hand is not None:  # the bus did not run up to the moment of the exchange
             self._look(self._put_at)
 
     # -- the power of the socket ------------------------------------------------------------------
@@ -351,20 +351,20 @@ class VirtualSocket:
                 injector.set(PowerCut(POWER_OFF_S), AtTime(self.clock.now()))
 
     def check(self) -> None:
-        """It never fails."""
+        """Never raises."""
 
 
 def make_device(
     target: Target, dialect: Dialect, health: Health, release: Release, serial_number: str
 ) -> MockDevice:
-    """A device as it comes to the end of the line, with an older application."""
+    """Make a device as it arrives at the end of the line, with an older application."""
     usual = DeviceProfile()
     hardware = usual.hardware_version
     if health is Health.WRONG_HARDWARE:
         hardware = OTHER_HARDWARE
     elif not release.fits_hardware(hardware):
         hardware = release.hardware_versions[0].replace("*", "20220512")[:15]
-    # Room for the image: a device with a smaller flash is made faster.
+    # The flash is as large as the image needs: a device with a smaller one is made faster.
     pages = -(-2 * release.size_bytes // usual.page_size_bytes) + 2
     area_bytes = min(pages * usual.page_size_bytes, usual.application_area_bytes, IMAGE_MAX_SIZE)
     profile = DeviceProfile(
@@ -376,6 +376,6 @@ def make_device(
     if health is Health.SLOW:
         profile = replace(profile, program_time_s=SLOW_PROGRAM_S, erase_time_s=SLOW_ERASE_S)
     if health is Health.REFUSES:
-        # Its product wants a checksum in the image, which this image does not have.
+        # The product requires a checksum in the image, which this image does not have.
         profile = replace(profile, image_checksum="crc32")
     return MockDevice(target, bitrate_bps=dialect.bitrate_bps, profile=profile)

@@ -1,13 +1,12 @@
 """The process of one socket: it opens the adapter, watches for units, and runs them.
 
-It is a process of its own so that an adapter's driver that crashes or hangs takes nothing with it.
-The processes are made by `multiprocessing` with "spawn" on every system: its pipes keep messages
-apart and can be waited for all together on Linux and Windows alike, which the standard streams of
-a subprocess cannot, and a driver that prints to them does no harm.
+It is a process of its own, so that a driver that crashes or hangs affects one socket only.
+`multiprocessing` starts the processes with "spawn" on every system: a station can wait for all of
+their pipes together, on Windows too, and output that a driver prints does no harm.
 
-It writes no records. Everything that has to be on disk is asked of the station (`Ask`), and it does
-nothing until the reply comes. When the pipe breaks, the station is dead: the message under way is
-finished, and there is no further one.
+It writes no records. It asks the station to save everything that has to be on disk (`Ask`), and
+waits for the reply. A broken pipe means that the station is dead: the current message is finished,
+and no further one is sent.
 """
 
 from __future__ import annotations
@@ -66,24 +65,24 @@ IDLE_S: Final = 0.05
 REPLY_LIMIT_S: Final = 60.0
 """Time limit for the station to save something to disk."""
 _LOOK_S: Final = 0.1
-"""Interval between polls of the pipe during a run: between frames it must cost nothing."""
+"""Interval between polls of the pipe during a run, so that they do not delay frames."""
 
 
 class Channel(Protocol):
     """The pipe to the station; `multiprocessing.connection.Connection` is one."""
 
     def send(self, obj: Any, /) -> None:
-        """Raises OSError when the station is gone."""
+        """Raises OSError when the station has ended."""
 
     def recv(self) -> Any:
-        """Raises EOFError when the station is gone."""
+        """Raises EOFError when the station has ended."""
 
     def poll(self, timeout: float = 0.0) -> bool:
-        """True when there is something to receive, or the station is gone."""
+        """True when a message waits, or the station has ended."""
 
 
 class StationGoneError(Exception):
-    """The pipe to the station is broken: nothing can be recorded any more."""
+    """The station has ended: nothing can be recorded."""
 
 
 class StationPipe:
@@ -101,7 +100,7 @@ class StationPipe:
         """Called repeatedly while it waits for the station."""
         self.is_aborted = False
         self.is_over = False
-        """True when the station is gone or has asked the process to end."""
+        """True when the station has ended, or has asked the process to end."""
         self.is_gone = False
 
     def send(self, message: FromWorker) -> None:
@@ -133,25 +132,25 @@ class StationPipe:
             self.is_gone = self.is_over = True
 
     def wait(self, limit_s: float) -> None:
-        """Wait up to `limit_s`; end early when the process is to end."""
+        """Wait up to `limit_s`; returns early when the process has to end."""
         until = self._now() + limit_s
         while self._now() < until and not self.is_over:
             self.look(IDLE_S)
 
     def is_stopped(self) -> bool:
-        """True when a person aborted the run or the station is gone; polled between frames."""
+        """True when a person aborted the run or the station has ended; called between frames."""
         if self._now() - self._looked_at >= _LOOK_S:
             self.look()
         return self.is_aborted or self.is_over
 
     def take_claim(self) -> Claim | None:
-        """The run to make; returned once."""
+        """The claimed run, returned once; None without one."""
         claim, self._claim = self._claim, None
         if claim is not None:
             self.is_aborted = False
         return claim
 
-    # -- the `Journal` of a run, which the station writes ------------------------------------------
+    # -- `Journal` of a run ------------------------------------------------------------------------
 
     def intent(self, target: str, what: str, value: str) -> JournalWrite:
         write = JournalWrite(target, what, value)
@@ -222,7 +221,7 @@ class Worker:
         self._reopen_at = 0.0
 
     def work(self) -> None:
-        """Work until the station ends the process or is gone."""
+        """Work until the station ends the process, or has ended itself."""
         sees = self._virtual is not None or self._presence.sees_units
         self._pipe.send(AdapterReady(self._connection.name, sees))
         if self._virtual is not None:
@@ -330,7 +329,7 @@ class Worker:
             return
         except FlasherError as error:
             result = _error_result(codes.TRACE_NOT_SAVED, error.what)
-        except Exception as error:  # noqa: BLE001  a bug must not cost the socket its process
+        except Exception as error:  # noqa: BLE001  a bug must not end the socket's process
             log_event(error)
             result = _error_result(codes.INTERNAL, f"{type(error).__name__}: {error}")
         if recorder is not None and recorder.failure is None:
