@@ -22,7 +22,7 @@ from flasher.protocol.text import printable
 LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
 _ALSO_RAISED: Final = ("was not properly shut down", "Could not access SocketCAN device")
-"""What python-can logs of a bus that it cannot open, beside the error that it raises: a command
+"""Texts that python-can logs about a bus that it cannot open, besides raising an error: a command
 that waits for an adapter tries again.
 """
 _NOWHERE: Final = logging.NullHandler()

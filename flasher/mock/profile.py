@@ -132,9 +132,9 @@ class DeviceProfile:
     largest_image_bytes: NumberOrNone = None
     """Largest image taken; none: the whole area."""
     page_size_bytes: Number = 2048
-    """What is erased at once."""
+    """Size of a page, the unit of erasing."""
     program_unit_bytes: Number = 8
-    """What is programmed at once; divides a packet."""
+    """Size of the unit of programming; divides the size of a packet."""
     erased_pages: Literal["needed", "all"] = "needed"
     """Pages of the application area erased for an image."""
     erase_time_s: Seconds = 0.002

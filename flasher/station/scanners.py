@@ -1,6 +1,6 @@
-"""Scanners that the station reads itself, wherever the focus of a screen is: Linux input devices,
-which it takes for itself alone, and serial ports. Each is read by a thread, and opened again when
-it comes back.
+"""Scanners that the station reads directly, independent of the focus of a screen: Linux input
+devices, which it grabs, and serial ports. A thread reads each scanner, and opens it again after it
+was unplugged.
 """
 
 from __future__ import annotations

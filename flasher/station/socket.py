@@ -26,7 +26,7 @@ class Source:
     """Origin of scans. Sources with the same name are one."""
 
     name: str = ""
-    """As events and messages have it: "scanner left"."""
+    """Name in events and messages, such as "scanner left"."""
     socket: str = field(default="", compare=False)
     """The socket that it is mounted at."""
 
@@ -224,7 +224,7 @@ class Socket:
         self.is_in_bootloader = what.is_in_bootloader
         is_starting = what.is_power_up or what.is_in_bootloader
         if before is Occupancy.UNKNOWN and self.has_passed and is_starting:
-            # One that has passed runs its application: another one was put in, and nobody listened.
+            # A unit that has passed runs its application: another one was put in, unobserved.
             before = Occupancy.SILENT
         if what.serial is not None:
             self.own, self.is_own_known = what.serial, is_serial
@@ -315,7 +315,7 @@ class Socket:
         is_known = self.occupancy is not Occupancy.UNKNOWN
         is_time = self.begin_at_s is not None and now >= self.begin_at_s and is_known
         if self.binding is Binding.NAMED:
-            # It has arrived, and said who it is or has had the time for it.
+            # It was put in, and has identified itself or had the time to.
             has_arrived = self.is_there and self.begin_at_s is not None
             is_time = has_arrived and (self.own is not None or is_time)
         else:
@@ -346,8 +346,8 @@ class Socket:
             return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None and not self.label:
-            told = last.action if self.note_until_s is None else self.note
-            return _state_after(last.outcome), last.serial, told
+            shown = last.action if self.note_until_s is None else self.note
+            return _state_after(last.outcome), last.serial, shown
         if self.out_of_service is not None:
             state = SocketState.ERROR if self.out_of_service else SocketState.STARTING
             return state, self.label, self.out_of_service or (self.wanted if self.label else "")

@@ -1,9 +1,10 @@
-"""Virtual units: they come into a socket, are good, slow, bad or dead, and leave again. They keep
-their labels, contents and numbers; some are exchanged for another one in the middle of their run
-and come back, and some bear the label of another one.
+"""Virtual units for training, demonstration and tests. They are put into a socket, are good, slow,
+bad or dead, and are taken out again. They keep their labels, contents and numbers. Some are
+exchanged for another one during their run, and put in again later; some have the label of another
+unit.
 
-For training, demonstration and tests. Each socket has a simulated bus of its own at the pace of a
-real one; what is decided about a unit follows from seed and serial number.
+Each socket has a simulated bus of its own, as fast as a real one. Everything about a unit is drawn
+from seed and serial number.
 """
 
 from __future__ import annotations
@@ -102,8 +103,8 @@ def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[st
 
 
 def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Collection[str]]) -> int:
-    """The number after that of the last virtual unit that records know; `known` returns those of
-    some serial numbers that they know.
+    """The number after that of the last virtual unit in the records. `known` returns those of the
+    given serial numbers that are in the records.
     """
     numbers: dict[str, int] = {}
     for number in range(1, _NUMBERS_TRIED):
@@ -126,8 +127,8 @@ class VirtualUnit:
 
 
 class _Seat:
-    """The place of one target's device on the bus of a socket; an engine. `look` is called with
-    every moment at which something happens to it.
+    """The place of one target's device on the bus of a socket; an engine. Calls `look` with the
+    time of each event.
     """
 
     def __init__(self, look: Callable[[float], None]) -> None:
@@ -171,7 +172,7 @@ class _Seat:
 
 
 class VirtualSocket:
-    """A socket with virtual units: a bus, and who comes and goes."""
+    """A socket with virtual units: its bus, and the units that are put in and taken out."""
 
     def __init__(
         self, recipe: LoadedRecipe, virtual: VirtualUnits, clock: Clock | None = None
@@ -195,14 +196,14 @@ class VirtualSocket:
         self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
         self._exchanged: set[str] = set()
         self._returns: deque[VirtualUnit] = deque()
-        """Units that were exchanged for another one in their run, and come back."""
+        """Units that were exchanged for another one in their run, and will be put in again."""
         self._exchange_at_operation: int | None = None
         """The operation of the flash during which the unit is pulled out."""
         self._in_hand: VirtualUnit | None = None
         """The unit that is put in its place, at `_put_at`."""
         self._put_at = 0.0
         self._is_other = False
-        """The unit was put in for another one in a run, and it is not told yet."""
+        """The unit replaced another one during a run, which is not reported yet."""
 
     @property
     def serial(self) -> str:

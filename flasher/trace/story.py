@@ -69,7 +69,7 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class TraceVerdict:
-    """What went wrong (or right), where, the likely cause, and the next step."""
+    """The result of a trace: cause, place, likely reason and next step."""
 
     cause: Cause
     phase: Phase | None
@@ -79,7 +79,7 @@ class TraceVerdict:
     attempt: int
     """From 1; 0 without an upgrade."""
     text: str
-    """What happened, one or two sentences."""
+    """Description of the event, one or two sentences."""
     likely: str = ""
     """Likely cause; empty when nothing needs an explanation."""
     remedy: str = ""

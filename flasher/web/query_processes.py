@@ -34,39 +34,39 @@ HTML: Final = "text/html; charset=utf-8"
 
 @dataclass(frozen=True)
 class Question:
-    """What a page is asked for."""
+    """The request of a page."""
 
     path: str
-    """As its route is written."""
+    """Path of the route."""
     fields: Mapping[str, str] = field(default_factory=dict)
-    """Of the form in the address, without empty ones."""
+    """Query parameters of the URL, without empty ones."""
     run: int = 0
-    """Of a page about one run."""
+    """Number of the run, for a page about one run."""
     language: str = "en"
     token: str = ""
     sign_in: SignIn | None = None
-    """Of who asks."""
+    """Sign-in of the requesting person."""
     body: bytes = b""
-    """What was sent; empty where the page was only asked for."""
+    """Body of a POST request; else empty."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A page, a file to save, or where to go instead."""
+    """The response: a page, a file to save, or a redirection."""
 
     body: bytes = b""
     media_type: str = HTML
     status: int = 200
     file_name: str = ""
-    """Of a file to save."""
+    """Name of a file to save."""
     location: str = ""
-    """Another page of this server."""
+    """Path of another page of this server, for a redirection."""
     after: str = ""
-    """Of a file in parts: where the next one begins, a field of the question for it."""
+    """Start of the next part of a file in parts: a field of the question for it."""
 
 
 class Answering(Protocol):
-    """Who answers questions."""
+    """Answers questions."""
 
     def answer(self, question: Question) -> Answer: ...
 
@@ -75,8 +75,8 @@ Ask = Callable[[Question], Awaitable[Answer]]
 
 
 class QueryProcesses:
-    """Processes that answer. `make` makes who answers in each of them; it and what it makes of are
-    sent there. `close` ends them.
+    """Processes that answer questions. `make` is called in each process, and has to be picklable;
+    `close` ends them.
     """
 
     def __init__(self, make: Callable[[], Answering]) -> None:
@@ -84,14 +84,14 @@ class QueryProcesses:
         self._pool: Any = None
 
     def begin(self) -> None:
-        """Start the processes, which the first question does else."""
+        """Start the processes before the first question."""
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             with deaf_from_birth():
                 self._pool = context.Pool(PROCESSES, _begin, (self._make,))
 
     async def ask(self, question: Question) -> Answer:
-        """The answer to a question. Raises TimeoutError, or what the process raised."""
+        """Answer a question. Raises TimeoutError, and all exceptions of the process."""
         self.begin()
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[Answer] = loop.create_future()
@@ -103,7 +103,7 @@ class QueryProcesses:
         self._pool.apply_async(
             _answer,
             (question,),
-            callback=lambda found: loop.call_soon_threadsafe(resolve, answered.set_result, found),
+            callback=lambda answer: loop.call_soon_threadsafe(resolve, answered.set_result, answer),
             error_callback=lambda error: loop.call_soon_threadsafe(
                 resolve, answered.set_exception, error
             ),
@@ -139,7 +139,7 @@ def _answer(question: Question) -> Answer:
 
 
 def question_of(path: str, request: Request, pages: Pages) -> Question:
-    """What a request asks for; `path` as its route is written."""
+    """Make the question of a request; `path`: the path of its route."""
     fields = {
         name: value.strip()[:FIELD_MAX]
         for name, value in request.query_params.items()

@@ -211,7 +211,7 @@ def test_another_unit_in_the_named_socket_is_not_begun(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A", OTHER)
     assert line.of(RunStarted) == []
-    assert line.text("A").startswith(f"The unit in it says that it is {OTHER}.")
+    assert line.text("A").startswith(f"The unit in it reports {OTHER}.")
     line.leave("A")
     line.arrive("A", SERIAL)
     assert line.last(RunStarted).serial == SERIAL

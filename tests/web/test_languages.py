@@ -261,7 +261,7 @@ def _exchanged_unit(folder: Path) -> UnitBench:
 @each(
     "made, code, shows",
     [
-        (_wrong_unit, "WRONG_UNIT", "The unit says that it is 'W2605009'"),
+        (_wrong_unit, "WRONG_UNIT", "The unit reports 'W2605009'"),
         (_exchanged_unit, "UNIT_CHANGED", "announced its bootloader"),
     ],
 )

@@ -38,7 +38,7 @@ def story_lines(story: Story, *, packets: bool = False) -> Iterator[str]:
         yield from _upgrade_lines(upgrade, packets=packets, is_only=len(story.upgrades) == 1)
     if story.steps:
         yield ""
-        yield "outside of upgrades" if story.upgrades else "what was said"
+        yield "outside of upgrades" if story.upgrades else "messages"
         yield from _step_lines(story.steps, story.steps_left_out)
     yield ""
     yield from _bus_lines(story.bus, story.bitrate_bps)

@@ -207,7 +207,7 @@ def _bit_rate(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]
     wanted = f"{bitrate_bps / 1000:g} kbit/s"
     if seen.bitrate_bps is None:
         if seen.is_up:
-            what = f"the bit rate of {name} is not told; {wanted} is needed"
+            what = f"the bit rate of {name} is not known; {wanted} is needed"
             fix = (f"ip -details link show {name}",)
             yield _note("interface", what, fix)
     elif seen.bitrate_bps != bitrate_bps:

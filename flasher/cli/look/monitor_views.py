@@ -127,12 +127,12 @@ class LineView(MonitorView):
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         # Faults are never cut.
         width = None if seen.is_alarm or self.output.verbosity >= 1 else _VALUE_WIDTH
-        said = ", ".join(
+        values = ", ".join(
             shown.words(width, "*" if shown.name in changed else "") for shown in seen.fields
         )
         mark = "! " if seen.is_trouble else ""
         text = f"{at_s:10.3f}  {seen.can_id:03X}  {seen.route:<9}  {mark}{seen.marked_title}"
-        self.output.result(f"{text}: {said}" if said else text)
+        self.output.result(f"{text}: {values}" if values else text)
         self.output.line(
             SeenLine(
                 at_s=round(at_s, 6),
@@ -203,8 +203,8 @@ class TableView(MonitorView):
             self._live.update(self._view_now(), refresh=True)
 
     def _view_now(self) -> RenderableType:
-        said = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
-        title = f"{self.name}: {said}, {self.troubles:,} with trouble"
+        counts = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
+        title = f"{self.name}: {counts}, {self.troubles:,} with trouble"
         return self._view.draw(self.board, self._last_at, title)
 
 

@@ -388,8 +388,8 @@ class _Upgrade:
 OTHER_IMAGE: Final = "OTHER_IMAGE"
 """Placeholder for another image, after the device refused the one sent."""
 _LEFT_OUT: Final = frozenset({"--timeout", "--trace-file", "--skip-same-version"})
-"""What does not fit: a deadline meant for a device that answers at once (here somebody has to
-switch it off and on), a trace that is evidence now, what `rescue` has not."""
+"""Options that the repair command omits: a deadline for a device that answers at once (a rescue
+waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
 _OF_THE_IMAGE: Final = frozenset(
     {"--format", "--base", "--range", "--fill-gaps-up-to", "--manifest", "--force"}
 )

@@ -220,7 +220,7 @@ def _rows_of(station_name: str, *columns: Any) -> Any:
 
 
 CLAIM: Final = "claim"
-"""What a run was begun with; it stands before the run has ended."""
+"""The digest of a run's claim, stored when the run begins."""
 NAMED: Final = {
     "unit": "serial number or part",
     "station": "the station's name",

@@ -61,7 +61,7 @@ _OPENED: Final = "flasher_file"
 _CHANGE_LIMIT_S: Final = 3600.0
 """Time limit of a server for one statement that changes the schema."""
 _BEFORE_ALEMBIC: Final = 2
-"""The schema of records that have no revision; there are older ones, which nobody has."""
+"""The schema of records without a revision; older schemas are not in use."""
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ def read_only_sqlite(file: Path) -> sqlite3.Connection:
     where possible.
     """
     log = file.with_name(file.name + "-wal")
-    # Without a log nobody writes, and none can be made where the folder is read-only.
+    # Without a log no program writes, and none can be created in a read-only folder.
     is_still = not log.exists() and not os.access(file.parent, os.W_OK)
     uri = f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_still else ''}"
     return sqlite3.connect(uri, uri=True, check_same_thread=False)

@@ -120,7 +120,7 @@ class Refusal(StrEnum):
     WRONG_SERIAL = "WRONG_SERIAL"
     RECIPE_CHANGED = "RECIPE_CHANGED"
     CLOCK = "CLOCK"
-    """The computer's clock is behind what this station has recorded."""
+    """The computer's clock is earlier than the last record of this station."""
 
 
 class ClaimRefusedError(FlasherError):

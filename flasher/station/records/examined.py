@@ -36,7 +36,7 @@ class ExaminedChain:
     """Rows that give up others, with the first and the last of these."""
     version: int | None
     schema: dict[str, str]
-    """What the chain states last of the schema."""
+    """The schema as the chain states it last."""
     first: dict[str, int]
     """The first row of which a place keeps the head."""
 

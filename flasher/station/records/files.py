@@ -97,7 +97,7 @@ class FileStore:
     @contextmanager
     def named(self, file: AttachmentFile) -> Iterator[Path]:
         """The bytes of an attachment under a name of our own with its suffix, for readers that go
-        by the suffix: what stands in the records is nobody's path. Raises RecordError.
+        by the suffix: names in the records are not used as paths. Raises RecordError.
         """
         suffix = _SUFFIX.search(file.name)
         data = self.read(file.sha256)

@@ -48,7 +48,7 @@ def begun_in(chosen: RunFilter, begun_at: ColumnElement[str]) -> list[ColumnElem
 
 
 def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any]]]:
-    """What a filter names and few rows have, by the column of the run: the ids that it allows."""
+    """For each name in a filter, the column of the run and a query of the ids that it allows."""
     lot, recipe, socket, run = schema.lot.c, schema.recipe.c, schema.socket.c, schema.run.c
     if chosen.lot is not None:
         yield run.lot_id, select(lot.id).where(lot.name == chosen.lot)

@@ -122,9 +122,8 @@ class HeadsFile:
         return next((each for each in self.entries() if isinstance(each, ChainHead)), None)
 
     def entries(self, after: int = 0) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
-        """What is kept, in the order in which it was; closed segments up to the audit row `after`
-        are left out. Half a line at the end, which a station may be writing, is left out too.
-        Raises as `last`.
+        """All entries in order, without closed segments up to the audit row `after`, and without an
+        incomplete last line, which a station may be writing. Raises as `last`.
         """
         previous = _NO_SEGMENT
         last = self._last_segment()

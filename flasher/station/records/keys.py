@@ -2,7 +2,7 @@
 
 Whoever can write the database but has no key cannot make a chain that verifies. The chain alone
 cannot show that its end was cut off, or that it is an older copy; heads in another, append-only
-place can. Heads beside the key show it only while nobody else can write there.
+place can. Heads beside the key show it only while no other person can write there.
 """
 
 from __future__ import annotations

@@ -37,9 +37,9 @@ from flasher.station.records.model import (
 )
 
 _BURST_QUIET_S: Final = 0.3
-"""An announcement after so much silence begins another burst."""
+"""Silence after which an announcement begins another burst."""
 _LEFTOVER_S: Final = 0.25
-"""Announcements up to here after request transfer may have been on their way."""
+"""Time after a transfer request in which announcements may still arrive."""
 _STALL_S: Final = 3.0
 """The same where nothing came between, as frames that waited in a stalled computer bear the time at
 which they were read."""
@@ -48,13 +48,13 @@ _IDENTITY: Final = ("model", "serial_number", "hardware_version")
 
 @dataclass
 class Restarts:
-    """When the bootloader of one target announced itself, and nothing in the trace had caused it.
-    Times are seconds on the trace's clock.
+    """Finds announcements of one target's bootloader that nothing in the trace has caused. Times
+    are seconds on the trace's clock.
     """
 
     uncaused: list[float] = field(default_factory=list)
     is_identified: bool = False
-    """It has answered, or was told to update: it has to stay."""
+    """It has answered, or got an update command: from now on it has to stay."""
     _has_acted: bool = False
     """The tool has sent something after which it may restart."""
     _is_running: bool = False
@@ -125,29 +125,29 @@ class _Usual(NamedTuple):
 
 @dataclass
 class TraceOfTarget:
-    """What a trace shows of one target."""
+    """The events of one target in a trace."""
 
     target: Target
     packets: dict[int, bytes] = field(default_factory=dict)
     size_bytes: int = 0
     sent_sha256: str | None = None
-    """Of the last image that was sent to its end."""
+    """SHA-256 of the last image that was sent completely."""
     is_complete: bool = False
-    """The device said so, after that."""
+    """The device confirmed that image."""
     version: str | None = None
-    """As answered last."""
+    """Version in its last answer."""
     serial: str = ""
-    """As answered last; empty while it names none."""
+    """Serial number in its last answer; empty without one."""
     written_serial: str | None = None
     answers: list[bytes] = field(default_factory=list)
-    """The data of all other answers: products may have queries of their own."""
+    """Data of all unknown answers: products may have queries of their own."""
     restarts: Restarts = field(default_factory=Restarts)
     changes: list[str] = field(default_factory=list)
-    """Fields that name the unit, and became what the tool had not written."""
+    """Identity fields that changed to a value that the tool had not written."""
     _identity: dict[str, str] = field(default_factory=dict)
-    """As answered last."""
+    """Identity fields of its last answer."""
     _written: dict[str, set[str]] = field(default_factory=dict)
-    """What the tool has written to these fields."""
+    """Values that the tool has written to these fields."""
 
     def __post_init__(self) -> None:
         self._watcher = TargetWatcher(_Usual(self.target, Profile(self.target)))
@@ -229,7 +229,7 @@ class TraceOfTarget:
 def traces_of_targets(
     targets: Iterable[str], frames: Iterable[tuple[float, Frame]]
 ) -> dict[str, TraceOfTarget]:
-    """What a trace shows of these targets."""
+    """Read the events of these targets from the frames of a trace."""
     traces = {name: TraceOfTarget(TARGETS[name]) for name in targets if name in TARGETS}
     # The CAN ids on which a node speaks.
     ids_of = {
@@ -266,27 +266,27 @@ def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Ite
     run = details.run
     flashed = {write.target for write in details.writes if write.what == FLASH}
     for target in details.targets:
-        said = traces.get(target.target)
-        if said is None:
+        trace = traces.get(target.target)
+        if trace is None:
             yield f"there is no device {printable(target.target)}"
             continue
         if target.target in flashed:
-            yield from _image(target, said)
+            yield from _image(target, trace)
         is_read_back = target.reached is not None and target.reached >= Verified.VERSION
-        if is_read_back and target.version and not said.names(target.version):
-            answered = printable(said.version or "none")
+        if is_read_back and target.version and not trace.names(target.version):
+            answered = printable(trace.version or "none")
             yield f"the {target.target} answers version {answered}, not {target.version}"
-        if said.serial and said.serial != run.serial:
-            yield f"it is of the unit {printable(said.serial)}, not of {printable(run.serial)}"
-        for name in dict.fromkeys(said.changes):
+        if trace.serial and trace.serial != run.serial:
+            yield f"it is of the unit {printable(trace.serial)}, not of {printable(run.serial)}"
+        for name in dict.fromkeys(trace.changes):
             yield f"the {name} of the {target.target} changed: it is of two units"
     yield from _restarts(details, traces)
     for write in details.writes:
-        said = traces.get(write.target)
-        if write.what == SERIAL_NUMBER and said is not None:
-            if said.written_serial != run.serial:
+        trace = traces.get(write.target)
+        if write.what == SERIAL_NUMBER and trace is not None:
+            if trace.written_serial != run.serial:
                 yield f"the serial number {printable(run.serial)} is not written in it"
-            if not said.serial:
+            if not trace.serial:
                 yield f"the serial number {printable(run.serial)} is not read back in it"
 
 
@@ -300,10 +300,10 @@ def _restarts(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator
     if AFTER_RESTART in measured or (is_switched and known is None):
         return  # it was allowed to; records of before this was counted
     cycles = 0 if known is None else int(known.value or 0)
-    for name, said in traces.items():
+    for name, trace in traces.items():
         # The battery supplies the others, and restarts for causes of its own.
-        is_supplied = BMS.name in traces and said.target is not BMS
-        uncaused = [] if is_supplied else said.restarts.uncaused[cycles:]
+        is_supplied = BMS.name in traces and trace.target is not BMS
+        uncaused = [] if is_supplied else trace.restarts.uncaused[cycles:]
         for at_s in uncaused[:1]:
             yield (
                 f"the {name} announced its bootloader {at_s:.1f} s after the beginning, and nothing"
@@ -311,10 +311,10 @@ def _restarts(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator
             )
 
 
-def _image(target: TargetRecord, said: TraceOfTarget) -> Iterator[str]:
-    if said.sent_sha256 is None:
+def _image(target: TargetRecord, trace: TraceOfTarget) -> Iterator[str]:
+    if trace.sent_sha256 is None:
         yield f"it holds no whole transfer to the {target.target}"
-    elif said.sent_sha256 != target.image_sha256:
-        yield f"it carries another image for the {target.target}, of SHA-256 {said.sent_sha256}"
-    elif not (said.is_complete or (target.version and said.names(target.version))):
+    elif trace.sent_sha256 != target.image_sha256:
+        yield f"it carries another image for the {target.target}, of SHA-256 {trace.sent_sha256}"
+    elif not (trace.is_complete or (target.version and trace.names(target.version))):
         yield f"the {target.target} neither says complete nor names its version"

@@ -35,14 +35,14 @@ _EVERYTHING: Final = RunFilter()
 VERIFIED: Final = case(
     {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
 ).label("verified")
-"""How far a run was verified, by its word."""
+"""Verification level of a run, as a word."""
 _DETAILS: Final = TypeAdapter(RunDetails)
 _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
-"""What every run names."""
+"""Columns with a name that every run has."""
 
 
 class Records:
-    """What the records say. Every method raises RecordError when they cannot be read."""
+    """Queries of the records. Every method raises RecordError when they cannot be read."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -90,7 +90,7 @@ def grant_again(connection: Connection) -> None:
 
 
 def _grants(schema: str, *, readers: str, stations: str) -> Iterator[str]:
-    """What those who read (stations too) and `stations` may do; both may be empty."""
+    """Grants for `readers` (stations too) and for `stations`; both may be empty."""
     if readers:
         yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {readers}"
     if stations:

@@ -41,8 +41,8 @@ class _Connection(psycopg.Connection[Any]):
         except psycopg.OperationalError:
             if self.pgconn.transaction_status != TransactionStatus.ACTIVE:
                 raise
-            self.pgconn.finish()  # nobody knows what it still does
-            raise psycopg.OperationalError(f"the server said nothing for {limit_s:g} s") from None
+            self.pgconn.finish()  # the state of the connection is unknown
+            raise psycopg.OperationalError(f"the server sent nothing for {limit_s:g} s") from None
 
 
 def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None = None) -> Engine:

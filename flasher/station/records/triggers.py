@@ -183,13 +183,13 @@ def _rules() -> Iterator[Rule]:
     for (table, at), rules in _OF_TABLES.items():
         event, _, to = at.partition(" to ")
         begin = f"NEW.state = '{to}' AND " if to else ""
-        for name, (when, said) in rules.items():
-            yield Rule(name, table, event, begin + when, said)
+        for name, (when, message) in rules.items():
+            yield Rule(name, table, event, begin + when, message)
     for table, over in _PARTS.items():  # no part of a finished run is added, changed or taken away
-        said = f"a finished run is immutable: {table}"
+        message = f"a finished run is immutable: {table}"
         old, new = over.format(row="OLD"), over.format(row="NEW")
-        yield Rule(f"{table}_insert", table, "INSERT", new, said)
-        yield Rule(f"{table}_update", table, "UPDATE", f"{old} OR {new}", said)
+        yield Rule(f"{table}_insert", table, "INSERT", new, message)
+        yield Rule(f"{table}_update", table, "UPDATE", f"{old} OR {new}", message)
         yield Rule(f"{table}_delete", table, "DELETE", _ALWAYS, _NOT_DELETED)
     for table in _NAMED:
         yield Rule(f"{table}_update", table, "UPDATE", _ALWAYS, f"a {table} is final")

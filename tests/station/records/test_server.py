@@ -75,7 +75,7 @@ def test_a_server_that_hangs_is_given_up_and_used_again_when_it_works(
                 os.kill(sessions[0], signal.SIGSTOP)
                 connection.exec_driver_sql("SELECT 1")
         os.kill(sessions[0], signal.SIGCONT)
-        assert "said nothing for 0.4 s" in caught.value.cause
+        assert "sent nothing for 0.4 s" in caught.value.cause
     bench.store.note(AuditEvent.RESUME, {})
 
 
