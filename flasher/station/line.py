@@ -87,14 +87,18 @@ NOTE_S: Final = 15.0
 _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
-_FORGOTTEN: Final = "FORGOTTEN"
 _AGAIN: Final = text("Scan it again.")
 _NOTHING: Final = text("Nothing to do.")
-_CHANGED: Final = (
+_CHANGED: Final = Refused(
     codes.UNIT_CHANGED.name,
     text("The unit was exchanged, or had no power."),
     text("See which unit it is, then scan again."),
 )
+
+
+def _forgotten(reason: str, remedy: str = _AGAIN) -> Refused:
+    """The refusal of a scan that was accepted and is dropped."""
+    return Refused("FORGOTTEN", reason, remedy)
 
 
 # -- inputs and effects ---------------------------------------------------------------------------
@@ -254,7 +258,7 @@ class Line:
             socket.out_since_s = now
         socket.out_of_service = what.reason or text("It cannot work.")
         reason = text("Socket {socket} is out of service.", socket=socket.name)
-        self._drop_scans(socket, _FORGOTTEN, reason, text("Scan it again when it works again."))
+        self._drop_scans(socket, _forgotten(reason, text("Scan it again when it works again.")))
         # The socket cannot be observed now. A unit that was silent before stays doubtful.
         socket.own, socket.is_own_known, socket.presence_number = None, False, 0
         if socket.occupancy is not Occupancy.SILENT:
@@ -265,18 +269,18 @@ class Line:
         socket.presence_number = what.number
         if not what.is_there:
             reason = text("Its unit sends nothing any more.")
-            remedy = text("Scan it again when it is connected.")
-            self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
+            why = _forgotten(reason, text("Scan it again when it is connected."))
+            self._silent(socket, now, why, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
-            code, reason, remedy = _CHANGED
+            why = _CHANGED
             if what.was_missed and not what.is_power_up:
-                code = codes.NOT_OBSERVED.name
                 reason = text("This computer stalled, and did not see whether the unit stayed.")
-            self._silent(socket, now, code, reason, remedy, is_certain=False)
+                why = Refused(codes.NOT_OBSERVED.name, reason, _CHANGED.remedy)
+            self._silent(socket, now, why, is_certain=False)
         elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
             # It may have come after its card or label was scanned, in place of a silent one.
-            self._drop_for(socket, now, *_CHANGED, keeps_label=socket.binding is Binding.NAMED)
+            self._drop_for(socket, now, _CHANGED, keeps_label=socket.binding is Binding.NAMED)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.note_unit(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
@@ -299,16 +303,7 @@ class Line:
         elif is_new:
             self._arrived_elsewhere(socket)
 
-    def _silent(
-        self,
-        socket: Socket,
-        now: float,
-        code: str,
-        reason: str,
-        remedy: str,
-        *,
-        is_certain: bool,
-    ) -> None:
+    def _silent(self, socket: Socket, now: float, why: Refused, *, is_certain: bool) -> None:
         """The unit may have been removed: drop the scans for it."""
         # No unit came for its label yet, or the unit reported another serial number.
         awaits = socket.begin_at_s is None or socket.is_of_another(socket.label)
@@ -318,37 +313,25 @@ class Line:
         self._emit(UnitRemoved(socket.name))
         if awaits:
             socket.begin_at_s = None
-        self._drop_for(socket, now, code, reason, remedy, keeps_label=awaits)
+        self._drop_for(socket, now, why, keeps_label=awaits)
 
-    def _drop_for(
-        self,
-        socket: Socket,
-        now: float,
-        code: str,
-        reason: str,
-        remedy: str,
-        *,
-        keeps_label: bool,
-    ) -> None:
+    def _drop_for(self, socket: Socket, now: float, why: Refused, *, keeps_label: bool) -> None:
         """Drop the scans for a unit, and show that on its socket for a while."""
-        if self._drop_scans(socket, code, reason, remedy, keeps_label=keeps_label):
-            socket.note = text("{reason} {remedy}", reason=reason, remedy=remedy)
+        if self._drop_scans(socket, why, keeps_label=keeps_label):
+            socket.note = text("{reason} {remedy}", reason=why.reason, remedy=why.remedy)
             socket.note_until_s = now + NOTE_S
 
     def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
         if not borne and now < socket.bound_at_s + REACH_S:
-            self._drop_label(
-                socket,
-                _FORGOTTEN,
-                text("A unit was in socket {socket} already.", socket=socket.name),
-                text("Scan it again with the card of its socket."),
-            )
+            reason = text("A unit was in socket {socket} already.", socket=socket.name)
+            remedy = text("Scan it again with the card of its socket.")
+            self._drop_label(socket, _forgotten(reason, remedy))
         elif borne and borne != socket.label:
             reason = text(
                 "The unit in socket {socket} bears {label}.", socket=socket.name, label=borne
             )
-            remedy = text("Scan {label}.", label=borne)
-            self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket, socket.source)
+            why = Refused("OTHER_UNIT", reason, text("Scan {label}.", label=borne))
+            self._refuse(socket.let_go(), why, socket, socket.source)
         else:
             # The unit may have woken up: identify it before anything begins.
             socket.begin_at_s = now if borne else now + IDENTIFY_S
@@ -377,7 +360,7 @@ class Line:
 
     def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
         serial, socket.phase, socket.serial = socket.serial, SocketPhase.REST, ""
-        self._refuse(serial, what.code, what.reason, what.remedy, socket, socket.source)
+        self._refuse(serial, Refused(what.code, what.reason, what.remedy), socket, socket.source)
         socket.note = text("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
         if what.stops_line:
             self.stop(what.code, what.reason, what.remedy)
@@ -433,7 +416,7 @@ class Line:
             # A PIN typed too late or too often: no message may show it.
             reason = text("No PIN is awaited, and it is no serial number of this recipe.")
             remedy = text("Scan first what needs the PIN.")
-            self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, remedy, source=source)
+            self._refuse(HIDDEN, Refused("NO_PIN_AWAITED", reason, remedy), source=source)
         else:
             self._answer(
                 printable(scanned)[:80], source, lambda: self._understand(raw, waiting, now)
@@ -447,7 +430,7 @@ class Line:
         try:
             meaning, socket = understand()
         except Refused as refused:
-            self._refuse(shown, refused.code, refused.reason, refused.remedy, source=source)
+            self._refuse(shown, refused, source=source)
         else:
             if meaning not in (_RESUME, _REPRINT, _PIN):  # other events report the result
                 name = "" if socket is None else socket.name
@@ -502,24 +485,21 @@ class Line:
     def _take_pin(self, asked: Asked, scanned: str, source: Source, now: float) -> None:
         """Handle a scan while a PIN is awaited; it is never shown."""
         if scanned.upper() == Word.CANCEL.value:
-            self._end_pin(asked, "CANCELLED", text("It was cancelled."), _NOTHING)
+            self._end_pin(asked, Refused("CANCELLED", text("It was cancelled."), _NOTHING))
         elif is_form(scanned):
             name = asked.person.name
             if remedy := self._crew.lock_words(name, source, now):
                 reason = text("Too many wrong PINs of {name}.", name=printable(name))
-                self._refuse(HIDDEN, "PIN_LOCKED", reason, remedy, source=source)
+                self._refuse(HIDDEN, Refused("PIN_LOCKED", reason, remedy), source=source)
                 return
             self._crew.count_try(name, source, now)
             self._pin_from = source
             self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
         else:
-            self._refuse(
-                HIDDEN,
-                "NO_PIN",
-                text("That is no PIN: it has {form}.", form=FORM_WORDS),
-                text("Type the PIN of {name}, or scan CANCEL.", name=printable(asked.person.name)),
-                source=source,
-            )
+            reason = text("That is no PIN: it has {form}.", form=FORM_WORDS)
+            name = printable(asked.person.name)
+            remedy = text("Type the PIN of {name}, or scan CANCEL.", name=name)
+            self._refuse(HIDDEN, Refused("NO_PIN", reason, remedy), source=source)
 
     def pin_checked(self, now: float, *, is_right: bool) -> None:
         """Result of `CheckPin`."""
@@ -539,17 +519,18 @@ class Line:
                 lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)),
             )
         elif remedy := crew.lock_words(asked.person.name, source, now):
-            self._end_pin(asked, "PIN_LOCKED", text("Too many wrong PINs."), remedy)
+            self._end_pin(asked, Refused("PIN_LOCKED", text("Too many wrong PINs."), remedy))
         else:
             remedy = text("Type it again, or scan CANCEL.")
-            self._refuse(HIDDEN, "WRONG_PIN", text("The PIN is wrong."), remedy, source=source)
+            wrong = Refused("WRONG_PIN", text("The PIN is wrong."), remedy)
+            self._refuse(HIDDEN, wrong, source=source)
         self._go_on(now)
 
-    def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
+    def _end_pin(self, asked: Asked, why: Refused) -> None:
         """Refuse the override that waited for its PIN."""
         self._crew.asked = None
         self._emit(PinEnded(asked.person.name, is_right=False))
-        self._refuse(printable(asked.text)[:80], code, reason, remedy)
+        self._refuse(printable(asked.text)[:80], why)
 
     # -- labels and commands ----------------------------------------------------------------------
 
@@ -566,8 +547,7 @@ class Line:
         placed = place(self.sockets, serial, waiting.source)
         for other in self._waiting.values():
             if other.label == serial and other is not waiting:  # its last scan counts
-                reason = text("It was scanned elsewhere.")
-                self._drop_waiting(other, _FORGOTTEN, reason, _NOTHING)
+                self._drop_waiting(other, _forgotten(text("It was scanned elsewhere."), _NOTHING))
         if placed is None:
             self._keep_waiting(serial, waiting, now)
             return None
@@ -617,8 +597,8 @@ class Line:
         )
         for other in self._waiting.values():
             if other.card is socket and other is not waiting:
-                self._drop_waiting(other, _FORGOTTEN, reason, _AGAIN)
-        self._drop_label(socket, _FORGOTTEN, reason, _AGAIN)  # was scanned for it before
+                self._drop_waiting(other, _forgotten(reason))
+        self._drop_label(socket, _forgotten(reason))  # was scanned for it before
         waiting.forget()
         self._bind(socket, serial, Binding.SAID, now, waiting.source)
         if was_here:
@@ -723,8 +703,7 @@ class Line:
         socket = self._named(argument)
         check_free(socket)
         reason = text("Socket {socket} is free.", socket=socket.name)
-        remedy = text("Scan it again when it is connected.")
-        self._drop_scans(socket, _FORGOTTEN, reason, remedy)
+        self._drop_scans(socket, _forgotten(reason, text("Scan it again when it is connected.")))
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
             socket.occupancy = Occupancy.EMPTY
@@ -787,7 +766,7 @@ class Line:
         if refused is None:
             self._emit(ScanAccepted(text, _REPRINT))
         else:
-            self._refuse(text, refused.code, refused.reason, refused.remedy)
+            self._refuse(text, refused)
 
     def _resume(self, _argument: str, _now: float, _waiting: Waiting) -> None:
         if self.stopped is None:
@@ -807,12 +786,8 @@ class Line:
                 if socket.awaits_label and socket.borne:  # it was refused meanwhile
                     self._scan_borne(socket, socket.borne, now)
         else:
-            self._refuse(
-                word,
-                "STILL_NOT_SAVED",
-                text("It still cannot be saved."),
-                text("Repair the cause first."),
-            )
+            reason = text("It still cannot be saved.")
+            self._refuse(word, Refused("STILL_NOT_SAVED", reason, text("Repair the cause first.")))
         self._go_on(now)
 
     # -- the time, and due actions ----------------------------------------------------------------
@@ -820,14 +795,12 @@ class Line:
     def tick(self, now: float) -> None:
         for waiting in tuple(self._waiting.values()):
             if waiting.forget_at_s is not None and now >= waiting.forget_at_s:
-                self._drop_waiting(
-                    waiting,
-                    _FORGOTTEN,
+                reason = (
                     text("No card of a socket was scanned for it.")
                     if waiting.label
-                    else text("No label was scanned for it."),
-                    _AGAIN,
+                    else text("No label was scanned for it.")
                 )
+                self._drop_waiting(waiting, _forgotten(reason))
                 waiting.is_in_doubt = False
             if waiting.is_in_doubt and waiting.forget_at_s is None:
                 waiting.forget_at_s = now + SCAN_LIMIT_S
@@ -835,14 +808,14 @@ class Line:
                 del self._waiting[waiting.source.name]
         asked = self._crew.asked
         if asked is not None and not self.is_checking_pin and now >= asked.until_s:
-            self._end_pin(asked, "NO_PIN", text("No PIN came."), _AGAIN)
+            self._end_pin(asked, Refused("NO_PIN", text("No PIN came."), _AGAIN))
         for socket in self.sockets.values():
             if socket.out_of_service and now - socket.out_since_s >= SHORT_OUTAGE_S:
                 socket.is_last_there = False
             waits = socket.label and socket.begin_at_s is None and socket.phase is SocketPhase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
-                reason = text("Its unit did not come.")
-                self._drop_label(socket, _FORGOTTEN, reason, text("Scan it again with its unit."))
+                remedy = text("Scan it again with its unit.")
+                self._drop_label(socket, _forgotten(text("Its unit did not come."), remedy))
             if socket.note_until_s is not None and now >= socket.note_until_s:
                 self._clear_drop_note(socket)
         self._go_on(now)
@@ -883,29 +856,27 @@ class Line:
         elif why is Binding.SAID or (why is Binding.ONLY and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
-    def _drop_scans(
-        self, socket: Socket, code: str, reason: str, remedy: str, *, keeps_label: bool = False
-    ) -> bool:
+    def _drop_scans(self, socket: Socket, why: Refused, *, keeps_label: bool = False) -> bool:
         """Drop the card and the label that wait at a socket; False without any."""
         cards = [each for each in self._waiting.values() if each.card is socket]
         for waiting in cards:
-            self._drop_waiting(waiting, code, reason, remedy)
-        is_label = not keeps_label and self._drop_label(socket, code, reason, remedy)
+            self._drop_waiting(waiting, why)
+        is_label = not keeps_label and self._drop_label(socket, why)
         return bool(cards) or is_label
 
-    def _drop_label(self, socket: Socket, code: str, reason: str, remedy: str) -> bool:
+    def _drop_label(self, socket: Socket, why: Refused) -> bool:
         label = socket.let_go()
         if label:
-            self._refuse(label, code, reason, remedy, socket, socket.source)
+            self._refuse(label, why, socket, socket.source)
         return bool(label)
 
-    def _drop_waiting(self, waiting: Waiting, code: str, reason: str, remedy: str) -> None:
+    def _drop_waiting(self, waiting: Waiting, why: Refused) -> None:
         """Drop the waiting scan of a source, and report it there. A label that follows a dropped
         card must not go elsewhere.
         """
         text, card = waiting.text, waiting.card
         if text:
-            self._refuse(text, code, reason, remedy, card, waiting.source)
+            self._refuse(text, why, card, waiting.source)
         self._forget_card(waiting)
         if card is not None:
             waiting.is_in_doubt, waiting.forget_at_s = True, None
@@ -920,28 +891,28 @@ class Line:
             else text("The unit in socket {socket} does not identify itself.", socket=socket.name)
         )
         remedy = text("Scan SOCKET {socket}, then the label.", socket=socket.name)
-        self._drop_label(socket, "NOT_IDENTIFIED", reason, remedy)
+        self._drop_label(socket, Refused("NOT_IDENTIFIED", reason, remedy))
 
     def _forget_card(self, waiting: Waiting) -> None:
         """Forget the waiting scan, and the label that waited at its socket."""
         card = waiting.card
         waiting.forget()
         if card is not None:
-            why = text("SOCKET {socket} was scanned, and not its label.", socket=card.name)
-            self._drop_label(card, _FORGOTTEN, why, text("Scan it again with the card."))
+            reason = text("SOCKET {socket} was scanned, and not its label.", socket=card.name)
+            self._drop_label(card, _forgotten(reason, text("Scan it again with the card.")))
 
     @staticmethod
     def _clear_drop_note(socket: Socket) -> None:
         if socket.note_until_s is not None:
             socket.note, socket.note_until_s = "", None
 
-    def drop_all(self, code: str, reason: str, remedy: str) -> None:
+    def drop_all(self, why: Refused) -> None:
         """Drop every card and label that waits."""
         for waiting in self._waiting.values():
-            self._drop_waiting(waiting, code, reason, remedy)
+            self._drop_waiting(waiting, why)
             waiting.is_in_doubt = False
         for socket in self.sockets.values():
-            self._drop_label(socket, code, reason, remedy)
+            self._drop_label(socket, why)
 
     def stop(self, code: str, reason: str, remedy: str) -> None:
         """Start no run until RESUME. Labels are dropped, since units may be swapped meanwhile."""
@@ -949,8 +920,8 @@ class Line:
             return
         self.stopped = LineStopped(code, reason, remedy)
         self._emit(self.stopped)
-        reason = text("The line was stopped.")
-        self.drop_all(_FORGOTTEN, reason, text("Scan it again when it goes on."))
+        remedy = text("Scan it again when it goes on.")
+        self.drop_all(_forgotten(text("The line was stopped."), remedy))
 
     def _is_serial(self, text: str) -> bool:
         try:
@@ -965,17 +936,11 @@ class Line:
         self._effects.append(event)
 
     def _refuse(
-        self,
-        text: str,
-        code: str,
-        reason: str,
-        remedy: str,
-        socket: Socket | None = None,
-        source: Source = UNNAMED,
+        self, text: str, why: Refused, socket: Socket | None = None, source: Source = UNNAMED
     ) -> None:
         name = "" if socket is None else socket.name
-        self._emit(ScanRefused(text, code, reason, remedy, name, source.name))
-        self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
+        self._emit(ScanRefused(text, why.code, why.reason, why.remedy, name, source.name))
+        self._audit(AuditEvent.REFUSED_SCAN, text=text, code=why.code, socket=name)
 
     def _audit(self, what: AuditEvent, **data: str) -> None:
         self._effects.append(Audit(what, self._with_author(data)))
@@ -991,7 +956,7 @@ class Line:
         try:
             self._check_label(label)
         except Refused as refused:
-            self._refuse(label, refused.code, refused.reason, refused.remedy, socket)
+            self._refuse(label, refused, socket)
         else:
             self._emit(ScanAccepted(label, "label", socket.name))
             self._bind(socket, label, Binding.SAID, now, UNNAMED)

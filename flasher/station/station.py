@@ -219,7 +219,7 @@ class Station:
     def drop_waiting(self) -> None:
         """Drop the cards and labels that wait. Called in the station's thread."""
         remedy = text("Scan it again when the station runs.")
-        self.line.drop_all(SCANS_ENDED, text("The scans have ended."), remedy)
+        self.line.drop_all(Refused(SCANS_ENDED, text("The scans have ended."), remedy))
         self._carry_out()
 
     def stop(self) -> None:
