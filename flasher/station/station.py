@@ -110,7 +110,7 @@ class Station:
     from one.
     """
 
-    def __init__(  # noqa: PLR0913  what a station is made of
+    def __init__(  # noqa: PLR0913  all parts of a station
         self,
         store: Store,
         recipe: LoadedRecipe,
@@ -154,7 +154,7 @@ class Station:
         self._checked: deque[bool] = deque()
         """Results of PIN checks that the line has not received yet."""
         self.checker = checker or pins.checker()
-        """Checks PINs in a thread of its own."""
+        """Executor that checks PINs in a thread."""
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
         self._is_stopping = False
@@ -309,7 +309,7 @@ class Station:
         )
         return self.store.read.figures(chosen)
 
-    # -- the line and the world -------------------------------------------------------------------
+    # -- inputs and effects of the line -----------------------------------------------------------
 
     @property
     def _now(self) -> float:
@@ -320,7 +320,7 @@ class Station:
         try:
             at = self.clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
             self._on_event(replace(event, at=at))
-        except Exception as error:  # noqa: BLE001  who looks on must not stop the line
+        except Exception as error:  # noqa: BLE001  a failing view must not stop the line
             log_event(error)
 
     def _feed(self, socket: str, what: line.SocketInput) -> None:
@@ -395,7 +395,9 @@ class Station:
                 socket.interrupted = run.serial
 
     def _end_unknown(self) -> bool:
-        """End runs whose claim was saved although it seemed lost; False when that is not saved."""
+        """End runs whose claims were saved although an error was reported. Returns False when the
+        end cannot be saved.
+        """
         known = {run.claim.run_id for run in self._runs.values()}
         try:
             self._find_interrupted(self.store.end_unknown(known))
@@ -550,7 +552,7 @@ class Station:
             self._print(socket, claim)
         return True
 
-    # -- labels: nothing of them touches a verdict ------------------------------------------------
+    # -- labels (without effect on verdicts) -------------------------------------------------------
 
     def _print(self, socket: str, claim: Claim) -> None:
         """Print the label of a unit whose PASS is on disk."""

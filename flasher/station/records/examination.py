@@ -145,7 +145,7 @@ class Examiner:
         with self._database.reading() as connection:
             if self._since is not None and not _is_as_examined(connection, self._since):
                 self._remarks.append(
-                    f"what was examined on {self._since.at[:10]} is not there as it was: everything"
+                    f"records that were examined on {self._since.at[:10]} have changed: everything"
                     " is examined again"
                 )
                 self._since = None
@@ -154,8 +154,8 @@ class Examiner:
                 self.examined = self._found_good(connection, records_id, now)
         if self._nameless:
             self._remarks.append(
-                f"{self._nameless} PASS of devices that name no serial number: their traces do not"
-                " tell which unit it was"
+                f"{self._nameless} PASS of devices that report no serial number: their traces do"
+                " not identify the unit"
             )
         return Examination(
             problems,
@@ -344,7 +344,7 @@ class Examiner:
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
     ) -> Iterator[Problem]:
-        """Go along one chain; fills what was found of it."""
+        """Check the rows of one chain in order; yields problems and fills in `trail`."""
         before = chain.GENESIS
         if self._since is not None and trail.begin:
             before = self._since.chains[trail.station].hash
@@ -382,8 +382,8 @@ class Examiner:
     # -- one run ----------------------------------------------------------------------------------
 
     def examine_run(self, run_id: RunId) -> RunExamination:
-        """Examine one run with its audit rows and what is kept of them, without going through all
-        records. Raises RecordError.
+        """Examine one run with its audit rows and their stored heads, without reading all records.
+        Raises RecordError.
         """
         with self._database.reading() as connection:
             records_id = _records_id(connection)

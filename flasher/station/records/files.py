@@ -129,7 +129,7 @@ class FileStore:
                 what = "An attachment is missing."
                 raise RecordsDamagedError(what, where=shown, remedy=remedy) from error
         if hashlib.sha256(data).hexdigest() != sha256:
-            what = "An attachment is not what was stored: its hash differs."
+            what = "An attachment was changed after it was stored: its hash differs."
             raise RecordsDamagedError(what, where=shown, remedy=remedy)
         return data
 

@@ -300,7 +300,7 @@ def _write(path: Path, lines: list[str]) -> None:
                 rest = rest[file.write(rest) :]
             os.fsync(file.fileno())
         except OSError:
-            with suppress(OSError):  # what is kept next would make a fault of half a line
+            with suppress(OSError):  # the next entry must not follow half a line
                 file.truncate(size)
             raise
     if is_new:

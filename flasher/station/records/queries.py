@@ -181,8 +181,8 @@ class Records:
 
 
 def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
-    """The runs that a condition chooses, with their parts, in the order of their ids; one that
-    names what is not there is left out. Raises ValidationError for what no station writes.
+    """The runs of a condition with their parts, in the order of their ids, without runs that refer
+    to missing rows. Raises ValidationError for values that no station writes.
     """
     run_ids = connection.execute(select(schema.run.c.id).where(chosen).order_by(schema.run.c.id))
     for some in batches(run_ids.scalars().all()):

@@ -60,7 +60,7 @@ def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None
         "tcp_user_timeout": round(_DEAD_AFTER_S * 1000),
         **_PROBES,
     }
-    # A server that was started again must not cost a record: what is stale is replaced.
+    # pre_ping replaces stale connections: a restart of the server must not lose a record.
     engine = create_engine(url, isolation_level="READ COMMITTED", pool_pre_ping=True)
 
     @event.listens_for(engine, "do_connect")
