@@ -49,7 +49,7 @@ def opened(
 
     `what` names the kind of file in messages. A file that `may_grow`, such as a recording in
     progress, may get longer; any other must not change until the end of the block. Unless the user
-    named it (`was_named`), it must belong to the user or root, and nobody else may have write
+    named it (`was_named`), it must belong to the user or root, and no other user may have write
     permission (not checked on Windows).
 
     Raises UsageError if the file does not exist or is not regular; `error` if it is too large,

@@ -138,12 +138,12 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 def error_text(error: BaseException) -> str:
     """Message of the back end without a full stop, or the type of the error if it is empty."""
-    said: list[str] = []
+    texts: list[str] = []
     for each in causes(error):
         words = str(each).strip().rstrip(".!")
-        if words and not any(words in earlier for earlier in said):
-            said.append(words)
-    return ": ".join(said) or type(error).__name__
+        if words and not any(words in earlier for earlier in texts):
+            texts.append(words)
+    return ": ".join(texts) or type(error).__name__
 
 
 def _codes(chain: list[BaseException]) -> set[int]:

@@ -167,8 +167,8 @@ class Detection:
         """Collect the answers of all processes; True if one ended without answering."""
         crashed = False
         for names, process in self._processes:
-            said, is_over = self._wait_for(process)
-            _take(said, detected, unanswered)
+            output, is_over = self._wait_for(process)
+            _take(output, detected, unanswered)
             if not is_over:
                 continue
             missing = unanswered & set(names)
@@ -198,8 +198,8 @@ class Detection:
                 process.stdout.close()
 
 
-def _take(said: str, detected: DetectionResult, unanswered: set[str]) -> None:
-    for line in said.splitlines():
+def _take(output: str, detected: DetectionResult, unanswered: set[str]) -> None:
+    for line in output.splitlines():
         if not line.startswith(_MARK):
             continue
         with contextlib.suppress(ValueError, LookupError, TypeError):

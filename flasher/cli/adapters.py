@@ -139,8 +139,8 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOp
         ctx = click.get_current_context()
         name = ctx.info_name or ""
         words = rebuild_command_line(ctx, name)
-        behind = words.index(name) + 1
-        error.command = shlex.join(["flasher", *words[:behind], *bus.found.words, *words[behind:]])
+        after = words.index(name) + 1
+        error.command = shlex.join(["flasher", *words[:after], *bus.found.words, *words[after:]])
         raise error
     output.progress(f"the {node} is there")
 

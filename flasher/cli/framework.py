@@ -76,8 +76,8 @@ class Session:
                 "--events needs --json.", remedy="Events are lines of JSON: add --json."
             )
         self._logs.open(self._verbosity, self._log_file, typed_values(but="log_file"))
-        told = printable(shlex.join(["flasher", *self.command_line]))
-        _LOG.info("flasher %s: %s", __version__, told, extra=SAID)
+        shown = printable(shlex.join(["flasher", *self.command_line]))
+        _LOG.info("flasher %s: %s", __version__, shown, extra=SAID)
 
 
 def _session(ctx: click.Context) -> Session:
@@ -413,16 +413,18 @@ def usage_error(wrong: click.UsageError, command: str | None) -> UsageError:
     ctx = wrong.ctx
     program = ctx.command_path if ctx else " ".join(filter(None, ("flasher", command)))
     close = getattr(wrong, "possibilities", None)
-    said = wrong.message if close else wrong.format_message()
+    message = wrong.message if close else wrong.format_message()
     remedy = f"Did you mean {close[0]}? " if close else ""
-    if ctx is not None and isinstance(ctx.command, Group) and " command" in said:
-        said = said.replace("command", "action")
+    if ctx is not None and isinstance(ctx.command, Group) and " command" in message:
+        message = message.replace("command", "action")
         remedy = remedy or f"Actions are {', '.join(ctx.command.commands)}. "
-    is_left_over = "extra argument" in said or isinstance(wrong, click.exceptions.NoSuchCommand)
+    is_left_over = "extra argument" in message or isinstance(wrong, click.exceptions.NoSuchCommand)
     if ctx is not None and is_left_over:
         remedy += "".join(
             f"{param.opts[-1]} takes one value, and may be repeated. "
             for param in ctx.command.params
             if getattr(param, "multiple", False) and param.name in _typed(ctx)
         )
-    return UsageError(f"{program}: {said.rstrip('.')}.", remedy=f"{remedy}Try `{program} --help`.")
+    return UsageError(
+        f"{program}: {message.rstrip('.')}.", remedy=f"{remedy}Try `{program} --help`."
+    )

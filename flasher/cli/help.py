@@ -107,10 +107,10 @@ class HelpedCommand(rich_click.RichCommand):
         else:
             codes = sorted({*_ALWAYS, *self.exit_codes})
             # No blank inside, so that a meaning is not parted from its code.
-            told = (f"{int(code)} {_MEANINGS[code]}".replace(" ", "\xa0") for code in codes)
+            listed = (f"{int(code)} {_MEANINGS[code]}".replace(" ", "\xa0") for code in codes)
             given = {name for param in self.params for name in param.opts}
             read = "".join(text for name, text in _READ_FOR.items() if name in given)
-            sections.append(f"exit codes:\n  {'   '.join(told)}")
+            sections.append(f"exit codes:\n  {'   '.join(listed)}")
             sections.append(f"files and environment:\n{read}{_READ_ALWAYS}")
         from rich.text import Text  # noqa: PLC0415  for help only
 

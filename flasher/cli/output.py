@@ -169,8 +169,8 @@ class Output:
         self.say(f"{head} {text}")
         if self.ending is not None:
             self.verdict(self.ending(error))
-        said = document_of(ErrorDocument, error, kind=type(error).__name__)
-        return self.document(known, exit_code=error.exit_code, error=said)
+        failure = document_of(ErrorDocument, error, kind=type(error).__name__)
+        return self.document(known, exit_code=error.exit_code, error=failure)
 
 
 def _plain_stderr(text: str) -> None:

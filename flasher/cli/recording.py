@@ -247,11 +247,11 @@ def _leave_bundle(
 
 def _error(error: BaseException) -> dict[str, Any]:
     if isinstance(error, FlasherError):
-        said = ("what", "where", "cause", "remedy", "command")
+        names = ("what", "where", "cause", "remedy", "command")
         return {
             "kind": type(error).__name__,
             "exit_code": int(error.exit_code),
-            **{name: getattr(error, name) for name in said},
+            **{name: getattr(error, name) for name in names},
         }
     lines = traceback.format_exception(error)
     return {

@@ -40,8 +40,8 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
         story = explain_path(trace, everything=True)
         remarks = _remarks(story)
         verdict = story.verdict
-        said = (verdict.text, verdict.likely, verdict.remedy)
-        writer = PcapngWriter(to, "\n".join(filter(None, said)))
+        parts = (verdict.text, verdict.likely, verdict.remedy)
+        writer = PcapngWriter(to, "\n".join(filter(None, parts)))
     else:
         writer = writer_of(to, called=str(called))
     damage: list[str] = []

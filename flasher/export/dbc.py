@@ -39,7 +39,7 @@ _FRAME_FORMATS: Final = (
 _COMMENT: Final = (
     "Messages of the Welling drive system, each joined to one CAN FD frame (flasher export "
     "trace --joined): its first 64 bytes, from the header 55 AA on. Left out is what a DBC cannot "
-    "say: texts, plain bytes, everything behind byte 64, and the CRC. Frames of a message as they "
+    "say: texts, plain bytes, everything after byte 64, and the CRC. Frames of a message as they "
     "are on the bus are not described."
 )
 

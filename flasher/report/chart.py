@@ -232,16 +232,16 @@ def _marks(parts: _Parts, kind: MarkKind) -> Iterable[Mark]:
 
 
 def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
-    said = f"{len(samples):,} packets, {len(known):,} with an answer"
+    summary = f"{len(samples):,} packets, {len(known):,} with an answer"
     if known:
-        said += (
+        summary += (
             f": {duration_text(min(known))} to {duration_text(max(known))}, "
             f"median {duration_text(median(known))}"
         )
     for kind in (MarkKind.REPEATED, MarkKind.NAK):
         count = sum(_count(sample, kind) for sample in samples)
-        said += f"; {count:,} {'repetitions' if kind is MarkKind.REPEATED else 'NAKs'}"
-    return said + "."
+        summary += f"; {count:,} {'repetitions' if kind is MarkKind.REPEATED else 'NAKs'}"
+    return summary + "."
 
 
 # -- distributions --------------------------------------------------------------------------------
@@ -347,5 +347,5 @@ def spread(distribution: Distribution, width: float) -> Spread:
         values, frame.left, frame.right, from_zero=True, intervals=_intervals_for(width)
     )
     figures = tuple(Figure(name, value, round(x_axis.at(value), 1)) for name, value in named)
-    said = ", ".join(f"{name} {duration_text(value)}" for name, value in named)
-    return Spread(frame, x_axis, figures, f"{distribution.count:,} values: {said}.")
+    summary = ", ".join(f"{name} {duration_text(value)}" for name, value in named)
+    return Spread(frame, x_axis, figures, f"{distribution.count:,} values: {summary}.")

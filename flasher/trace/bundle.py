@@ -146,8 +146,8 @@ def transcript(recorder: FlightRecorder) -> Iterator[str]:
 def _line(event: BusEvent, direction: str) -> str:
     step = step_of(event, event.at)
     route = f"{step.sender} > {step.receiver}" if step.sender else ""
-    said = ("! " if step.is_trouble else "") + step.title + (f": {step.text}" if step.text else "")
-    return f"{step.at_s:10.6f}  {direction:<3}  {event.can_id:03X}  {route:<9}  {said}"
+    line = ("! " if step.is_trouble else "") + step.title + (f": {step.text}" if step.text else "")
+    return f"{step.at_s:10.6f}  {direction:<3}  {event.can_id:03X}  {route:<9}  {line}"
 
 
 def _circumstances(recorder: FlightRecorder, now: float) -> dict[str, Any]:

@@ -229,9 +229,9 @@ def content_fields(content: Content) -> tuple[Field, ...]:
         value = getattr(content, name)
         if not isinstance(codec, ReservedField) or any(value):
             shown = Field(name, _plain_value(value), label(name, codec), codec.show(value))
-            said = remark(name, codec.unit, value)
-            if said:
-                fields.append(shown._replace(text=f"{shown.text} {codec.unit} ({said})"))
+            words = remark(name, codec.unit, value)
+            if words:
+                fields.append(shown._replace(text=f"{shown.text} {codec.unit} ({words})"))
             else:
                 fields.append(shown._replace(unit=codec.unit))
     return tuple(fields)

@@ -164,9 +164,9 @@ class _StoryBuilder:
     def _begin(self, target: Target, timed: TimedEvent) -> ObservedUpgrade:
         """Start an upgrade with the announcements that led to it."""
         heard = [
-            said
-            for said in self._announced.pop(target, [])
-            if timed.begin_s - said.end_s <= _BURST_S
+            message
+            for message in self._announced.pop(target, [])
+            if timed.begin_s - message.end_s <= _BURST_S
         ]
         upgrade = self._open[target] = ObservedUpgrade(
             target,
@@ -177,8 +177,8 @@ class _StoryBuilder:
             max_packets=self._packets_left,
             is_one_tool=self._is_one_tool,
         )
-        for said in heard:
-            upgrade.device(said)
+        for message in heard:
+            upgrade.device(message)
         return upgrade
 
     def _end_of_restart(self, target: Target, timed: TimedEvent) -> None:
@@ -284,9 +284,9 @@ class _StoryBuilder:
             # Only one dialect has displays, and only the other one has upgrades.
             bitrate_bps = MOTINOVA.bitrate_bps
         bus = self._bus.figures(bitrate_bps)
-        told = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
+        targets = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
         talkers = self._bus.talkers(
-            {of for each in told for of in (each.request_id, each.answer_id)}
+            {of for each in targets for of in (each.request_id, each.answer_id)}
         )
         return Story(
             source=printable(source),

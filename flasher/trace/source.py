@@ -73,11 +73,11 @@ def _as_the_tool_ended(story: Story) -> Story:
     def judged(verdict: TraceVerdict) -> TraceVerdict:
         if verdict.cause is not Cause.RECORDING_ENDS:
             return verdict
-        said = recorded.error.partition(" | ")[0]
+        first = recorded.error.partition(" | ")[0]
         return replace(
             verdict,
             cause=Cause.TOOL_ENDED,
-            text=f"{verdict.text} Here the tool ended: {said}".rstrip(": "),
+            text=f"{verdict.text} Here the tool ended: {first}".rstrip(": "),
             likely=explanation(Cause.TOOL_ENDED).likely,
             remedy=explanation(Cause.TOOL_ENDED).remedy,
         )
@@ -148,7 +148,7 @@ def _recorded(report: dict[str, Any]) -> Recorded:
     error = report.get("error")
     error = error if isinstance(error, dict) else {}
     exit_code = error.get("exit_code")
-    said = [
+    messages = [
         f"{title}{error[key]}"
         for key, title in (
             ("what", ""),
@@ -161,5 +161,5 @@ def _recorded(report: dict[str, Any]) -> Recorded:
     return Recorded(
         command=printable(shlex.join(map(str, words))) if isinstance(words, list) else "",
         exit_code=exit_code if isinstance(exit_code, int) else None,
-        error=printable(" | ".join(said)),
+        error=printable(" | ".join(messages)),
     )

@@ -134,15 +134,15 @@ def step_of(event: BusEvent, at_s: float) -> Step:
     kind = StepKind.DAMAGED if event.kind is Kind.DAMAGED else StepKind.MESSAGE
     width = None if event.is_alarm else _VALUE_WIDTH  # no fault is left out
     # Image bytes, and a constant text that repeats the title, add nothing.
-    told = (shown for shown in event.fields if shown.name not in ("payload", "text"))
-    said = ", ".join(shown.words(width) for shown in told)
+    fields = (shown for shown in event.fields if shown.name not in ("payload", "text"))
+    values = ", ".join(shown.words(width) for shown in fields)
     return Step(
         at_s,
         kind,
         event.sender,
         event.receiver,
         event.title,
-        said,
+        values,
         is_trouble=event.is_trouble,
         can_id=event.can_id,
     )

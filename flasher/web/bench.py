@@ -523,8 +523,8 @@ class BenchController:
 def _note_of(event: object) -> str:
     """The note for an event; checks are shown elsewhere."""
     line = progress_line(event)
-    said = warning_text(event) or (line[0] if line and line[1] < 2 else "")
-    return "" if isinstance(event, events.CheckMade) else said
+    warning = warning_text(event) or (line[0] if line and line[1] < 2 else "")
+    return "" if isinstance(event, events.CheckMade) else warning
 
 
 def _known(things: Mapping[str, T], name: str) -> T:

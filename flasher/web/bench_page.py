@@ -184,14 +184,14 @@ class BenchPage:
 
     async def _order(self, request: Request) -> Response:
         try:
-            said = json.loads(await request.body())
-            word = said["order"]
+            order = json.loads(await request.body())
+            word = order["order"]
             if word == "stop":
                 self._bench.stop()
                 return JSONResponse({})
             step, fields = _ORDERS[word]
-            values = [said[name] for name in fields]
-            is_meant = word != "waive" or said["risk"] == "known"
+            values = [order[name] for name in fields]
+            is_meant = word != "waive" or order["risk"] == "known"
         except (ValueError, TypeError, KeyError):
             is_meant = False
         if not is_meant:

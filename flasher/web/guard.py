@@ -71,8 +71,8 @@ class BrowserEntry:
         return [Route(_ENTER, self._take), Route(_CLOSED, self._refuse)]
 
     async def _take(self, request: Request) -> Response:
-        said = request.query_params.get("key", "")
-        if not self._key or not hmac.compare_digest(said.encode(), self._key.encode()):
+        given = request.query_params.get("key", "")
+        if not self._key or not hmac.compare_digest(given.encode(), self._key.encode()):
             return RedirectResponse("/" if request.session.get(_IS_IN) else _CLOSED, 303)
         self._key = ""
         request.session[_IS_IN] = True
@@ -205,7 +205,7 @@ class _Sessions:
         is_stream = path.endswith("/events")
         sign_in = None
         if self._login is not None:
-            # A page that stays open looks for its stream by HEAD: nobody is there for that.
+            # A page that stays open looks for its stream by HEAD: no person is there for that.
             is_use = not is_stream and scope["method"] in ("GET", "POST")
             sign_in = self._login.find(session, is_use=is_use)
         scope["sign_in"] = sign_in
@@ -216,8 +216,8 @@ class _Sessions:
             await refusal(scope, receive, send)
             return
         if scope["method"] == "POST" and path not in FORMS:
-            said = Headers(scope=scope).get(TOKEN_HEADER, "")
-            if not hmac.compare_digest(said.encode(), session["token"].encode()):
+            token = Headers(scope=scope).get(TOKEN_HEADER, "")
+            if not hmac.compare_digest(token.encode(), session["token"].encode()):
                 await PlainTextResponse("Load the page again.", 403)(scope, receive, send)
                 return
         if is_stream:

@@ -143,9 +143,9 @@ class SupervisorPages:
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
-        said = translator(question.language)
+        translate = translator(question.language)
         shown = frame(question, self.now()) | context
-        text = self._pages.text(template, said, question.token, outcomes=RUN_WORDS, **shown)
+        text = self._pages.text(template, translate, question.token, outcomes=RUN_WORDS, **shown)
         return Answer(text.encode("utf-8", "backslashreplace"), status=http)
 
     # -- runs -------------------------------------------------------------------------------------
@@ -312,11 +312,11 @@ class SupervisorPages:
 
     def yields(self, question: Question) -> Answer:
         chosen, span = self._figured(question)
-        said = translator(question.language)
+        translate = translator(question.language)
         yields, whole = self.overview.yields(chosen, list(spans_of(span)))
         rows = [each for each in yields if each.units]
         by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
-        groups, causes = self._causes(chosen, span, by, said)
+        groups, causes = self._causes(chosen, span, by, translate)
         return self._page(
             question,
             "yield.html",
@@ -325,7 +325,7 @@ class SupervisorPages:
             name_of=_name_of,
             whole=whole,
             chart=lines(
-                said(text("Yield over time")),
+                translate(text("Yield over time")),
                 [_name_of(row.span).removeprefix(f"{span.end.astimezone():%Y-}") for row in rows],
                 {
                     "end": [100 * (row.share or 0) for row in rows],
@@ -340,7 +340,7 @@ class SupervisorPages:
             groups=groups,
             causes=causes,
             causes_chart=stacked_bars(
-                said(text("Causes")),
+                translate(text("Causes")),
                 [row.code for row in causes[:CAUSES_DRAWN]],
                 {
                     f"{at} {group}": [row.counts[at] for row in causes[:CAUSES_DRAWN]]
@@ -354,7 +354,7 @@ class SupervisorPages:
         )
 
     def _causes(
-        self, chosen: RunFilter, span: Span, by: By, said: Translator
+        self, chosen: RunFilter, span: Span, by: By, translate: Translator
     ) -> tuple[list[str], list[PartOfCauses]]:
         """The groups, and the codes by descending frequency."""
         shifts = list(shifts_of(span, self.shifts)) if by is By.SHIFT else []
@@ -373,8 +373,8 @@ class SupervisorPages:
             meaning = codes.CODES[code].meaning if code in codes.CODES else ""
             share = so_far / everything
             rows.append(PartOfCauses(code, meaning, tuple(shown), counts.total(), share))
-        names = [name or said(text("no lot")) for name in sorted(kept)]
-        return [*names, *([said(text("others"))] if has_others else [])], rows
+        names = [name or translate(text("no lot")) for name in sorted(kept)]
+        return [*names, *([translate(text("others"))] if has_others else [])], rows
 
     def times(self, question: Question) -> Answer:
         chosen, span = self._figured(question)

@@ -57,7 +57,7 @@ def opened(
         yield subject, profile, stopped
 
 
-def confirm_wear(said: str, *, is_agreed: bool) -> None:
+def confirm_wear(wear: str, *, is_agreed: bool) -> None:
     """Report how often the device is erased, and ask unless it `is_agreed`. Raises UsageError
     without a yes.
     """
@@ -65,11 +65,11 @@ def confirm_wear(said: str, *, is_agreed: bool) -> None:
         return
     if not can_ask():
         raise UsageError(
-            f"{said}, and there is no terminal to ask.",
+            f"{wear}, and there is no terminal to ask.",
             remedy="Add --yes.",
             code=ErrorCode.NOT_CONFIRMED,
         )
-    if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
+    if not agrees(f"{wear}. Begin?", interrupted="nothing was sent to the device."):
         raise UsageError(
             "Nothing was sent to the device.",
             remedy="Answer y to begin, or add --yes.",

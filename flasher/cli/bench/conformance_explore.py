@@ -91,8 +91,8 @@ def explore(
     check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
     if not (bench.is_simulated or replay):
         erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
-        said = f"{steps} steps erase and write the device about {erases} times"
-        confirm_wear(said, is_agreed=yes)
+        wear = f"{steps} steps erase and write the device about {erases} times"
+        confirm_wear(wear, is_agreed=yes)
     with (
         opened(bench, output) as (subject, profile, stopped),
         Bar(output, leave=False, unit=" steps") as bar,

@@ -75,8 +75,8 @@ def init(
     # Other facts of the bench must be observed too.
     start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
     if not bench.is_simulated:
-        said = f"the questions erase and write the device about {UPGRADES} times"
-        confirm_wear(said, is_agreed=yes)
+        wear = f"the questions erase and write the device about {UPGRADES} times"
+        confirm_wear(wear, is_agreed=yes)
     with (
         opened(bench, output) as (subject, _, stopped),
         Bar(output, leave=False, unit=" questions") as bar,

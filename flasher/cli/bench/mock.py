@@ -214,13 +214,13 @@ def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output
     """Wait until the adapter opens again; False when the user stops. A device outlives faults of
     its bus. Each reason is reported once.
     """
-    told = ""
+    reported = ""
     while not stopped():
         try:
             connection.link.reopen()
         except BusError as error:
-            if str(error) != told:
-                told = str(error)
+            if str(error) != reported:
+                reported = str(error)
                 output.progress(f"not yet: {error.what} {error.remedy}".rstrip())
             connection.clock.wait_until(connection.clock.now() + _REOPEN_S)
         else:

@@ -135,8 +135,8 @@ def adapter(detected: DetectionResult) -> Iterator[Finding]:
     if detected.hung:
         names = ", ".join(detected.hung)
         yield _note("adapters", f"no answer in time from the back ends {names}")
-    for name, said in detected.failed.items():
-        text = printable(said)
+    for name, error in detected.failed.items():
+        text = printable(error)
         yield _note("adapters", f"the back end {name} fails: {text}")
 
 
@@ -404,16 +404,16 @@ def _nodes(heard: ListenResult) -> Iterator[Finding]:
     if survey.duplicates.evidence:
         what = f"two devices of one kind are on the bus: {survey.duplicates.evidence}"
         yield _problem("traffic", what, ("disconnect one of them",))
-    for node, said in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
-        if any(isinstance(content, contents.Shutdown) for content in said.last.values()):
+    for node, traffic in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
+        if any(isinstance(content, contents.Shutdown) for content in traffic.last.values()):
             what = f"the {node.name} sent the command SHUTDOWN: the system switches off"
             yield _warning("traffic", what, ("press the key of the system",))
-        if said.boot_version:
-            what = f"the {node.name} is in its bootloader ({said.boot_version})"
+        if traffic.boot_version:
+            what = f"the {node.name} is in its bootloader ({traffic.boot_version})"
             fix = f"flasher flash IMAGE -t {node.name.lower()} {heard.bus_arguments}".rstrip()
             yield _note("traffic", what, (fix,))
-        if said.damaged:
-            what = f"the {node.name} sent {counted(said.damaged, 'run')} of bytes that made no "
+        if traffic.damaged:
+            what = f"the {node.name} sent {counted(traffic.damaged, 'run')} of bytes that made no "
             yield _note("traffic", f"{what}message")
     guessed, why = survey.guess_dialect()
     if guessed is not None and guessed is not heard.dialect:

@@ -84,9 +84,9 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
         output.result("")
         output.result("of the station:")
         output.table(((name, code.meaning) for name, code in CODES.items()), indent=2)
-        told = [CodeDocument(each.code, each.title, "") for each in errors.values()]
-        told += [CodeDocument(name, str(code.meaning), "") for name, code in CODES.items()]
-        return output.document(CodesDocument(told))
+        documents = [CodeDocument(each.code, each.title, "") for each in errors.values()]
+        documents += [CodeDocument(name, str(code.meaning), "") for name, code in CODES.items()]
+        return output.document(CodesDocument(documents))
     if what in program.command.entries:
         found = program.command.entries[what].load()
         with found.make_context(what, [], parent=program, resilient_parsing=True) as shown:

@@ -123,21 +123,21 @@ def read(
                 "START, END, --output and --format are for `flasher read memory` only."
             )
         return _read_item(item, target, bus, recorded, output)
-    first, behind = _range(start, end)
+    first, stop = _range(start, end)
     if target is not BMS:
         raise UsageError(f"The documents give no way to read memory of the {target.node.name}.")
     if file is None and format:
         raise UsageError("--format needs --output FILE.")
     check_writable(file, _OUTPUT)
     with recorded_device(recorded, bus, output, BMS) as (device, record):
-        data = read_shown(device, first, behind, output, record)
+        data = read_shown(device, first, stop, output, record)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
         write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT, is_private=True)
         output.result(f"{byte_count(len(data))} from 0x{first:08X} in {printable(str(file))}")
         name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
         document = MemoryDocument(
-            target.name, first, behind, file=str(file), format=name, two_devices=record.two_devices
+            target.name, first, stop, file=str(file), format=name, two_devices=record.two_devices
         )
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
@@ -145,7 +145,7 @@ def read(
             text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in line)
             output.result(f"{first + at:08X}  {line.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}")
         document = MemoryDocument(
-            target.name, first, behind, data=data.hex(), two_devices=record.two_devices
+            target.name, first, stop, data=data.hex(), two_devices=record.two_devices
         )
     return output.document(document)
 
@@ -172,11 +172,11 @@ def _range(start: str | None, end: str | None) -> tuple[int, int]:
     if start is None or end is None:
         raise UsageError("Reading memory takes START and END.", remedy="END is exclusive.")
     try:
-        first, behind = values.number(start), values.number(end)
+        first, stop = values.number(start), values.number(end)
     except click.BadParameter as error:
         raise UsageError(f"{error.message}.") from error
-    check_range(first, behind)
-    return first, behind
+    check_range(first, stop)
+    return first, stop
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:

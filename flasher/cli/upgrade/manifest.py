@@ -133,7 +133,7 @@ def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Deco
 @_stated("minimum_boot_version", BOOT_VERSION_FORM, "the oldest bootloader that may receive it")
 @_stated("previous_from", FIRMWARE_VERSION_FORM, "the oldest running version that it may replace")
 @_stated("notes", "TEXT", "what a person should know")
-@_stated("hardware_versions", "V", "hardware that it fits; * stands for any text", is_list=True)
+@_stated("hardware_versions", "V", "hardware that it fits; * matches any text", is_list=True)
 @_stated("previous_except", "V", "running versions that it must not replace", is_list=True)
 @option(
     "-o", "--output", "file", metavar="FILE", type=values.FilePath("toml"), panel="manifest",

@@ -69,9 +69,9 @@ Damage = tuple[str, Callable[[bytes], bytes]]
 def single_bits(bench: Bench) -> None:
     probe = _probe_without_headers(bench)
     probe.begin()
-    for name, first, behind in _FIELDS:
+    for name, first, stop in _FIELDS:
         with bench.step(name):
-            bits = range(8 * first, 8 * behind)
+            bits = range(8 * first, 8 * stop)
             flips = [(f"bit {bit % 8} of byte {bit // 8}", _flipping(bit, 1)) for bit in bits]
             _check_none_accepted(bench, probe, flips, framed=first in _PACKET_LIKE_BYTES)
     probe.send_next()

@@ -41,7 +41,7 @@ def gaps(bench: Bench) -> None:
             taken = probe.offer(probe.frames(), EITHER, gap_s=gap_s, gaps=gaps)
             sent = [one.at_s for one in bench.tester.trace if one.sent and one.at_s > began_at]
             pairs = pairwise(sent[:PACKET_FRAMES])  # of the packet, as it was on the bus
-            widest_s = max(behind - before for before, behind in pairs)
+            widest_s = max(after - before for before, after in pairs)
             bench.info(f"gap of {gap_s * 1000:.1f} ms: {'accepted' if taken else 'rejected'}")
             if wanted == EITHER:
                 continue

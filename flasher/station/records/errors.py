@@ -248,8 +248,8 @@ def mapped(where: str, *, writes: bool) -> Iterator[None]:
             code = getattr(original, "sqlite_errorcode", None) or 0
             chosen = _SQLITE.get(code & 0xFF, _UNKNOWN)
         kind, why, remedy = chosen
-        said = getattr(getattr(original, "diag", None), "message_primary", None) or str(original)
-        cause, error = " ".join(said.split()), found
+        message = getattr(getattr(original, "diag", None), "message_primary", None) or str(original)
+        cause, error = " ".join(message.split()), found
     except OSError as found:
         usual = (RecordError, "", "Check the disk and the rights of the folder.")
         kind, _, remedy = _SYSTEM.get(found.errno or 0, usual)

@@ -437,18 +437,18 @@ class Examiner:
 
     def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
         """Note what a person should know of an intact row."""
-        said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
+        decision = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
         match row["event"]:
             case chain.KEY_LOST:
-                self._remarks.append(f"{shown}: the key was declared lost on {said}")
+                self._remarks.append(f"{shown}: the key was declared lost on {decision}")
             case chain.RESTORED:
                 lost = chain.lost_of(data)
                 self._remarks.append(
                     f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
-                    f" up as lost on {said}"
+                    f" up as lost on {decision}"
                 )
             case chain.CLOCK:
-                self._remarks.append(f"{shown}: the clock was released on {said}")
+                self._remarks.append(f"{shown}: the clock was released on {decision}")
 
     # -- runs -------------------------------------------------------------------------------------
 
@@ -492,8 +492,8 @@ class Examiner:
                 details = details_of_content(content, content["recipe"])
             except ValidationError as error:
                 (first, *_) = error.errors()
-                said = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
-                yield Problem(f"run {run_id}", f"it cannot be read: {said}", (run_id,))
+                value = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
+                yield Problem(f"run {run_id}", f"it cannot be read: {value}", (run_id,))
                 continue
             self._did(1)
             is_over = details.run.state is not RunState.RUNNING
