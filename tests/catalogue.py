@@ -5,9 +5,7 @@ it has one; a sentence that nobody says any more is dropped.
 
 from __future__ import annotations
 
-import errno
 import itertools
-import os
 import string
 import sys
 from collections.abc import Iterator
@@ -44,10 +42,22 @@ from flasher.wording import _TEXTS
 from tests.sentences import spoken
 
 _SYSTEM: Final = (
-    errno.EACCES, errno.EADDRINUSE, errno.EAFNOSUPPORT, errno.EBUSY, errno.ECONNREFUSED,
-    errno.EHOSTUNREACH, errno.EISDIR, errno.ENETDOWN, errno.ENODEV, errno.ENOENT, errno.ENOSPC,
-    errno.ENXIO, errno.EPERM, errno.EROFS, errno.ETIMEDOUT,
-)  # fmt: skip
+    "Address already in use",
+    "Address family not supported by protocol",
+    "Connection refused",
+    "Connection timed out",
+    "Device or resource busy",
+    "Is a directory",
+    "Network is down",
+    "No route to host",
+    "No space left on device",
+    "No such device",
+    "No such device or address",
+    "No such file or directory",
+    "Operation not permitted",
+    "Permission denied",
+    "Read-only file system",
+)
 """Errors of Linux that users meet."""
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "locale"
@@ -85,7 +95,7 @@ def sentences() -> Iterator[str]:
         "not answered",
     )
     yield from (NOT_SAVED, "[Errno {number}] {error}")
-    yield from map(os.strerror, _SYSTEM)
+    yield from _SYSTEM
     named = ("model", "serial number", "hardware version", "firmware version")
     yield from (f"{{target}} {word}" for word in (*named, *(each.value for each in IdentityCheck)))
     layouts = (BootVersion.LAYOUT, Packet.LAYOUT, UpdateCommand.LAYOUT)
