@@ -343,7 +343,7 @@ SCANS = tuple(
         ("pipe.txt", os.mkfifo, "not a regular file"),
         ("zero.txt", link("/dev/zero"), "not a regular file"),
         ("terabyte.txt", sparse(1 << 40), "too large"),
-        ("utf_16.txt", content("BAT2620-0001\n".encode("utf-16")), "no text"),
+        ("utf_16.txt", content("BAT2620-0001\n".encode("utf-16")), "not a text file"),
     )
 )
 
