@@ -54,6 +54,8 @@ _EXCHANGE_S: Final = 0.25
 _ANNOUNCED_ON: Final = 2
 """A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
 announcement may have been on its way."""
+_BACKLOG_S: Final = 0.1
+"""Frames that are read so soon after unobserved time may have been sent in it."""
 _UNOBSERVED: Final = (
     "This computer did not listen {}: another unit could have come, and would announce itself in"
     " the same way."
@@ -115,8 +117,10 @@ class Continuity:
         """Observed time up to the last announcement of the current burst; None: no burst."""
         self._burst_until = -inf
         """Time until which a burst may begin that the run has caused."""
-        self._heard_s = 0.0
-        """Observed time up to the last frame of the unit."""
+        self._heard_s, self._missed_unheard_s, self._resumed_s = 0.0, 0.0, -inf
+        """Observed time up to the last frame of the unit; unobserved time since then (frames
+        that had waited to be read do not end it); observed time up to its end.
+        """
         self._announced_on = 0
         """Announcements of the current burst since the last reset."""
         self._awaits_confirmation = self._awaits_complete = self._awaits_application = False
@@ -209,6 +213,8 @@ class Continuity:
 
     def _miss(self, missed_s: float) -> None:
         self._missed_s += missed_s
+        self._missed_unheard_s += missed_s
+        self._resumed_s = self._listened_s
         self.watcher.miss(missed_s)
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
@@ -225,6 +231,7 @@ class Continuity:
         watcher(frame, sent=False, now=now)
         if watcher.power_ups > power_ups and (was_heard or self._was_silent):
             self._take_power_up(now, was_heard=was_heard)
+        missed_unheard_s = self._missed_unheard_s
         has_returned = watcher.heard_at == now and self._returns()
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
@@ -238,6 +245,9 @@ class Continuity:
             # The new application runs: the burst after the end of the transfer is over.
             self._awaits_application, self._burst_until = False, -inf
         if watcher.begun_announcements > begun:  # it may be pulled before the last frame
+            if self._awaits_confirmation or self._awaits_complete:
+                # It may have been exchanged before the command reached it.
+                self._missed_s = max(self._missed_s, missed_unheard_s)
             self._take_announcement(now, has_returned=has_returned)
         if watcher.announcements > announcements and self._is_identified:
             self._compare_boot_version()
@@ -249,6 +259,8 @@ class Continuity:
     def _returns(self) -> bool:
         """Note a frame of the unit. Returns True after a silence that allows an exchange."""
         before, self._heard_s = self._heard_s, self._listened_s
+        if self._listened_s - self._resumed_s > _BACKLOG_S:
+            self._missed_unheard_s = 0.0
         return self._listened_s - before > _EXCHANGE_S
 
     def _note_sent(self, frame: Frame, now: float) -> None:

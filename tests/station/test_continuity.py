@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from flasher.protocol.messages import (
+    Ack,
     BootVersion,
     Complete,
     EndOfTransfer,
@@ -103,6 +104,42 @@ def test_a_burst_after_an_unobserved_time_may_be_of_another_unit(
     run.announce(run.now + 0.1)
     assert not run.continuity.lost
     assert bool(run.continuity.unobserved) == (missed_s > 0.25)
+
+
+@each("confirms", [False, True])
+def test_a_unit_that_is_pulled_in_an_unobserved_time_before_it_is_reset(
+    tmp_path: Path, confirms: bool
+) -> None:
+    run = Watched(tmp_path)
+    run.identify()
+    run.continuity.settle()
+    run.now += 1.0
+    run.send(2.0, ResetCommand())
+    if confirms:
+        run.hear(2.01, GeneralFeedbackMessage())
+    run.announce(2.15, 1)
+    assert not run.continuity.lost
+    assert bool(run.continuity.unobserved) == (not confirms)
+
+
+@each("confirms", [False, True])
+def test_a_unit_that_is_pulled_in_an_unobserved_time_before_the_end_of_its_transfer(
+    tmp_path: Path, confirms: bool
+) -> None:
+    run = Watched(tmp_path)
+    run.identify()
+    run.send(1.1, ResetCommand())
+    run.announce(1.2, 1)
+    run.send(1.21, UpdateCommand(BMS.update_text, 256))
+    run.hear(1.22, RequestTransfer())
+    run.now += 1.0
+    run.hear(2.22, Ack(2))  # it had waited to be read
+    run.send(2.22, EndOfTransfer())
+    if confirms:
+        run.hear(2.23, Complete())
+    run.announce(2.37, 1)
+    assert not run.continuity.lost
+    assert bool(run.continuity.unobserved) == (not confirms)
 
 
 def test_an_adapter_that_was_away_in_the_transfer_accuses_nobody(tmp_path: Path) -> None:

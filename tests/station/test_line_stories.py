@@ -263,6 +263,16 @@ STORIES = {
         " @3.5 put unit=2 socket=A ; @5.3 label by=mo unit=2 ; @5.9 stall socket=A seconds=2.0 ;"
         " @6.1 pull unit=2 ; @6.4 put unit=4 socket=A"
     ),
+    "pulled while the process stands still, before it is reset": (
+        "line sockets=1 ; unit label=2 ; unit label=4 application=new ; person name=mo ;"
+        " @3.5 put unit=2 socket=A ; @5.2 card by=mo unit=2 ; @5.3 label by=mo unit=2 ;"
+        " @5.7017 stall socket=A seconds=1.0 ; @5.8017 pull unit=2 ; @6.8017 put unit=4 socket=A"
+    ),
+    "pulled while the process stands still, before the end of its transfer": (
+        "line sockets=1 ; unit label=2 ; unit label=4 application=new ; person name=mo ;"
+        " @3.5 put unit=2 socket=A ; @5.2 card by=mo unit=2 ; @5.3 label by=mo unit=2 ;"
+        " @5.8747 stall socket=A seconds=1.0 ; @5.9747 pull unit=2 ; @6.9747 put unit=4 socket=A"
+    ),
     "two exchanges at one pace, of which the second is of bootloaders": (
         "line sockets=2 ; unit label=1 ; unit label=3 pace=slow ; unit label=4 application=none ;"
         " person name=jo source=jo ; person name=al source=mounted ; @6.5 put unit=3 socket=B ;"
