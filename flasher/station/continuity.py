@@ -39,7 +39,7 @@ from flasher.protocol.spec import (
     Mode,
 )
 from flasher.protocol.wire import Message, Reassembler
-from flasher.station.presence import TargetWatcher
+from flasher.station.presence import BACKLOG_S, TargetWatcher
 from flasher.station.recipe_file import LoadedTarget
 
 _FIELDS: Final = ("model", "serial_number", "hardware_version")
@@ -54,8 +54,6 @@ _EXCHANGE_S: Final = 0.25
 _ANNOUNCED_ON: Final = 2
 """A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
 announcement may have been on its way."""
-_BACKLOG_S: Final = 0.1
-"""Frames that are read so soon after unobserved time may have been sent in it."""
 _UNOBSERVED: Final = (
     "This computer did not listen {}: another unit could have come, and would announce itself in"
     " the same way."
@@ -259,7 +257,7 @@ class Continuity:
     def _returns(self) -> bool:
         """Note a frame of the unit. Returns True after a silence that allows an exchange."""
         before, self._heard_s = self._heard_s, self._listened_s
-        if self._listened_s - self._resumed_s > _BACKLOG_S:
+        if self._listened_s - self._resumed_s > BACKLOG_S:
             self._missed_unheard_s = 0.0
         return self._listened_s - before > _EXCHANGE_S
 

@@ -42,8 +42,8 @@ _ANNOUNCEMENT: Final = (
     + Command.BOOT_VERSION.to_bytes(COMMAND_SIZE, "big")
 )
 """First bytes of the first frame of an announcement."""
-_LATE_LOOKS: Final = 2
-"""Calls of `Presence.change` after which all frames that came in unobserved time have been read."""
+BACKLOG_S: Final = 0.1
+"""Frames that are read so soon after unobserved time may have been sent in it."""
 _RHYTHM_S: Final = 1.0
 """Pauses of a bootloader that keeps announcing recur within this time."""
 _ALIKE: Final = 1.2
@@ -275,7 +275,8 @@ class Presence:
         self._told_power_ups = 0
         self._was_missed = False
         """Another unit may have been put in during unobserved time."""
-        self._late_looks = 0
+        self._resumed_at = float("-inf")
+        """End of the last unobserved time in which a unit could be exchanged."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """Handle one frame of an idle bus."""
@@ -285,10 +286,10 @@ class Presence:
             if watcher.heard_at == now and watcher.has_sent_message:
                 self._heard_at = now
 
-    def miss(self, missed_s: float) -> None:
-        """Add unobserved time."""
+    def miss(self, missed_s: float, now: float) -> None:
+        """Add unobserved time, up to now."""
         if missed_s > PAUSE_S:
-            self._late_looks = _LATE_LOOKS
+            self._resumed_at = now
         for watcher in self.watchers:
             watcher.miss(missed_s)
         if self._heard_at is not None:
@@ -311,8 +312,7 @@ class Presence:
             self._began_at = now
         heard = self._heard_at is not None and now - self._heard_at < SILENCE_S
         in_bootloader = heard and self._is_in_bootloader(now)
-        if self._late_looks:
-            self._late_looks -= 1
+        if now - self._resumed_at <= BACKLOG_S:
             self._was_missed |= in_bootloader
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not heard:

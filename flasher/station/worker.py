@@ -273,7 +273,7 @@ class Worker:
         """Record that the bus was observed up to now, unless this computer stalled."""
         now, blind_s = self._connection.clock.now(), BLIND_S * self._connection.clock.speed
         if now - self._listened_at > blind_s:
-            self._presence.miss(now - self._listened_at)
+            self._presence.miss(now - self._listened_at, now)
         self._listened_at = now
 
     def _reopen(self) -> None:

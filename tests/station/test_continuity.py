@@ -63,8 +63,8 @@ class Watched:
             self.hear(now + 0.05 * number, ANNOUNCEMENT)
 
 
-def flashed(folder: Path) -> Watched:
-    """A battery whose image is complete at 1.24 s."""
+def in_transfer(folder: Path) -> Watched:
+    """A battery that requests its transfer at 1.22 s."""
     run = Watched(folder)
     run.identify()
     run.send(1.1, ResetCommand())
@@ -72,6 +72,12 @@ def flashed(folder: Path) -> Watched:
     run.announce(1.2, 1)
     run.send(1.21, UpdateCommand(BMS.update_text, 256))
     run.hear(1.22, RequestTransfer())
+    return run
+
+
+def flashed(folder: Path) -> Watched:
+    """A battery whose image is complete at 1.24 s."""
+    run = in_transfer(folder)
     run.send(1.23, EndOfTransfer())
     run.hear(1.24, Complete())
     return run
@@ -126,12 +132,7 @@ def test_a_unit_that_is_pulled_in_an_unobserved_time_before_it_is_reset(
 def test_a_unit_that_is_pulled_in_an_unobserved_time_before_the_end_of_its_transfer(
     tmp_path: Path, confirms: bool
 ) -> None:
-    run = Watched(tmp_path)
-    run.identify()
-    run.send(1.1, ResetCommand())
-    run.announce(1.2, 1)
-    run.send(1.21, UpdateCommand(BMS.update_text, 256))
-    run.hear(1.22, RequestTransfer())
+    run = in_transfer(tmp_path)
     run.now += 1.0
     run.hear(2.22, Ack(2))  # it had waited to be read
     run.send(2.22, EndOfTransfer())
@@ -143,12 +144,7 @@ def test_a_unit_that_is_pulled_in_an_unobserved_time_before_the_end_of_its_trans
 
 
 def test_an_adapter_that_was_away_in_the_transfer_accuses_nobody(tmp_path: Path) -> None:
-    run = Watched(tmp_path)
-    run.identify()
-    run.send(1.1, ResetCommand())
-    run.announce(1.2, 1)
-    run.send(1.21, UpdateCommand(BMS.update_text, 256))
-    run.hear(1.22, RequestTransfer())
+    run = in_transfer(tmp_path)
     run.go_to(3.22)
     run.continuity.was_away(2.0)
     run.send(3.23, EndOfTransfer())

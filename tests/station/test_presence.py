@@ -233,7 +233,7 @@ def test_a_pause_like_the_last_one_is_no_pace_after_a_longer_burst(presence: Pre
 
 def test_time_in_which_nobody_listened_is_no_silence(presence: Presence) -> None:
     hear(presence, version_answer("W2605002"), 1.0)
-    presence.miss(4.0)
+    presence.miss(4.0, 6.9)
     assert presence.change(6.9) is None
     assert presence.change(7.0) is not None
 
@@ -248,15 +248,15 @@ def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
 
 def test_a_bootloader_that_nobody_listened_to_may_be_another_one(presence: Presence) -> None:
     announce(presence, 1.0, 1.05)
-    presence.miss(0.2)
+    presence.miss(0.2, 1.3)
     assert presence.change(1.3) is None, "nobody exchanges it so fast"
-    presence.miss(1.0)
+    presence.miss(1.0, 2.3)
     change = presence.change(2.3)
     assert change is not None
     assert (change.is_there, change.was_missed, change.is_power_up) == (True, True, False)
     assert (presence.missed_number, presence.exchanged_number) == (change.number, 0)
     hear(presence, version_answer("W2605002"), 2.4)
-    presence.miss(1.0)
+    presence.miss(1.0, 3.5)
     assert presence.change(3.5) is None, "an application would announce its restart"
 
 
@@ -264,7 +264,7 @@ def test_announcements_that_are_read_late_may_be_of_two_units(presence: Presence
     """One was pulled, and another one put in, while this computer stalled: no pause is seen."""
     assert presence.change(0.0) is None
     assert presence.change(2.0) is not None, "empty"
-    presence.miss(0.4)
+    presence.miss(0.4, 2.4)
     assert presence.change(2.4) is None, "nothing was read yet"
     assert announce(presence, 2.41) == [(True, True)]
     announce(presence, 2.42)
@@ -273,7 +273,7 @@ def test_announcements_that_are_read_late_may_be_of_two_units(presence: Presence
 
 def test_announcements_long_after_a_stall_are_of_one_unit(presence: Presence) -> None:
     presence.change(2.0)
-    presence.miss(0.4)
+    presence.miss(0.4, 2.4)
     for now in (2.4, 2.45, 2.5):
         presence.change(now)
     announce(presence, 2.55, 2.6)
