@@ -27,8 +27,11 @@ _COMMA_LANGUAGES: Final = frozenset({"de"})
 _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
 _MARKS_MIN: Final = 4
 """Characters of an entry besides values and spaces: with fewer it would match anything."""
-_LENGTH_MAX: Final = 2000
-"""Characters of a text that is matched; longer ones come from devices and files."""
+_LENGTH_MAX: Final = 1000
+_JOINTS_MAX: Final = 24
+"""Characters and joints of a text that is matched, which takes time that grows with both. Longer
+texts come from files, devices and data bases, and no entry matches them."""
+_JOINT: Final = re.compile(r"[.!?;:] | \(")
 _QUANTITY: Final = re.compile(r"-?[\d,]+(?:\.\d+)? [A-Za-z%\N{MICRO SIGN}]{1,4}")
 """A number and its unit."""
 _LEADING: Final = re.compile(r"(?<![^.!? \N{IDEOGRAPHIC FULL STOP}])\{\w+\} ?")
@@ -90,9 +93,10 @@ class Translator(Formatter):
 
     def _translate_plain(self, sentence: str) -> str:
         translated = self._known(sentence)
-        is_matched = " " in sentence and self._entries and len(sentence) <= _LENGTH_MAX
-        if translated or not is_matched:
+        if translated or " " not in sentence or not self._entries:
             return translated or sentence
+        if len(sentence) > _LENGTH_MAX or len(_JOINT.findall(sentence)) > _JOINTS_MAX:
+            return sentence
         if _QUANTITY.fullmatch(sentence):
             return self.numbers(sentence)
         return (
