@@ -256,14 +256,16 @@ class UnitRun:
 
     def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
         """The error for a missing answer: the unit was removed if an application that had answered
-        before no longer does.
+        before no longer does, which a lost adapter leaves open.
         """
         try:
             for target in steps.targets:
                 target.confirm()
         except StepFailedError as silent:
             return silent
-        except (InterruptedByUserError, BusError):
+        except BusError as error:
+            return StepFailedError(codes.BUS, error.what)
+        except InterruptedByUserError:
             pass  # the next step raises it again
         return failed
 

@@ -201,6 +201,17 @@ STORIES = {
         " @0.0 put unit=3 socket=A ; @3.5 label by=jo unit=3 ; @24.1 pull unit=3 ;"
         " @26.0 unplug socket=A seconds=4.0 ; @29.0 look"
     ),
+    "the adapter is away when a pulled unit is asked whether it is there": (
+        "line sockets=1 recipe=bicycle ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+        " @6.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @8.5 pull unit=1 ;"
+        " @16.0 unplug socket=A seconds=4.0"
+    ),
+    "exchanged before anything of it was received after an outage": (
+        "line sockets=1 ; unit label=2 ; unit label=3 ; person name=jo ;"
+        " @17.751062 unplug socket=A seconds=0.05 ; @18.583766 put unit=2 socket=A ;"
+        " @18.974001 card by=jo unit=2 socket=A ; @18.974001 pull unit=2 ;"
+        " @19.274001 put unit=3 socket=A ; @19.359158 label by=jo unit=2"
+    ),
     "a new flash after an interrupted one": (
         "line sockets=1 ; unit label=1 pace=slow ; person name=jo source=jo ;"
         " @36.875 label by=jo unit=1 ; @43.122 put unit=1 socket=A ; @43.665 pull unit=1 ;"

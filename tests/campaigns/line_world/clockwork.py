@@ -17,7 +17,7 @@ from greenlet import getcurrent, greenlet  # type: ignore[import-untyped]
 
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
-from flasher.bus.simulated import SimulatedBus
+from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
@@ -45,6 +45,7 @@ class SocketBus(SimulatedBus):
         self.horizon = 0.0
         self.wire_clock = VirtualClock()
         super().__init__(WELLING.bitrate_bps, self.wire_clock)
+        self._link: SimulatedLink | None = None
         self.on_command: Callable[[int, float], None] | None = None
         """Called with each command that the host writes, when its first frame has been carried."""
         self.stop: Callable[[], None] = lambda: None
@@ -69,9 +70,13 @@ class SocketBus(SimulatedBus):
             self.on_command(int.from_bytes(command, "big"), self._sending_ends_at)
         for part in (getattr(sender, "engine", None) for sender in senders):
             if isinstance(part, _Part) and frame is not None:
-                is_received = bool(self._hosts) and self.faults.takes_part
-                part.frame_carried(frame, self._sending_ends_at, is_received=is_received)
+                part.frame_carried(frame, self._sending_ends_at, is_received=self._is_received())
         super()._deliver(senders, frame)
+
+    def _is_received(self) -> bool:
+        """A process listens; what comes before it opens a lost adapter again is discarded."""
+        link, faults = self._link, self.faults
+        return link is not None and link._opened_at == faults.times_unplugged and faults.takes_part
 
     def idle(self, until: float) -> None:
         """Let time pass without an adapter."""
@@ -95,13 +100,14 @@ class SocketBus(SimulatedBus):
     def opened(self) -> Iterator[tuple[Connection, None]]:
         """The adapter of the socket. Raises BusError while it is not plugged in."""
         self.close_adapter()
-        link = self.link()
+        self._link = link = self.link()
         link.reopen()
         yield Connection(link, self.clock, "an adapter"), None
 
     def close_adapter(self) -> None:
         """What the process of the socket had still to send is gone with it."""
         self._silence_hosts()
+        self._link = None
         for host in self._hosts:
             self._nodes.remove(host)
         self._hosts.clear()
@@ -302,8 +308,10 @@ class _Part:
         self.engine.frame_sent(now)
 
     def frame_carried(self, frame: Frame, now: float, *, is_received: bool) -> None:
-        """Its frame has been on the bus to its end, and an adapter has received it."""
-        if is_received and self.engine is self._unit.engine:
+        """Its frame has been on the bus to its end. The station knows only of received ones."""
+        if not is_received:
+            return
+        if self.engine is self._unit.engine:
             is_last = len(frame.data) < FRAME_DATA_SIZE
             self._unit.last_word = self.engine.state if is_last else None
             self._unit.sent_at = now
