@@ -54,7 +54,7 @@ class ProcessPort:
         self._process = context.Process(
             target=worker_main, args=(theirs, setup), name=f"socket {setup.socket}", daemon=True
         )
-        with deaf_from_birth(to_sigterm=True):  # `kill` ends it with SIGKILL
+        with deaf_from_birth():
             self._process.start()
         # The end of the process is only detected after this side has closed the other end.
         theirs.close()

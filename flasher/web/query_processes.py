@@ -9,11 +9,13 @@ import asyncio
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
@@ -29,6 +31,7 @@ ANSWER_LIMIT_S: Final = 120.0
 FIELD_MAX: Final = 200
 """Characters of one field of a form."""
 _NICENESS: Final = 10
+Result = TypeVar("Result")
 HTML: Final = "text/html; charset=utf-8"
 
 
@@ -81,39 +84,40 @@ class QueryProcesses:
 
     def __init__(self, make: Callable[[], Answering]) -> None:
         self._make = make
-        self._pool: Any = None
+        self._pool: ProcessPoolExecutor | None = None
 
     def begin(self) -> None:
-        """Start the processes before the first question."""
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            with deaf_from_birth():
-                self._pool = context.Pool(PROCESSES, _begin, (self._make,))
+        """Start a process, which the first question does else."""
+        self._submit(os.getpid)
 
     async def ask(self, question: Question) -> Answer:
-        """Answer a question. Raises TimeoutError, and all exceptions of the process."""
-        self.begin()
-        loop = asyncio.get_running_loop()
-        answered: asyncio.Future[Answer] = loop.create_future()
+        """The answer to a question. Raises TimeoutError, or what the process raised."""
+        try:
+            answer = self._submit(_answer, question)
+            return await asyncio.wait_for(asyncio.wrap_future(answer), ANSWER_LIMIT_S)
+        except BrokenExecutor:  # a process was killed: others take its place
+            self.close()
+            answer = self._submit(_answer, question)
+            return await asyncio.wait_for(asyncio.wrap_future(answer), ANSWER_LIMIT_S)
 
-        def resolve(set_result: Callable[[Any], None], result: Any) -> None:
-            if not answered.done():
-                set_result(result)
-
-        self._pool.apply_async(
-            _answer,
-            (question,),
-            callback=lambda answer: loop.call_soon_threadsafe(resolve, answered.set_result, answer),
-            error_callback=lambda error: loop.call_soon_threadsafe(
-                resolve, answered.set_exception, error
-            ),
-        )
-        return await asyncio.wait_for(answered, ANSWER_LIMIT_S)
+    def _submit(self, function: Callable[..., Result], *arguments: object) -> Future[Result]:
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(PROCESSES, context, _begin, (self._make,))
+        with deaf_from_birth():
+            return self._pool.submit(function, *arguments)
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.terminate()
-            self._pool.join()
+        """End the processes, also in the middle of an answer."""
+        pool, self._pool = self._pool, None
+        if pool is None:
+            return
+        processes = [*(pool._processes or {}).values()]  # noqa: SLF001  nothing else names them
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+        for process in processes:
+            process.join()
 
 
 _make: Callable[[], Answering]
@@ -124,9 +128,18 @@ def _begin(make: Callable[[], Answering]) -> None:
     """Called once in each process. It does not fail: another process would be started at once."""
     global _make  # noqa: PLW0603  a process has one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
     _make = make
+
+
+def _end_with_parent() -> None:
+    """A station that was killed ends nothing."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _answer(question: Question) -> Answer:

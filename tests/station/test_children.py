@@ -13,7 +13,7 @@ from flasher.station.children import deaf_from_birth
 HEARS = """
 import signal, sys
 blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-sys.exit(not {signal.SIGINT, signal.SIGHUP} <= blocked)
+sys.exit(not {signal.SIGINT, signal.SIGHUP, signal.SIGTERM} <= blocked)
 """
 
 
