@@ -67,6 +67,7 @@ class Bench:
         self.is_off = False
         """True while the case keeps the device switched off."""
 
+        self.waits = tester.waits
         self.choice, self.limit, self.number = profile.choice, profile.limit, profile.number
         self.send, self.disturb = tester.send, tester.disturb
         self.wait, self.wait_until = tester.wait, tester.wait_until

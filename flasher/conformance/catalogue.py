@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from flasher.conformance.clauses import clause_texts
 from flasher.conformance.results import CaseText, Gap
 from flasher.conformance.subject import Subject, readback_source
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import reported_version
 from flasher.errors import UsageError, did_you_mean
 
@@ -121,7 +122,18 @@ class Case:
     requires: frozenset[Requirement] = frozenset()
     choices: tuple[str, ...] = ()
     limit_s: float = 300.0
-    """Time limit of the case on the bench's clock."""
+    """What the case itself needs on the bench's clock, with a device that answers at once."""
+    upgrades: int = 40
+    """Adds the time of this many upgrades at the limits of the profile."""
+    largest: int = 0
+    """Adds the time of this many upgrades to the largest image."""
+
+    def limit_with(self, profile: ConformanceProfile, subject: Subject) -> float:
+        """Time limit of the case for this device, on the bench's clock."""
+        waits = Waits(profile, subject.port.bitrate_bps)
+        largest_s = waits.upgrade_s(profile.number("largest_image_bytes"))
+        own_s = waits.upgrade_s(len(subject.good_image))
+        return self.limit_s + self.upgrades * own_s + self.largest * largest_s
 
 
 CASES: Final[dict[str, Case]] = {}

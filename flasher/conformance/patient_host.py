@@ -29,8 +29,6 @@ _SETTLE_S: Final = 0.3
 _BLIND_S: Final = 1.0
 """A device that announces nothing for this long after a reset may be in a transfer."""
 UPDATES_MAX: Final = 50
-_WINDOW_MAX_S: Final = 1.0
-"""Longest window to assume when the profile does not define it (up_04)."""
 LEFTOVER_S: Final = 0.06
 """A boot version this soon after request transfer was sent before it (R11)."""
 _PACKET_ANSWERS: Final = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION, Reply.COMPLETE)
@@ -50,16 +48,6 @@ class PatientHost:
         self._tester = tester
         self._encoder = tester.encoder
         self._profile = tester.profile
-
-    @property
-    def burst_s(self) -> float:
-        """Longest duration of announcements and window together."""
-        limit, count = self._profile.limit, self._profile.number("versions")
-        spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
-        window_s = limit("window_s") + limit("window_tolerance_s")
-        if self._profile.choice("up_04") == "either":
-            window_s = max(window_s, _WINDOW_MAX_S)
-        return (count - 1) * spacing_s + window_s
 
     # -- application ------------------------------------------------------------------------------
 
@@ -110,11 +98,11 @@ class PatientHost:
             if runs or tester.now >= deadline:
                 # A message sent before the end of a burst that the reset started would be lost.
                 if tester.wait_for(Reply.BOOT_VERSION) is not None:
-                    tester.wait(self.burst_s + _SETTLE_S)
+                    tester.wait(self._tester.waits.burst_s + _SETTLE_S)
                     tester.forget()
                 return runs
             # The reset may have started a burst (RS-02), which another reset would restart.
-            quiet_s = self.burst_s + _SETTLE_S
+            quiet_s = self._tester.waits.burst_s + _SETTLE_S
             while tester.wait_for(Reply.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
                 pass
 

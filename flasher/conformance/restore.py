@@ -20,6 +20,7 @@ from flasher.conformance.results import (
     TraceEntry,
 )
 from flasher.conformance.subject import Subject
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import Reply, reported_version
 
 _MARGIN_S: Final = 60.0
@@ -125,15 +126,9 @@ def needs_power(profile: ConformanceProfile) -> bool:
 
 
 def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
-    """Time limit of one attempt: all waits, and the transfer at low speed."""
-    limit = profile.limit
-    waits_s = (
-        3
-        * _UPGRADE_TRIES
-        * sum(map(limit, ("first_version_s", "pause_s", "erase_s", "complete_s", "start_s")))
-    )
-    frames = len(subject.good_image) / 5.0
-    return waits_s + 4 * frames * 130 / subject.port.bitrate_bps + _MARGIN_S
+    """Time limit of one attempt, each of whose upgrades may begin anew three times."""
+    waits = Waits(profile, subject.port.bitrate_bps)
+    return 3 * _UPGRADE_TRIES * waits.upgrade_s(len(subject.good_image)) + _MARGIN_S
 
 
 def _check_version(bench: Bench) -> str:

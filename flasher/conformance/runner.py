@@ -221,7 +221,7 @@ class SuiteRun:
         bench = Bench(
             self._subject,
             self._profile,
-            limit_s=case.limit_s,
+            limit_s=case.limit_with(self._profile, self._subject),
             seed=seed,
             stopped=self._must_stop,
             upgrades=self._options.upgrades or WEAR.get(case.id, 0),
@@ -284,7 +284,7 @@ class SuiteRun:
         """Verify the flashed good image with what the bench has."""
         subject, image = self._subject, self._subject.good_image
         seen_by = [] if reported_version(subject.target, image) is None else ["version"]
-        limit_s = CASES[BRING_UP].limit_s
+        limit_s = CASES[BRING_UP].limit_with(self._profile, subject)
         bench = Bench(subject, self._profile, limit_s=limit_s, seed=self._options.seed)
         try:
             if bench.difference(image, runs=True) is not None:

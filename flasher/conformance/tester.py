@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseLimitReached, RunStopped, TraceEntry
 from flasher.conformance.subject import BusPort
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import (
     UPDATE,
     WRITE,
@@ -103,6 +104,7 @@ class BusTester:
         self.port = port
         self.encoder = encoder
         self.profile = profile
+        self.waits = Waits(profile, port.bitrate_bps)
         self.began_at = port.now()
         self.ends_at = self.began_at + limit_s
         self.update_was_sent = False

@@ -34,7 +34,7 @@ from flasher.protocol.spec import TARGETS, WELLING, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Reassembler
 
-_HELD: Final = frozenset(
+HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
 )
 _BOOTLOADER: Final = frozenset(BootloaderState) - {
@@ -264,7 +264,7 @@ def faults_of(seed: int, selection: Selection = Selection()) -> list[str]:  # no
         found += [
             f"{seed} {name} {result.case_id} {result.verdict.value}: {result.reason}"
             for result in report.results
-            if result.verdict not in _HELD
+            if result.verdict not in HELD
         ]
         if report.final_image != "verified":
             found.append(f"{seed} {name}: the good image at the end: {report.final_image}")

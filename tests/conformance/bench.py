@@ -127,7 +127,15 @@ def run_case(
 ) -> RunReport:
     """Run one case, FR-00, that performs `action`; with `before_others`, RS-04 too."""
     CASES["FR-00"] = Case(
-        "FR-00", "a test", "R12", "something", "something", action, requires, limit_s=limit_s
+        "FR-00",
+        "a test",
+        "R12",
+        "something",
+        "something",
+        action,
+        requires,
+        limit_s=limit_s,
+        upgrades=0,
     )
     try:
         return run(

@@ -1,15 +1,44 @@
-"""A correct device passes with every choice that the document allows.
+"""A correct device passes with every choice that the document allows, and with every time at its
+limit.
 
 `python -m tests.campaigns.right_devices` runs the whole suite on hundreds of them.
 """
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from tests.campaigns.right_devices import faults_of, right_device
+from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.results import CaseVerdict
+from flasher.conformance.runner import run
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from tests.campaigns.right_devices import HELD, faults_of, right_device
+from tests.conformance.bench import subject
 from tests.loops import each
+
+
+def blamed(
+    *case_ids: str,
+    kind: type[MockDevice] = MockDevice,
+    device: DeviceProfile = MOCK_PROFILE,
+    given: dict[str, Value] | None = None,
+) -> list[str]:
+    """Failures of these cases on a device, judged by its own profile and `given`."""
+    profile = ConformanceProfile({**profile_of_mock(device).given, **(given or {})})
+    report = run(subject(kind, device), profile, selection=Selection(cases=case_ids))
+    found = [
+        f"{result.case_id} {result.verdict.value}: {result.reason}"
+        for result in report.results
+        if result.verdict not in HELD
+    ]
+    assert len(report.results) == len(case_ids)
+    assert all(result.verdict is not CaseVerdict.UNSUPPORTED for result in report.results), report
+    return found
 
 
 @pytest.mark.slow
@@ -24,3 +53,11 @@ def test_a_request_for_a_doubled_update_command_may_come_between_two_copies_of_p
 
 def test_a_seed_makes_the_same_device_again() -> None:
     assert str(right_device(5)) == str(right_device(5)) != str(right_device(6))
+
+
+# -- times at their limits -------------------------------------------------------------------------
+
+
+def test_many_updates_in_a_row_may_erase_to_the_limit_each() -> None:
+    slow = dataclasses.replace(MOCK_PROFILE, erase_time_s=9.9 / 2)
+    assert blamed("UP-08", device=slow, given={"up_08": "either"}) == []

@@ -49,7 +49,9 @@ def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> C
     """Like a run of this case alone, without the restore afterwards."""
     if why_unsupported(case, subject, profile):
         return CaseVerdict.UNSUPPORTED
-    bench = Bench(subject, profile, limit_s=case.limit_s, seed=f"1/{case.id}/1")
+    bench = Bench(
+        subject, profile, limit_s=case.limit_with(profile, subject), seed=f"1/{case.id}/1"
+    )
     _put_image(subject)
     bench.wait(1.0)
     bench.forget()

@@ -97,7 +97,7 @@ def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sen
     "delayed and swapped with the next one, in turn; frames of the answers dropped and doubled",
     expectation="the upgrade by a patient host completes correctly, or is refused explicitly",
     requires={DESTRUCTIVE, LONG},
-    limit_s=1800.0,
+    upgrades=200,
 )
 def disturbed_frames(bench: Bench) -> None:
     delay_s = 1.5 * bench.limit("inter_frame_s")
@@ -131,7 +131,7 @@ def disturbed_frames(bench: Bench) -> None:
     expectation="the device recovers, and the upgrade by a patient host completes correctly; alone "
     "on the bus, where no frame of it is acknowledged, it starts its application too",
     requires={DESTRUCTIVE, Requirement.BUS_OFF},
-    limit_s=1800.0,
+    upgrades=200,
 )
 def bus_off(bench: Bench) -> None:
     def disturbances(frames: int) -> Iterator[_Disturbance]:
@@ -148,12 +148,12 @@ def bus_off(bench: Bench) -> None:
         if not bench.subject.has_power:
             bench.unsupported("the application starts", "needs power control")
             return
-        off_s = bench.host.burst_s + bench.limit("start_s")
+        off_s = bench.waits.burst_s + bench.limit("start_s")
         bench.power_cycle()
         bench.subject.bus_off(off_s)
         bench.wait(off_s / 2)
         bench.forget()
-        replies = bench.collect(off_s / 2 + bench.host.burst_s)
+        replies = bench.collect(off_s / 2 + bench.waits.burst_s)
         versions = [one for one in replies if one.kind is Reply.BOOT_VERSION]
         bench.check(not versions, "the application runs by then", describe(versions))
         bench.check_application()
@@ -230,7 +230,7 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
             with disturbance.send(bench, bench.encoder.reset()):
                 reply = bench.wait_for(Reply.BOOT_VERSION, Reply.REQUEST, within_s=within_s)
         else:
-            within_s = bench.host.burst_s if disturbance.name else limit("erase_s")
+            within_s = bench.waits.burst_s if disturbance.name else limit("erase_s")
             with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
                 reply = bench.host.request_or_version(sent.left_at, within_s)
             # The device may still be in the bootloader: request transfer may be lost (UP-05).

@@ -64,7 +64,7 @@ Damage = tuple[str, Callable[[bytes], bytes]]
     stimulus="a packet once for each of its 1152 bits, with that bit inverted",
     expectation="none accepted; afterwards the correct packet is accepted and stored unchanged",
     requires={DESTRUCTIVE, LONG},
-    limit_s=1800.0,
+    upgrades=200,
 )
 def single_bits(bench: Bench) -> None:
     probe = _probe_without_headers(bench)
@@ -86,7 +86,7 @@ def single_bits(bench: Bench) -> None:
     "packet lost, doubled, swapped with the next one",
     expectation="none accepted; afterwards the correct packet is accepted and stored unchanged",
     requires={DESTRUCTIVE, LONG},
-    limit_s=1800.0,
+    upgrades=200,
 )
 def bursts(bench: Bench) -> None:
     probe = _probe_without_headers(bench)

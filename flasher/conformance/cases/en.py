@@ -47,7 +47,7 @@ def end(bench: Bench) -> None:
         bench.check_image(image)
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
         bench.check_application(image)
 
 
@@ -159,7 +159,7 @@ def wrong_checksum(bench: Bench) -> None:
         reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
         if bench.choice("rs_03") == "announces":  # else it may listen silently
             bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
-        bench.wait(bench.host.burst_s)
+        bench.wait(bench.waits.burst_s)
         runs = bench.application_runs(_NO_APPLICATION_S)
         bench.check(not runs, "no application runs", "it answers" if runs else "no answer")
     with bench.step("the good image"):

@@ -70,7 +70,7 @@ class _InterruptedUpgrade:
     "upgraded; acknowledged packets are stored",
     requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
-    limit_s=7200.0,
+    upgrades=400,
 )
 def cuts(bench: Bench) -> None:
     upgrade = _upgrade(bench)
@@ -102,7 +102,7 @@ def cuts(bench: Bench) -> None:
     "upgraded",
     requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
-    limit_s=3600.0,
+    upgrades=60,
 )
 def second_cut(bench: Bench) -> None:
     upgrade = _upgrade(bench)
@@ -227,7 +227,7 @@ def _check_after_cut(
         )
         return
     spacing_s = bench.limit("version_spacing_s") + bench.limit("version_spacing_tolerance_s")
-    replies = bench.collect(bench.host.burst_s + 2 * spacing_s)
+    replies = bench.collect(bench.waits.burst_s + 2 * spacing_s)
     announced = 1 + sum(one.kind is Reply.BOOT_VERSION for one in replies)
     # More than a burst means that it has no application to start.
     upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
@@ -372,7 +372,7 @@ def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         bench.end_transfer()
         bench.power_cycle(_OFF_S)
         bench.wait_for(Reply.BOOT_VERSION)  # without one: RS-05
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
         bench.check_image(upgrade.new)
         upgrade.runs = True
         upgrade.swap()

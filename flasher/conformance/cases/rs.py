@@ -104,7 +104,7 @@ def no_update(bench: Bench) -> None:
     count = bench.number("versions")
     with bench.step("with an application"):
         bench.reset_to_bootloader()
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
         bench.check_application()
     with bench.step("without an application"):
         bench.erase_application()
@@ -124,7 +124,7 @@ def no_update(bench: Bench) -> None:
             bench.check_upgrade()
         else:
             spacing_s = bench.limit("version_spacing_s")
-            more = _versions(bench.collect(3 * count * spacing_s + bench.host.burst_s))
+            more = _versions(bench.collect(3 * count * spacing_s + bench.waits.burst_s))
             expected = f"one burst of {count}, then silence"
             bench.check(more == count - 1, expected, f"{more + 1} boot versions")
             bench.update(len(bench.good_image))
@@ -193,7 +193,7 @@ def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
     """Check that exactly `count` boot versions, or one of `others`, and no other messages arrive
     until burst and window are over.
     """
-    replies = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
+    replies = bench.collect(bench.waits.burst_s + bench.limit("first_version_s") / 4)
     wanted = " or ".join(map(str, (count, *others)))
     bench.check(_versions(replies) in (count, *others), f"{expected}: {wanted}", describe(replies))
     bench.check_only(replies, Reply.BOOT_VERSION, Reply.FEEDBACK, why="nothing but boot versions")

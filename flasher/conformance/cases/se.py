@@ -100,8 +100,8 @@ def endless(bench: Bench) -> None:
 def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
     """Send useless data beyond the end of the window; the application still has to start."""
     bench.reset_to_bootloader()
-    ends_at = bench.now + bench.host.burst_s
-    for _ in range(1 + int(bench.host.burst_s / (_FLOOD_FRAMES * 0.0004))):
+    ends_at = bench.now + bench.waits.burst_s
+    for _ in range(1 + int(bench.waits.burst_s / (_FLOOD_FRAMES * 0.0004))):
         if bench.now < ends_at:
             bench.send(frames)
     if bench.encoder.has_version_query:
@@ -158,7 +158,7 @@ def noise(bench: Bench) -> None:
     with bench.step("the announcements"):
         bench.reset_to_bootloader()
         _send_noise(bench)
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
         bench.check_image(image)
     with bench.step("while it erases"):
         bench.reset_to_bootloader()

@@ -110,7 +110,7 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
         bench.measure(TimeName.SPACING, reply.at - last.at)
         last = reply
     if wait:
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
     return last
 
 

@@ -83,7 +83,7 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     bench.reset_to_bootloader()
     bench.wait_until_listening()
     bench.send(frames)
-    replies = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
+    replies = bench.collect(bench.waits.burst_s + bench.limit("inter_frame_s"))
     positive = [one for one in replies if one.kind in (Reply.ACK, Reply.COMPLETE, Reply.REQUEST)]
     bench.check(not positive, "neither ACK nor complete", describe(positive or replies))
 
@@ -279,7 +279,7 @@ def wrong_start_byte(bench: Bench) -> None:
     "the good image padded with FF, including end of transfer",
     expectation="every packet is accepted and stored at its place; the second image runs",
     requires={DESTRUCTIVE, LONG},
-    limit_s=7200.0,
+    largest=2,
 )
 def many_packets(bench: Bench) -> None:
     if needs_power(bench.profile) and not bench.subject.has_power:
@@ -386,7 +386,7 @@ def other_filler(bench: Bench) -> None:
     expectation="announces again or keeps waiting (tx_12); reachable; the long transfer continues",
     requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
-    limit_s=900.0,
+    upgrades=80,
 )
 def pause(bench: Bench) -> None:
     with bench.step("a long transfer"):

@@ -93,7 +93,7 @@ def without_reset(bench: Bench) -> None:
     bench.check_application()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
-        bench.collect(bench.host.burst_s)
+        bench.collect(bench.waits.burst_s)
         bench.check_image(image)
 
 
@@ -325,7 +325,7 @@ def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> No
     with bench.step(step):
         bench.reset_to_bootloader()
         bench.send(frames)
-        replies = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
+        replies = bench.collect(bench.waits.burst_s + bench.limit("silence_s"))
         answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
         _check_answer(bench, answers, Reply.NAK, bench.choice("up_02"), "rejected by ")
         bench.check_image(bench.good_image)

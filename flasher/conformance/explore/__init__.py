@@ -23,12 +23,14 @@ from flasher.conformance.results import (
     WalkFinding,
 )
 from flasher.conformance.subject import Subject
+from flasher.conformance.waits import Waits
 from flasher.errors import BusError
 
 WALK_STEPS: Final = 24
 """Steps of the longest walk."""
 SHRINK_TRIES: Final = 60
-_LIMIT_S: Final = 900.0
+_LARGE_BYTES: Final = 70_000
+"""About as many bytes as the largest image of a walk has."""
 _NO_CHANCE: Final = random.Random(0)  # noqa: S311  all steps are given
 
 
@@ -99,7 +101,9 @@ class Explorer:
         the good image.
         """
         self._walks += 1
-        bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
+        waits = Waits(self._profile, self._subject.port.bitrate_bps)
+        limit_s = WALK_STEPS * waits.upgrade_s(_LARGE_BYTES)
+        bench = Bench(self._subject, self._profile, limit_s=limit_s, stopped=self._stopped)
         bench.tester.collects_feedback = True
         walk = Walk(bench)
         try:

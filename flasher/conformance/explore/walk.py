@@ -135,7 +135,7 @@ class Walk:
         """Check that the expected application runs. Raises Violation."""
         bench = self.bench
         if self.phase is not DevicePhase.APPLICATION and bench.encoder.has_version_query:
-            bench.wait(bench.host.burst_s)
+            bench.wait(bench.waits.burst_s)
         wanted = version_in(self.running_image)
         if wanted is None or not bench.encoder.has_version_query:
             found, wanted = ("answers" if bench.application_runs() else "no answer"), "answers"
@@ -159,7 +159,7 @@ class Walk:
         """Update the state for the time that passed since the last step."""
         bench = self.bench
         silent_s = bench.now - self._version_at
-        if self.phase is DevicePhase.ANNOUNCING and silent_s > bench.host.burst_s:
+        if self.phase is DevicePhase.ANNOUNCING and silent_s > bench.waits.burst_s:
             if self.has_application:
                 self._await_start()
             elif self.has_application is None:
@@ -354,7 +354,7 @@ class Walk:
     def _wait(self, argument: str) -> None:
         bench = self.bench
         if argument != "pause":
-            seconds = bench.host.burst_s + _GAP_S if argument == "window" else float(argument)
+            seconds = bench.waits.burst_s + _GAP_S if argument == "window" else float(argument)
             self._listen(seconds)
             return
         choice = bench.choice("tx_12")
@@ -510,7 +510,7 @@ class Walk:
                 self._completed()
             return
         self._updates_unanswered = 0
-        self._listen(bench.host.burst_s + _GAP_S)
+        self._listen(bench.waits.burst_s + _GAP_S)
         self._check_not_mixed([image for image in (before, after) if image is not None])
         self._may_complete = False
 

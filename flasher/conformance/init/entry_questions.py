@@ -231,7 +231,7 @@ def rejected_update(session: InitSession) -> Findings:
         for _ in range(REPEATS):
             session.enter()
             bench.send(frames)
-            replies = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
+            replies = bench.collect(bench.waits.burst_s + bench.limit("ack_s"))
             answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
             yield Trial(_choice_for(answers), answer_text(answers), stimulus)
             session.await_application()

@@ -13,11 +13,13 @@ from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import DeviceDecoder, RawFrame, Received, Reply, describe
 
 REPEATS: Final = 3
 """How often to repeat a trial."""
-_LIMIT_S: Final = 7200.0
+_UPGRADES_MAX: Final = 200
+"""More than any question takes, at the limits of the profile."""
 _ASK_S: Final = 0.05
 _BURST_GAP_S: Final = 1.5
 """Longer than the gap between two boot versions of a burst."""
@@ -32,7 +34,9 @@ class InitSession(PacketTransfer):
     def __init__(
         self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
     ) -> None:
-        bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
+        waits = Waits(profile, subject.port.bitrate_bps)
+        limit_s = _UPGRADES_MAX * waits.upgrade_s(len(subject.good_image))
+        bench = Bench(subject, profile, limit_s=limit_s, seed="init", stopped=stopped)
         super().__init__(bench, subject.good_image)
 
     def settle(self) -> None:
@@ -50,7 +54,7 @@ class InitSession(PacketTransfer):
     def await_application(self, name: str = "", since: float = 0.0) -> None:
         """Wait until the application answers; records the time since `since` under `name`."""
         bench = self.bench
-        within_s = bench.limit("start_s") + bench.host.burst_s
+        within_s = bench.limit("start_s") + bench.waits.burst_s
         if not bench.encoder.has_version_query:
             # The only query would be a reset, which restarts the bootloader.
             self.settle()

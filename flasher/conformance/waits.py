@@ -1,0 +1,46 @@
+"""Computes how long the suite waits, from all times of the profile that bear on it.
+
+A device that uses every limit to its end is right, so no wait is shorter than the limits that it
+covers; cases and `init` take their waits from here or from the profile, never as numbers.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from flasher.conformance.wire import PACKET_FRAMES, packet_count
+
+if TYPE_CHECKING:  # the profile needs the validation library, which the list of cases does not
+    from flasher.conformance.profile import ConformanceProfile
+
+_WINDOW_MAX_S: Final = 1.0
+"""Longest window to assume when the profile does not define it (up_04)."""
+_FRAME_BITS: Final = 135
+"""Bits of an 8-byte frame with all possible stuff bits and the interframe space."""
+
+
+class Waits:
+    """Waits for a device of this profile, in seconds."""
+
+    def __init__(self, profile: ConformanceProfile, bitrate_bps: int) -> None:
+        self._profile = profile
+        self._limit = profile.limit
+        self._bitrate_bps = bitrate_bps
+
+    @property
+    def burst_s(self) -> float:
+        """Longest duration of announcements and window together."""
+        limit, count = self._limit, self._profile.number("versions")
+        spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
+        window_s = limit("window_s") + limit("window_tolerance_s")
+        if self._profile.choice("up_04") == "either":
+            window_s = max(window_s, _WINDOW_MAX_S)
+        return (count - 1) * spacing_s + window_s
+
+    def upgrade_s(self, image_bytes: int) -> float:
+        """Longest duration of an upgrade from a running application to a running application,
+        including a pause that ends a transfer before it.
+        """
+        names = ("pause_s", "feedback_s", "first_version_s", "erase_s", "complete_s", "start_s")
+        packet_s = PACKET_FRAMES * _FRAME_BITS / self._bitrate_bps + self._limit("ack_s")
+        return self.burst_s + sum(map(self._limit, names)) + packet_count(image_bytes) * packet_s
