@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from math import inf
 from typing import Final
 
 from flasher.conformance.judge import Judge, TimeName
@@ -66,6 +67,10 @@ class Bench:
         """Number of upgrades for a case that wears the flash."""
         self.is_off = False
         """True while the case keeps the device switched off."""
+        self.continued_at = -inf
+        """When the transfer last went on: the last packet that was acknowledged was sent, or
+        request transfer arrived. A pause may count from there (TX-12).
+        """
 
         self.waits = tester.waits
         self.choice, self.limit, self.number = profile.choice, profile.limit, profile.number
@@ -162,6 +167,7 @@ class Bench:
             reply = None
         found = self.require_received(reply, Reply.REQUEST.value, limit_s)
         self.measure(TimeName.REQUEST, found.at - sent.left_at)
+        self.continued_at = found.at
         return found
 
     def start_transfer(self, size_bytes: int) -> None:
@@ -175,6 +181,7 @@ class Bench:
         """Send a packet of `image` and require its ACK."""
         sent = self.send_packet(image, number)
         reply = self.expect(Reply.ACK, number=number)
+        self.continued_at = sent.left_at
         self.measure(TimeName.ANSWER, reply.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
@@ -215,7 +222,7 @@ class Bench:
 
     def answers(self) -> list[Received]:
         """Wait for the first answer and any that follow it immediately."""
-        first = self.next_message(self.limit("ack_s") + self.limit("inter_frame_s"))
+        first = self.next_message(self.waits.settle_s)
         return [] if first is None else [first, *self.collect(QUIET_S)]
 
     def gaps(
@@ -230,6 +237,23 @@ class Bench:
         edge_s = frame_s + 2 * self.port.uncertainty_s + _EDGE_S
         for gap_s in (*(share * limit_s for share in shares), max(limit_s - edge_s, 0.0)):
             yield gap_s, min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
+
+    def is_pause_near(self, for_s: float) -> bool:
+        """True when the silence since the transfer last went on becomes a pause (TX-12) before
+        `for_s` more have passed.
+        """
+        return self.now + for_s >= self.continued_at + self.limit("pause_s")
+
+    def stay_before(self, image: bytes, number: int) -> None:
+        """Where packet `number` of `image` is next: when a pause may end the transfer before a
+        stimulus is answered, finish it and begin it again up to here. Several stimuli in a row
+        that the device does not take for progress would become a pause.
+        """
+        stimulus_s = 2 * self.waits.packet_s + self.waits.settle_s + QUIET_S
+        if self.choice("tx_12") != "waits" and self.is_pause_near(stimulus_s):
+            self.finish(image, number)
+            self.start_transfer(len(image))
+            self.packets(image, 1, number - 1)
 
     def end_transfer(self) -> None:
         """Send end of transfer and require complete."""

@@ -212,8 +212,8 @@ class BusTester:
     # -- receiving --------------------------------------------------------------------------------
 
     def next_message(self, within_s: float) -> Received | None:
-        """The next message, or None after `within_s`."""
-        deadline = self.now + within_s
+        """The next message, or None after `within_s`; one at the very end counts."""
+        deadline = self.now + within_s + self.port.uncertainty_s
         while not self._received:
             if self.now >= deadline:
                 return None

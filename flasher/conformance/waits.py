@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # the profile needs the validation library, which the list of
 
 _WINDOW_MAX_S: Final = 1.0
 """Longest window to assume when the profile does not define it (up_04)."""
+_INCOMPLETE: Final = 2
+"""A device waits for the rest of a message at most this many times the gap that it accepts."""
 _FRAME_BITS: Final = 135
 """Bits of an 8-byte frame with all possible stuff bits and the interframe space."""
 
@@ -37,10 +39,23 @@ class Waits:
             window_s = max(window_s, _WINDOW_MAX_S)
         return (count - 1) * spacing_s + window_s
 
+    @property
+    def settle_s(self) -> float:
+        """From the last frame of damaged or incomplete messages to the last answer to them: the
+        device notices that the rest is missing, and then takes as long as for any answer. No
+        partial message is left in it then.
+        """
+        return _INCOMPLETE * self._limit("inter_frame_s") + self._limit("ack_s")
+
+    @property
+    def packet_s(self) -> float:
+        """Longest time of a packet on the bus."""
+        return PACKET_FRAMES * _FRAME_BITS / self._bitrate_bps
+
     def upgrade_s(self, image_bytes: int) -> float:
         """Longest duration of an upgrade from a running application to a running application,
         including a pause that ends a transfer before it.
         """
         names = ("pause_s", "feedback_s", "first_version_s", "erase_s", "complete_s", "start_s")
-        packet_s = PACKET_FRAMES * _FRAME_BITS / self._bitrate_bps + self._limit("ack_s")
+        packet_s = self.packet_s + self._limit("ack_s")
         return self.burst_s + sum(map(self._limit, names)) + packet_count(image_bytes) * packet_s

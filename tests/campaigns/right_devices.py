@@ -14,9 +14,10 @@ import os
 import random
 import sys
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.mock import MockSubject, profile_of_mock
@@ -122,6 +123,85 @@ class _SilentToShort(MockDevice):
     def _take_damage(self, damage: Damage, now: float) -> None:
         if damage.reason is not DamageReason.INCOMPLETE:
             super()._take_damage(damage, now)
+
+
+class AnswersLate(MockDevice):
+    """Sends each kind of answer only after this time, and none before an earlier one."""
+
+    late_s: ClassVar[Mapping[type[messages.UpgradeMessage], float]] = {}
+    _at = 0.0
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._held: deque[tuple[float, messages.UpgradeMessage]] = deque()
+        super().__init__(*args, **kwargs)
+
+    def _handle(self, event: BootloaderEvent, now: float) -> None:
+        self._at = now
+        super()._handle(event, now)
+
+    def _send(self, row: messages.UpgradeMessage) -> None:
+        due_at = max(self._at + self.late_s.get(type(row), 0.0), self._held_until)
+        if due_at > self._at:
+            self._held.append((due_at, row))
+        else:
+            super()._send(row)
+
+    @property
+    def _held_until(self) -> float:
+        return self._held[-1][0] if self._held else 0.0
+
+    def tick(self, now: float) -> None:
+        while self._held and self._held[0][0] <= now:
+            super()._send(self._held.popleft()[1])
+        super().tick(now)
+
+    def deadline(self) -> float | None:
+        due_at = super().deadline()
+        if not self._held:
+            return due_at
+        return self._held[0][0] if due_at is None else min(due_at, self._held[0][0])
+
+    def _restart(self, now: float) -> str:
+        self._held.clear()
+        return super()._restart(now)
+
+    def _switch_off(self, now: float) -> str:
+        self._held.clear()
+        return super()._switch_off(now)
+
+    def _await_restart(self, now: float) -> None:
+        super()._await_restart(now)
+        self._due_at = max(self._due_at, self._held_until)  # feedback comes first
+
+    def _complete(self, now: float) -> str:
+        detail = super()._complete(now)
+        self._due_at += max(0.0, self._held_until - now)
+        return detail
+
+
+def answers_late(**late_s: float) -> type[AnswersLate]:
+    """A device that sends these messages late: `answers_late(Nak=0.4)`."""
+    kinds = {getattr(messages, name): value for name, value in late_s.items()}
+    return type("AnswersLate", (AnswersLate,), {"late_s": kinds})
+
+
+class CountsFromPackets(MockDevice):
+    """Counts a pause from the last packet that it stored, or from request transfer (TX-12)."""
+
+    _has_stored = False
+
+    def _acknowledge(self, now: float) -> str:
+        self._has_stored = True
+        return super()._acknowledge(now)
+
+    def _request(self, now: float) -> str:
+        self._has_stored = True
+        return super()._request(now)
+
+    def _await_host(self, now: float) -> None:
+        if self._has_stored:
+            super()._await_host(now)
+        self._has_stored = False
 
 
 _BEHAVIOURS: Final[tuple[tuple[type[MockDevice], dict[str, Value]], ...]] = (

@@ -7,6 +7,7 @@ limit.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,13 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from tests.campaigns.right_devices import HELD, faults_of, right_device
+from tests.campaigns.right_devices import (
+    HELD,
+    CountsFromPackets,
+    answers_late,
+    faults_of,
+    right_device,
+)
 from tests.conformance.bench import subject
 from tests.loops import each
 
@@ -61,3 +68,23 @@ def test_a_seed_makes_the_same_device_again() -> None:
 def test_many_updates_in_a_row_may_erase_to_the_limit_each() -> None:
     slow = dataclasses.replace(MOCK_PROFILE, erase_time_s=9.9 / 2)
     assert blamed("UP-08", device=slow, given={"up_08": "either"}) == []
+
+
+@each("late_s", (0.3, 0.45, 0.498))
+def test_damage_may_be_answered_as_late_as_a_packet(late_s: float) -> None:
+    cases = ("FR-04", "FR-06", "CR-02", "CR-03")
+    assert blamed(*cases, kind=answers_late(Nak=late_s)) == []
+
+
+@pytest.mark.slow
+def test_bit_flips_may_be_answered_late() -> None:
+    assert blamed("CR-01", kind=answers_late(Nak=0.498)) == []
+
+
+@each("case_id", ("TX-01", "TX-03", "TX-04", "TX-06", "SE-04", "EN-02", "CO-04"))
+@each("bad_packet", ("silence", "nak_received"))
+def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> None:
+    device = dataclasses.replace(MOCK_PROFILE, bad_packet=bad_packet, transfer_timeout_s=3.0)
+    late = answers_late(Nak=0.45)
+    kind = type("Hasty", (CountsFromPackets, late), {})
+    assert blamed(case_id, kind=kind, device=device) == []

@@ -89,6 +89,7 @@ def end_early_and_twice(bench: Bench) -> None:
     bench.packets(image, done + 1)
     for mark in _WRONG_MARKS:
         with bench.step(f"end of transfer with {mark:02X}"):
+            bench.stay_before(image, total + 1)
             bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
             answers = bench.collect(bench.limit("ack_s"))
             ok = not any(one.kind in (Reply.COMPLETE, Reply.ACK) for one in answers)

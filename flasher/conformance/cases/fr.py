@@ -198,7 +198,7 @@ def too_short(bench: Bench) -> None:
     for name, raw in broken_off.items():
         with bench.step(name):
             bench.send(bench.encoder.frames(raw))
-            bench.wait(probe.settle_s())
+            bench.wait(bench.waits.settle_s)
             probe.send_next()
         with bench.step(f"{name}, a packet at once"):
             frames = bench.encoder.frames(raw) + probe.frames()

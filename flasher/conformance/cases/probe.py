@@ -58,10 +58,6 @@ class PacketTransfer:
         """The next packet as bytes, header to tail."""
         return joined(self.frames())
 
-    def settle_s(self) -> float:
-        """Longer than a bootloader waits for the rest of a message."""
-        return 2 * self.bench.limit("inter_frame_s")
-
     def is_accepted(self, reply: Received) -> bool:
         """True for the ACK of the next packet."""
         return reply.kind is Reply.ACK and reply.number == self.number
@@ -76,7 +72,7 @@ class PacketTransfer:
         bench.forget()
         bench.send(frames, gap_s=gap_s, gaps=gaps)
         # Long enough that no partial message is left when the next packet arrives.
-        deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
+        deadline = bench.now + bench.waits.settle_s
         replies: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
             replies.append(one)
@@ -98,12 +94,10 @@ class Probe(PacketTransfer):
         wanted = bench.filler(_PACKETS) if image is None else image
         # Not a whole number of packets; UP-01 covers that.
         super().__init__(bench, (wanted + _REST)[:largest])
-        self._taken_at = bench.now
 
     def begin(self) -> None:
         """Reset the running application and get request transfer."""
         self.bench.start_transfer(len(self.image))
-        self._taken_at = self.bench.now
 
     def enter(self, frames: Sequence[RawFrame], wanted: str, *, reset: bool = True) -> None:
         """Send frames that contain the update command to the announcing bootloader, check whether
@@ -117,11 +111,13 @@ class Probe(PacketTransfer):
         reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
         taken = reply is not None and reply.kind is Reply.REQUEST
         bench.check(complies(wanted, taken), f"update command {wanted}", reply or "no answer")
-        if not taken:
+        if taken:
+            bench.continued_at = bench.now
+        else:
             if reset and reply is None:  # by now the application was started
                 bench.reset_to_bootloader()
             bench.update(len(self.image))
-        self.stored, self._taken_at = 0, bench.now
+        self.stored = 0
 
     def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:
         """At the first boot version, send stimuli that have to be rejected: the device may answer
@@ -143,7 +139,7 @@ class Probe(PacketTransfer):
         goes_on = not is_burst or (bool(replies) and replies[-1].kind is Reply.BOOT_VERSION)
         bench.require(ok and goes_on, "boot version, at most NAK before it", describe(replies))
         bench.update(len(self.image))
-        self.stored, self._taken_at = 0, bench.now
+        self.stored = 0
 
     def frames(self) -> list[RawFrame]:
         """Frames of the next packet; starts a new transfer when all packets were sent."""
@@ -159,12 +155,16 @@ class Probe(PacketTransfer):
         self.frames()
         self.bench.forget()
         self.bench.packet(self.image, self.number)
-        self._note_stored()
+        self.stored += 1
 
-    def keep_alive(self) -> None:
-        """Send the next packet if the device may soon take the silence for a pause (TX-12)."""
-        if self.bench.now - self._taken_at > self.bench.limit("pause_s") / 2:
-            self.bench.wait(self.settle_s())
+    def keep_alive(self, packets: int = 1) -> None:
+        """Send the next packet when a pause may end the transfer (TX-12) before `packets` more
+        are sent and answered.
+        """
+        waits = self.bench.waits
+        if self.bench.is_pause_near(2 * waits.settle_s + (1 + packets) * waits.packet_s):
+            if not self.bench.is_pause_near(waits.settle_s + waits.packet_s):
+                self.bench.wait(waits.settle_s)
             self.send_next()
 
     def offer(
@@ -180,6 +180,7 @@ class Probe(PacketTransfer):
         if it is not, send it unchanged. Ignores messages of the kinds `ignoring`. Returns whether
         the packet was accepted.
         """
+        bench = self.bench
         replies = self.answers(frames, gap_s=gap_s, gaps=gaps)
         taken = any(map(self.is_accepted, replies))
         allowed = (Reply.NAK, *ignoring)
@@ -190,9 +191,10 @@ class Probe(PacketTransfer):
             EITHER: f"ACK {self.number}, NAK or no answer",
         }
         ok = complies(wanted, taken) and not others
-        self.bench.check(ok, expected[wanted], describe(replies))
+        bench.check(ok, expected[wanted], describe(replies))
         if taken:
-            self._note_stored()
+            self.stored += 1
+            bench.continued_at = bench.tester.left_at
         else:
             self.send_next()
         return taken
@@ -204,7 +206,7 @@ class Probe(PacketTransfer):
         bench = self.bench
         bench.forget()
         bench.send(frames)
-        replies = bench.collect(self.settle_s())
+        replies = bench.collect(self.bench.waits.settle_s)
         ok = all(one.kind is Reply.NAK for one in replies)
         bench.require(ok, "NAK or no answer", describe(replies))
         self.send_next()
@@ -219,7 +221,3 @@ class Probe(PacketTransfer):
             bench.check_stored(self.image[:written])
         else:
             bench.unsupported("the flash holds the image", "all of it may still be buffered")
-
-    def _note_stored(self) -> None:
-        self.stored += 1
-        self._taken_at = self.bench.now

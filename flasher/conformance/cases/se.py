@@ -263,6 +263,7 @@ def outside(bench: Bench) -> None:
     for stored in bench.transfer_in_parts(image, (0, 1, total)):
         for number, named in numbers:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
+                bench.stay_before(image, stored + 1)
                 bench.send(bench.encoder.packet(number, named, marker))
                 replies = bench.answers()
                 ok = all(one.kind is Reply.NAK for one in replies)

@@ -109,6 +109,7 @@ def damaged(bench: Bench) -> None:
             index, choice = lost[number], bench.choice("tx_01_lost_frame")
             trusts_it = bench.choice("tx_01") in ("nak_received", "either")
             with bench.step(f"packet {number} without its frame {index + 1}"):
+                bench.stay_before(image, number)
                 frames = bench.encoder.packet_of(image, number)
                 bench.send(frames[:index] + frames[index + 1 :])
                 # Without its first frame the message cannot be recognised as a packet.
@@ -123,9 +124,11 @@ def damaged(bench: Bench) -> None:
         for named, step in neighbours.items():
             if 1 <= named <= total:
                 with bench.step(f"packet {number}, {step}"):
+                    bench.stay_before(image, number)
                     bench.send(bench.encoder.damaged_packet_of(image, named))
                     bench.check_packet_rejected(number, named)
         with bench.step(f"packet {number}, a wrong bit"):
+            bench.stay_before(image, number)
             raw = bytearray(joined(bench.encoder.packet_of(image, number)))
             raw[_DATA_AT] ^= 0x10
             bench.send(bench.encoder.frames(bytes(raw)))
@@ -172,6 +175,7 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
         more = [f"ACK {number}", f"NAK {number}"] if number == total and choice != "ack" else []
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
+                bench.stay_before(image, number + 1)
                 bench.send(bench.encoder.packet(number, total, payload))
                 replies = describe(bench.answers())
                 expected = f"{' or '.join(allowed)} for the repeated packet"
@@ -206,6 +210,7 @@ def out_of_order(bench: Bench) -> None:
             if 0 < number == stored or number > _NUMBER_MAX:
                 continue
             with bench.step(f"after packet {stored}, number {number}"):
+                bench.stay_before(image, stored + 1)
                 bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
                 # When all packets are stored, any number in a NAK is correct.
                 is_open = stored == total
@@ -214,6 +219,7 @@ def out_of_order(bench: Bench) -> None:
             payload = packet_payload(image, number)
             for what, data in (("the right", payload), ("other", inverted(payload))):
                 with bench.step(f"after packet {stored}, packet {number} with {what} data"):
+                    bench.stay_before(image, stored + 1)
                     bench.send(bench.encoder.packet(number, total, data))
                     if choice in ("nak", "silence"):
                         bench.check_naks([number, _STORED + 1], choice)
@@ -244,6 +250,7 @@ def wrong_total(bench: Bench) -> None:
     for number in _transfer_stopping_at(bench, image, (1, _STORED + 1, total)):
         for named in wrong:
             with bench.step(f"packet {number} of {named}"):
+                bench.stay_before(image, number)
                 bench.send(bench.encoder.packet(number, named, packet_payload(image, number)))
                 bench.check_packet_rejected(number, number)
 
@@ -264,6 +271,7 @@ def wrong_start_byte(bench: Bench) -> None:
         payload = packet_payload(image, number)
         for start in _START_BYTES:
             with bench.step(f"packet {number} with {start:02X}"):
+                bench.stay_before(image, number)
                 bench.send(bench.encoder.packet(number, total, payload, start=start))
                 bench.check_packet_rejected(number, number)
 
