@@ -397,11 +397,14 @@ def test_who_cannot_be_asked_has_to_stay_from_its_first_update_command_on() -> N
     assert played.seen["ERROR UNIT_CHANGED"] == 1
 
 
-def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged() -> None:
+@pytest.mark.parametrize("again", ["", " @11.5 card by=al unit=2 ;"])
+def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged(again: str) -> None:
+    """Also when somebody else scans the card that waits once more, at the same page."""
     played = told(
         "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
-        " @3.0 put unit=1 socket=A ; @9.0 card by=jo unit=1 ; @10.0 pull unit=1 ;"
-        " @11.0 put unit=2 socket=A ; @12.0 label by=jo unit=1 ; @20.0 look"
+        " person name=al ; @3.0 put unit=1 socket=A ; @9.0 card by=jo unit=1 ;"
+        f" @10.0 pull unit=1 ; @11.0 put unit=2 socket=A ;{again}"
+        " @12.0 label by=jo unit=1 ; @20.0 look"
     )
     assert played.text == ""
     assert played.seen is not None

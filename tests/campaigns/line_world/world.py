@@ -142,8 +142,9 @@ class Bay:
     put_at: float = 0.0
     """When a unit was put in last."""
     card_at: float = inf
+    """When its card, which waits for a label, was accepted first."""
     label_at: float = float("-inf")
-    """When its card and a label for it were accepted last."""
+    """When a label for it was accepted last."""
     commanded_at: dict[int, float] = field(default_factory=dict)
     """When the run sent each command first."""
     unseen: str = ""
@@ -151,6 +152,11 @@ class Bay:
     heard: dict[str, None] = field(default_factory=dict)
     """Labels of the units that sent something in the run."""
     shown: SocketChanged | None = None
+
+    @property
+    def awaits_label(self) -> bool:
+        """Its card was scanned, and its tile asks for the label."""
+        return self.shown is not None and self.shown.text.startswith(_SCAN_LABEL)
 
     def blind(self, until: float, seconds: float) -> None:
         """Nobody observes it until then, for so long."""
@@ -395,8 +401,8 @@ class World:
                 for person in self.people.values():
                     if person.source == event.source:
                         person.card = None  # the screen says that it was used
-            else:
-                bay.card_at = self.now
+            elif not bay.awaits_label:
+                bay.card_at = self.now  # the same card, scanned again, does not begin another wait
 
     def _forget(self, text: str, source: str) -> None:
         """It is reported at a source that a scan does not wait any more."""
@@ -538,9 +544,7 @@ class World:
         if any(each.label is not None or each.notices_at < inf for each in sharing):
             return False  # the screen says whose card is awaited, or whose was dropped just now
         if self._scan(f"SOCKET {bay.name}", person):
-            text = "" if bay.shown is None else bay.shown.text
-            is_awaited = text.startswith(_SCAN_LABEL)
-            person.card = (bay.name, act.unit, is_in) if is_awaited else None
+            person.card = (bay.name, act.unit, is_in) if bay.awaits_label else None
             person.notices_at = inf
             person.label = None
         return True
