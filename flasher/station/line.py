@@ -570,12 +570,15 @@ class Line:
         return socket
 
     def _take_for_card(self, card: Socket, serial: str, waiting: Waiting, now: float) -> None:
-        """Handle a label after the card of its socket. Raises Refused, which uses up the card."""
+        """Handle a label after the card of its socket. Raises Refused, which uses up the card: a
+        second reading of the label must not be taken for one that was scanned alone.
+        """
         try:
             self._check_label(serial)
             self._check_for(card, serial, waiting.source)
         except Refused:
             self._forget_card(waiting)
+            waiting.is_in_doubt, waiting.refused_label = True, (serial, now)
             raise
         self._take_for(card, serial, waiting, now)
 

@@ -411,6 +411,19 @@ def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged(again: 
     assert played.seen["undetectable: exchanged between its card and its label"] == 1
 
 
+def test_a_label_whose_card_was_used_up_is_not_taken_for_one_that_was_scanned_alone() -> None:
+    """Two people at one page scan the same card; the label of the first is refused. The label of
+    the second follows before the refusal is read, when another unit is in the socket."""
+    played = told(
+        "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 ; unit label=3 ;"
+        " person name=jo ; person name=al ; @10.0 put unit=1 socket=A ; @12.2 label by=jo unit=1 ;"
+        " @12.4 pull unit=1 ; @13.0 put unit=2 socket=A ; @29.0 card by=al unit=2 ;"
+        " @30.0 card by=jo unit=2 ; @30.3 pull unit=2 ; @30.57 put unit=3 socket=A ;"
+        " @30.6 label by=al unit=2 ; @31.0 label by=jo unit=2"
+    )
+    assert played.text == ""
+
+
 def test_what_cannot_be_saved_is_never_green_and_the_line_goes_on() -> None:
     played = told(
         "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"

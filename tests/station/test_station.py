@@ -25,6 +25,7 @@ from flasher.station.events import (
     UnitRemoved,
     WorkerFailed,
 )
+from flasher.station.line import READ_S
 from flasher.station.messages import (
     Abort,
     AdapterDown,
@@ -284,6 +285,9 @@ def test_a_card_is_for_the_next_label_only(line: LineBench) -> None:
     line.scan("SOCKET B")
     line.scan("HELLO")
     assert line.last(ScanRefused).code == "WRONG_SERIAL"
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "NO_SOCKET"
+    line.bench.clock.go_on(READ_S)
     line.scan(SERIAL)
     assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
 
