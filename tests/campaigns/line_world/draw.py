@@ -87,11 +87,12 @@ class Teller:
         """What takes several things at once, while nobody else is at the line."""
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
         if people and self.chance.random() < 0.9:
-            scenes = [self._scan_at_once, self._lose_station]
-            scenes += 2 * [self._be_interrupted, self._go_on_in_an_outage]
+            scenes = [self._scan_at_once, self._lose_station, self._cancel_label]
+            scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash]
+            scenes += 3 * [self._be_interrupted]
             if any(each.number == "other" for each in self.world.setup.units):
                 scenes += 3 * [self._scan_another_number]
-            for scene in self.chance.sample(scenes, 2):
+            for scene in self.chance.sample(scenes, 3):
                 yield from scene(self.chance.choice(people))
                 yield 3.0, None
 
@@ -246,6 +247,17 @@ class Teller:
         if bay.unit is not None:
             yield from self._put_another(bay)
 
+    def _exchange_in_flash(self, name: str) -> Iterator[Step]:
+        """Another unit into the socket of one that is being flashed."""
+        for bay in (yield from self._bring(1)):
+            unit = self._number(bay)
+            yield self._pause(), stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
+            flashed = yield from self._await(StepName.FLASH)
+            yield self.chance.uniform(0.0, 1.0), None
+            if flashed is bay and bay.unit is not None:
+                yield from self._put_another(bay)
+
     def _keep_busy(self, name: str) -> Iterator[Step]:
         """Begin a run where none goes on."""
         if not self._bays(full=True, working=True):
@@ -311,7 +323,8 @@ class Teller:
         unit = self._number(bay)
         yield self._pause(), stories.Card(by=name, unit=unit)
         kill = stories.KillWorker(socket=bay.name)
-        way = self.chance.choice((None, kill, stories.Unplug(socket=bay.name, seconds=2.0)))
+        unplug = stories.Unplug(socket=bay.name, seconds=2.0)
+        way = self.chance.choice((None, None, kill, unplug))
         yield self._pause(), way
         yield self.chance.uniform(0.0, 0.3), stories.Pull(unit=unit)
         yield self.chance.choice((HAND_S, 0.3, 0.5)), stories.Put(unit=other, socket=bay.name)
@@ -409,6 +422,15 @@ class Teller:
 
     def _cancel(self, name: str) -> Iterator[Step]:
         yield self._pause(), stories.Cancel(by=name)
+
+    def _cancel_label(self, name: str) -> Iterator[Step]:
+        """Scan a unit on the table, think better of it, and put the unit in."""
+        units, empty = self._on_table(), self._bays(full=False)
+        if units and empty:
+            unit, socket = self.chance.choice(units), self.chance.choice(empty).name
+            yield from self._scan(name, unit, socket)
+            yield self._pause(), stories.Cancel(by=name)
+            yield self._pause(), stories.Put(unit=unit, socket=socket)
 
     def _free(self, name: str) -> Iterator[Step]:
         empty = self._bays(full=False)
