@@ -12,12 +12,14 @@ from typing import Any
 import pytest
 
 from flasher.conformance.catalogue import Selection
+from flasher.conformance.explore import Explorer
 from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.protocol import messages
 from tests.campaigns.right_devices import (
     HELD,
     CountsFromPackets,
@@ -88,3 +90,40 @@ def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> N
     late = answers_late(Nak=0.45)
     kind = type("Hasty", (CountsFromPackets, late), {})
     assert blamed(case_id, kind=kind, device=device) == []
+
+
+@each("choice", ("once", "either"))
+@each("request_s, ack_s", ((0.3, 0.2), (0.05, 0.45), (2.4, 0.49)))
+def test_a_repeated_update_command_may_be_answered_late(
+    choice: str, request_s: float, ack_s: float
+) -> None:
+    kind = answers_late(RequestTransfer=request_s, Ack=ack_s)
+    assert blamed("UP-05", kind=kind, given={"up_05": choice}) == []
+
+
+@each("choice", ("either", "restarts"))
+@each("delay_s", (1.0, 4.0, 4.9))
+def test_a_restart_of_the_bootloader_may_take_as_long_as_one_of_the_application(
+    choice: str, delay_s: float
+) -> None:
+    device = dataclasses.replace(
+        MOCK_PROFILE, reset_in_bootloader="restarts", reset_delay_s=delay_s
+    )
+    assert blamed("RS-02", device=device, given={"rs_02": choice}) == []
+
+
+class _AsksBeyondTheEnd(MockDevice):
+    """Answers a packet after the last one by NAK with the number after the last one."""
+
+    def _answer_bad(self, now: float) -> str:
+        transfer = self._transfer
+        if transfer.stored == transfer.total:
+            return self._reply(messages.Nak(transfer.total + 1), now)
+        return super()._answer_bad(now)
+
+
+@each("step", ("packet-beyond", "packet-skip", "packet-total", "packet-zero"))
+def test_a_nak_after_all_packets_may_name_any_number(step: str) -> None:
+    explorer = Explorer(subject(_AsksBeyondTheEnd), profile_of_mock(), seed="1")
+    walk = ["reset", "update=384", "packets=all", step, step]
+    assert explorer.replay(walk).finding is None

@@ -718,7 +718,9 @@ class Walk:
             self._nodes_asked = frozenset(own | frame.can_id >> 4 & 0xF for frame in refused.frames)
         if name in PACKETS:
             self._naks_due = 1 if refused.is_intact_write else 4
-            if refused.is_intact_write and self.phase in _IN_TRANSFER:
+            # When all packets are stored, any number in a NAK is correct, as in TX-03.
+            is_judged = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER)
+            if refused.is_intact_write and is_judged:
                 named = int.from_bytes(joined(refused.frames)[7:9], "little")
                 self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
         self.bench.send(refused.frames)
