@@ -1,8 +1,8 @@
-"""`Link` for a real adapter, through python-can.
+"""CAN adapter: a `Link` through python-can.
 
-It adds what python-can leaves to its users: the bit rate never defaults to the adapter's (a wrong
-one disturbs a live bus), a full transmit queue is waited for (every back end reports it
-differently), timeouts use the monotonic clock, and foreign exceptions end here.
+Differences from a plain `can.Bus`: the bit rate never defaults to the adapter's, because a wrong
+one disturbs a live bus; a full transmit queue is waited for, however the back end reports it;
+timeouts use the monotonic clock; every back end's exceptions become BusError.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from flasher.bus.back_ends import (
     causes,
     error_text,
     is_foreign_datagram,
-    meaning_in_receiving,
-    meaning_in_sending,
+    meaning_of_receive_error,
+    meaning_of_send_error,
 )
 from flasher.bus.bit_rate import BitRate, bit_rate
 from flasher.bus.echoes import FLAGGED_SENDER, Echoes, Sender
@@ -49,24 +49,24 @@ from flasher.protocol.spec import FRAME_DATA_SIZE
 from flasher.python_can import can
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
-"""Pause between two tries on a full queue: about one frame on the wire. Frames are received
-meanwhile."""
+"""Pause between two tries on a full transmit queue: about one frame on the wire. Frames are
+received meanwhile."""
 _DRAIN_FRAMES: Final = 100_000
 _KERNEL_STAMPS: Final = frozenset({"socketcan", "udp_multicast"})
-"""Back ends whose messages have Linux's receive time, by the wall clock."""
+"""Back ends whose messages have Linux's receive time (wall clock)."""
 _STAMP_AGE_MAX_S: Final = 1.0
-"""Maximum age of a frame; an older one means that the wall clock was set."""
+"""Maximum age of a frame by its time stamp; an older one means that the wall clock was set."""
 _UNREADABLE_LIMIT: Final = 100
-"""Consecutive unreadable inputs after which the adapter, not its line, counts as broken."""
-_PASSED_OVER_LIMIT: Final = 1000
-"""Maximum number of skipped inputs before a frame: a babbling port is never empty."""
+"""Consecutive unreadable inputs after which the adapter counts as broken."""
+_SKIPPED_LIMIT: Final = 1000
+"""Maximum number of inputs that one receive skips: a babbling serial port is never empty."""
 _WAIT_MIN_S: Final = 0.02
-"""A shorter wait may end early by rounding."""
-_HASTE_S: Final = 0.0005
-"""A back end that returns nothing sooner did not wait."""
-_HASTE_LIMIT_S: Final = 0.25
-_HASTE_LIMIT: Final = 100
-"""If it does not wait for so long, and so often, the adapter is gone."""
+"""Shortest timeout that is checked; a shorter one may end early by rounding."""
+_INSTANT_S: Final = 0.0005
+"""A back end that returns no frame sooner than this did not wait."""
+_INSTANT_LIMIT_S: Final = 0.25
+_INSTANT_LIMIT: Final = 100
+"""Number of returns without waiting, and their minimum duration, that mean a lost adapter."""
 _PCAN_BUS_OFF: Final = 0x00010
 _PCAN_PASSIVE: Final = 0x40000
 _PCAN_WARNING: Final = 0x00004 | 0x00008
@@ -81,13 +81,13 @@ def open_adapter(
     fallback: Fallback | None = None,
     **config: Any,
 ) -> CanLink:
-    """Open the adapter described by `config` (python-can's keywords), python-can's variables and
-    files, and the `fallback`.
+    """Open a CAN adapter by python-can's keywords (`config`), python-can's variables and files, and
+    the settings file (`fallback`).
 
-    `default_bitrate_bps` is the dialect's bit rate, which applies unless `config` itself names
-    another one. `holder` locks the adapter until it is closed (`lock.acquire`). With `sends`, an
-    interface that only listens is refused. `listen_only` keeps the adapter from acknowledging, if
-    its back end supports that (`opening.can_listen_only`).
+    `default_bitrate_bps` is the dialect's bit rate, which applies unless `config` names another
+    one. `holder` locks the adapter until it is closed (`lock.acquire`). With `sends`, an interface
+    in listen-only mode is refused. `listen_only` keeps the adapter from acknowledging, if its back
+    end supports that (`opening.can_listen_only`).
 
     Raises UsageError for an unknown interface or an invalid bit rate; BusError if the bit rate
     differs, the adapter cannot be opened, or another program holds it.
@@ -136,7 +136,7 @@ def open_adapter(
 
 
 class CanLink:
-    """python-can bus as a `Link` on the monotonic clock."""
+    """`Link` of a python-can bus; deadlines are times of `time.perf_counter`."""
 
     def __init__(
         self,
@@ -154,12 +154,12 @@ class CanLink:
         self._name = f"{interface} {channel}".strip()
         self._open_again = open_again
         self.bit_rate: BitRate | None = None
-        """Bit rate with which it was opened; None if unknown."""
+        """Bit rate of the bus; None if unknown."""
         self._waiting: deque[tuple[Frame, float | None]] = deque()
         is_stamped = interface in _KERNEL_STAMPS and platform.system() == "Linux"
         self.stamp_source = "kernel" if is_stamped else ""
         self.received_at: float | None = None
-        """Arrival time of the frame that `receive` last returned (`StampingLink`)."""
+        """Arrival time of the last frame returned by `receive` (`StampingLink`)."""
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
         sender = FLAGGED_SENDER.get(interface, Sender.UNKNOWN)
         self._echoes = Echoes(sender, gives_own=gives_own)
@@ -168,18 +168,18 @@ class CanLink:
         self._use(bus)
 
     def _use(self, bus: can.BusABC | None) -> None:
-        """Use this bus; None while there is none."""
+        """Send and receive through this bus; None while the adapter is gone."""
         self._bus = bus
         self._port: Any = getattr(bus, SERIAL_PORTS.get(self._interface, ""), None)
-        """Serial port of the back end, if any."""
+        """pyserial port of the back end; None without one."""
         if self._port is not None and not self._send_options:
             self._port.write_timeout = SEND_LIMIT_S  # otherwise a full port blocks forever
         self._unreadable_in_a_row = 0
-        self._hasty = 0
-        """Consecutive waits that the back end ended at once without a frame."""
-        self._hasty_since = 0.0
-        self._was_passed_over = False
-        """The last receive consumed an input that is not a frame for the caller."""
+        self._instant_returns = 0
+        """Consecutive receives that ended at once without a frame."""
+        self._instant_since = 0.0
+        self._has_skipped_input = False
+        """The last receive consumed an input that is not a frame, or not one for the caller."""
         self._send_raw: Callable[..., None] = _no_bus if bus is None else bus.send
         # recv() measures its timeout by the wall clock, so that a clock jump can hang the call; the
         # wrapped method does not. Its filters are only needed if the back end got some and leaves
@@ -202,11 +202,11 @@ class CanLink:
         return self._name
 
     def send(self, frame: Frame) -> None:
-        """Pass a frame to the adapter; wait up to `SEND_LIMIT_S` for room in a full queue. The data
-        of a remote frame give the length of the requested answer.
+        """Pass a frame to the adapter; wait up to `SEND_LIMIT_S` for room in a full transmit queue.
+        The data of a remote frame give the length of the requested answer.
 
-        Raises BusError at once if the controller is bus-off: its driver may still accept frames,
-        and lose them.
+        Raises TransmitBlockedError for a full queue; BusError if the adapter fails or is bus-off,
+        when its driver may still accept frames, and lose them.
         """
         give_up_at: float | None = None
         if self._health.state is ControllerState.BUS_OFF:
@@ -219,7 +219,7 @@ class CanLink:
             except MemoryError:
                 raise
             except Exception as error:
-                meaning = meaning_in_sending(error, self._interface)
+                meaning = meaning_of_send_error(error, self._interface)
                 if meaning is not Meaning.QUEUE_FULL:
                     raise self._failure("sending", error, meaning) from error
                 now = time.perf_counter()
@@ -236,12 +236,12 @@ class CanLink:
                 return
 
     def receive(self, deadline: float) -> Frame | None:
-        """Return the next frame, or None at `deadline` (monotonic clock)."""
+        """Return the next frame, or None at `deadline` (time of `time.perf_counter`)."""
         if self._waiting:
             waited, self.received_at = self._waiting.popleft()
             return waited
         if deadline == AT_ONCE:
-            for _ in range(_PASSED_OVER_LIMIT):
+            for _ in range(_SKIPPED_LIMIT):
                 frame = self._receive_once(0.0)
                 if frame is not None or not self._is_more_waiting():
                     return frame
@@ -253,7 +253,7 @@ class CanLink:
         return frame
 
     def drain(self) -> int:
-        """Discard waiting frames, with a limit for a babbling bus."""
+        """Discard received frames, up to a limit on a babbling bus; return their number."""
         count = len(self._waiting)
         self._waiting.clear()
         while count < _DRAIN_FRAMES and self.receive(AT_ONCE) is not None:
@@ -261,7 +261,7 @@ class CanLink:
         return count
 
     def close(self) -> None:
-        """Shut the adapter down, ignoring failures."""
+        """Shut the adapter down and unlock it; failures are ignored."""
         self._shut_down()
         self._release()
 
@@ -277,9 +277,9 @@ class CanLink:
 
     def reopen(self) -> None:
         """Close the adapter and open it again with the same settings. Raises BusError while it is
-        not back.
+        gone.
 
-        Waiting frames are lost, and the health is reset.
+        Received frames are discarded, and the health is reset.
         """
         if self._open_again is None:
             raise BusError(
@@ -303,17 +303,17 @@ class CanLink:
         return is_physical(self._interface, self._channel)
 
     def health(self) -> LinkHealth:
-        """Return the health of adapter and bus. Sends nothing; takes up to 2 s on SocketCAN."""
+        """Return the health of adapter and bus without sending. Takes up to 2 s on SocketCAN."""
         if self._interface == "socketcan":
-            seen = read_interface(self._channel)
-            if isinstance(seen, Interface):
-                return self._health.health(seen.state, seen.tx_errors, seen.rx_errors)
-        return self._health.health(_asked_state(self._bus, self._interface))
+            state = read_interface(self._channel)
+            if isinstance(state, Interface):
+                return self._health.health(state.state, state.tx_errors, state.rx_errors)
+        return self._health.health(_reported_state(self._bus, self._interface))
 
     def _is_more_waiting(self) -> bool:
         """True if frames may be waiting although the last receive returned none."""
-        if self._was_passed_over or self._port is None:
-            return self._was_passed_over
+        if self._has_skipped_input or self._port is None:
+            return self._has_skipped_input
         try:  # a serial back end returns after each line
             return bool(self._port.in_waiting)
         except Exception:  # noqa: BLE001  the next receive reports the failure
@@ -329,14 +329,14 @@ class CanLink:
         except Exception as error:  # noqa: BLE001  a back end may raise anything
             self._judge(error)
             return None
-        self._was_passed_over = message is not None
+        self._has_skipped_input = message is not None
         if message is None:
             if began:
-                self._check_haste(began, timeout_s)
+                self._check_instant_return(began, timeout_s)
             return None
         if frame is None:
             return None
-        self._unreadable_in_a_row = self._hasty = 0
+        self._unreadable_in_a_row = self._instant_returns = 0
         if self.stamp_source:
             self.received_at = _moment_of(message)
         if frame[0] in self._echoes.ids:
@@ -352,9 +352,9 @@ class CanLink:
         return frame if is_wanted else None
 
     def _judge(self, error: Exception) -> None:
-        """Return if the adapter still works after this receive error, else raise BusError."""
-        meaning = meaning_in_receiving(error, self._interface)
-        self._was_passed_over = meaning is Meaning.UNREADABLE
+        """Return for a receive error after which the adapter still works; else raise BusError."""
+        meaning = meaning_of_receive_error(error, self._interface)
+        self._has_skipped_input = meaning is Meaning.UNREADABLE
         if isinstance(meaning, BusTrouble):
             self._health.report(meaning)
         elif meaning is Meaning.UNREADABLE:
@@ -371,19 +371,19 @@ class CanLink:
         else:
             raise self._failure("receiving", error, meaning) from error
 
-    def _check_haste(self, began: float, timeout_s: float) -> None:
-        """Raise BusError if the back end keeps returning nothing without waiting."""
+    def _check_instant_return(self, began: float, timeout_s: float) -> None:
+        """Raise BusError if the back end keeps returning at once without a frame."""
         now = time.perf_counter()
         if timeout_s < _WAIT_MIN_S:
             return
-        if now - began > _HASTE_S:
+        if now - began > _INSTANT_S:
             # A busy computer makes every call slow.
-            self._hasty = 0 if now - began > _WAIT_MIN_S / 2 else self._hasty
+            self._instant_returns = 0 if now - began > _WAIT_MIN_S / 2 else self._instant_returns
             return
-        if not self._hasty:
-            self._hasty_since = began
-        self._hasty += 1
-        if self._hasty > _HASTE_LIMIT and now - self._hasty_since > _HASTE_LIMIT_S:
+        if not self._instant_returns:
+            self._instant_since = began
+        self._instant_returns += 1
+        if self._instant_returns > _INSTANT_LIMIT and now - self._instant_since > _INSTANT_LIMIT_S:
             gone = can.CanOperationError("it returns at once, with nothing")
             raise self._failure("receiving", gone, Meaning.LOST)
 
@@ -420,19 +420,19 @@ class CanLink:
 
 
 def _moment_of(message: can.Message) -> float | None:
-    """Convert the kernel's time stamp to the monotonic clock."""
+    """Convert the kernel's time stamp to the monotonic clock; None if the wall clock was set."""
     age_s = time.time() - message.timestamp
     return time.perf_counter() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
 
 def _no_bus(*_arguments: object, **_options: object) -> NoReturn:
-    """Send or receive while the adapter is gone."""
+    """Replaces send and receive while the adapter is gone."""
     raise can.CanOperationError("it is not open")
 
 
-def _asked_state(bus: can.BusABC | None, interface: str) -> ControllerState:
-    """Ask a back end for its state. python-can's default `state` is constant, and PCAN's is the
-    configured mode; only overrides report ERROR.
+def _reported_state(bus: can.BusABC | None, interface: str) -> ControllerState:
+    """Ask a back end for the controller state. python-can's default `state` is constant, and PCAN's
+    is the configured mode; only overrides report ERROR.
     """
     try:
         if interface == "pcan":
@@ -453,8 +453,8 @@ def _pcan_state(status: int) -> ControllerState:
 
 
 def _frame_of(message: can.Message) -> Frame:
-    """Convert a message to a frame; extra data are cut off. Raises for an invalid message: slcan
-    makes impossible ids and lengths from a damaged line.
+    """Convert a python-can message to a frame; data past 8 bytes are cut off. Raises ValueError for
+    impossible ids and lengths, which slcan makes of a damaged line.
     """
     can_id, is_extended, data = message.arbitration_id, message.is_extended_id, message.data
     if message.is_error_frame:
@@ -470,7 +470,7 @@ def _frame_of(message: can.Message) -> Frame:
 
 
 def _message_of(frame: Frame) -> can.Message:
-    """Convert a frame to a message for python-can."""
+    """Convert a frame to a python-can message."""
     can_id, data, is_extended, is_remote = frame[:4]
     if is_remote:
         return can.Message(

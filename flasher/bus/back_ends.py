@@ -1,4 +1,4 @@
-"""Classifies exceptions of python-can's back ends: damaged frame, full queue, lost adapter.
+"""Exceptions of python-can's back ends, classified: damaged frame, full queue, lost adapter.
 
 A back end may raise anything: its own CanError, exceptions of serial ports and USB libraries, and
 errors of its parser. `tests/bus/test_back_ends.py` tabulates them.
@@ -18,14 +18,14 @@ from flasher.python_can import can
 
 
 class Meaning(Enum):
-    """Meaning of a back end's exception."""
+    """Cause of an exception that a back end raises."""
 
     UNREADABLE = auto()
-    """The input is not a frame; the adapter works."""
+    """The input was not a frame; the adapter works."""
     QUEUE_FULL = auto()
     BUS_OFF = auto()
     LOST = auto()
-    """The adapter or its driver no longer works."""
+    """Adapter or driver no longer work."""
 
 
 SERIAL_PORTS: Final[Mapping[str, str]] = {
@@ -34,14 +34,14 @@ SERIAL_PORTS: Final[Mapping[str, str]] = {
     "serial": "_ser",
     "slcan": "serialPortOrig",
 }
-"""Attribute of each back end that is its pyserial port."""
+"""Attribute of each serial back end that holds its pyserial port."""
 TAKES_SEND_TIMEOUT: Final = frozenset({"nixnet", "robotell", "slcan"})
-"""Back ends that wait forever for room unless `send` gets a timeout. Others use it for something
-else or ignore it."""
+"""Back ends that wait forever for a full transmit queue unless `send` gets a timeout. Others ignore
+it or use it otherwise."""
 SILENT_WHEN_GONE: Final = frozenset({"gs_usb", "seeedstudio", "socketcand"})
-"""Back ends that mistake a lost adapter for silence, and return without waiting."""
-_LOSES_ITS_PLACE: Final = frozenset({"socketcand"})
-"""Back ends that are unusable after an error: the bad input stays in their buffer."""
+"""Back ends whose receive returns at once without a frame when the adapter is unplugged."""
+_CANNOT_CONTINUE: Final = frozenset({"socketcand"})
+"""Back ends that cannot continue after an error: the bad input stays in their buffer."""
 
 _QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
     "iscan": frozenset({7}),  # device is transmitting a message
@@ -52,13 +52,13 @@ _QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
     "usb2can": frozenset({9, 21, 32}),  # FIFO_FULL, TRM_FULL, TIMEOUT
     "vector": frozenset({11}),  # XL_ERR_QUEUE_IS_FULL
 }
-"""Error codes of the drivers, passed on by python-can."""
+"""Driver error codes for a full transmit queue."""
 _QUEUE_FULL_TEXT: Final = re.compile(
     r"(transmit|send|tx|xmt|write)[ _-]?(queue|buffer|fifo)?.*\b(full|overflow)"
     r"|TXQUEUE_FULL|XMTFULL",
     re.IGNORECASE,
 )
-"""Messages of other back ends (PCAN, IXXAT, NI-CAN, and SocketCAN's own "Transmit buffer full")."""
+"""Error messages of other back ends (PCAN, IXXAT, NI-CAN, python-can for SocketCAN)."""
 _BUS_OFF_CODES: Final[Mapping[str, int]] = {"iscan": 17, "usb2can": 2}
 _BUS_OFF_TEXT: Final = re.compile(r"bus[ _-]?off", re.IGNORECASE)
 _REPORT_CODES: Final[Mapping[str, Mapping[int, TroubleKind]]] = {
@@ -87,14 +87,14 @@ _REPORT_TEXTS: Final = (
     (re.compile(r"warning limit", re.IGNORECASE), TroubleKind.WARNING),
     (re.compile(r"overrun|read too late", re.IGNORECASE), TroubleKind.OTHER),
 )
-"""Of PCAN and IXXAT, whose exceptions have no code."""
+"""Error messages of PCAN and IXXAT, whose exceptions have no code."""
 _UNREADABLE_TEXT: Final = re.compile(r"invalid delimiter|could not unpack|out of range")
-"""Damaged frames that a back end reports by its own CanError (serial, udp_multicast)."""
+"""Error messages of back ends that raise CanError for a damaged frame (serial, udp_multicast)."""
 _FOREIGN_DATAGRAM: Final = "could not unpack"
 
 
-def meaning_in_sending(error: Exception, interface: str) -> Meaning:
-    """Classify an exception raised by `send` of the back end `interface`."""
+def meaning_of_send_error(error: Exception, interface: str) -> Meaning:
+    """Classify an exception raised by `send` of a back end."""
     chain = list(causes(error))
     if _is_bus_off(chain, interface):
         return Meaning.BUS_OFF
@@ -106,15 +106,15 @@ def meaning_in_sending(error: Exception, interface: str) -> Meaning:
     return Meaning.QUEUE_FULL if is_full else Meaning.LOST
 
 
-def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTrouble:
-    """Classify an exception raised by `recv`; a BusTrouble is reported by a working adapter."""
+def meaning_of_receive_error(error: Exception, interface: str) -> Meaning | BusTrouble:
+    """Classify an exception raised by `recv`; a BusTrouble comes from a working adapter."""
     chain = list(causes(error))
     if _is_bus_off(chain, interface):
         return Meaning.BUS_OFF
     kind = _reported_trouble(chain, interface)
     if kind is not None:
         return BusTrouble(frozenset({kind}), error_text(error))
-    if interface in _LOSES_ITS_PLACE or any(isinstance(each, OSError) for each in chain):
+    if interface in _CANNOT_CONTINUE or any(isinstance(each, OSError) for each in chain):
         return Meaning.LOST
     is_own = isinstance(chain[-1], can.CanError)
     is_damage = not is_own or _UNREADABLE_TEXT.search(str(chain[-1]))
@@ -122,13 +122,13 @@ def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTroub
 
 
 def is_foreign_datagram(error: Exception) -> bool:
-    """True for a datagram on udp_multicast's port that is not a CAN frame."""
+    """True for a datagram on the port of udp_multicast that is not a CAN frame."""
     return _FOREIGN_DATAGRAM in str(error)
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """Yield the exception and those that it was raised from, because back ends wrap the relevant
-    one. Exceptions of flasher are excluded.
+    """Yield an exception and those that it was raised from, up to one of flasher's: back ends wrap
+    the relevant one.
     """
     found: BaseException | None = error
     while found is not None and not isinstance(found, FlasherError):
@@ -137,7 +137,7 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def error_text(error: BaseException) -> str:
-    """Message of the back end without a full stop, or the type of the error if it is empty."""
+    """Messages of an exception and its causes without full stop, or its type if there are none."""
     texts: list[str] = []
     for each in causes(error):
         words = str(each).strip().rstrip(".!")
@@ -169,6 +169,6 @@ def _reported_trouble(chain: list[BaseException], interface: str) -> TroubleKind
 
 
 def _is_timeout(error: BaseException) -> bool:
-    """True for a timeout of the back end; those of pyserial and pyusb are not TimeoutErrors."""
+    """True for a timeout, also those of pyserial and pyusb, which are not TimeoutErrors."""
     is_named_so = type(error).__name__ in ("SerialTimeoutException", "USBTimeoutError")
     return is_named_so or isinstance(error, TimeoutError)

@@ -1,8 +1,7 @@
-"""Bit rate of a bus: the one value that is shown, recorded and opened, with its source.
+"""Bit rate of a CAN bus: chosen, compared with the dialect's, and refused if it differs.
 
-A wrong bit rate disturbs a live bus. The dialect's applies unless an option names another one.
-Values from variables, configuration files or the kernel are compared with it, and refused if they
-differ.
+A wrong bit rate disturbs a live bus. The dialect's applies unless an option names another one. A
+bit rate from variables, configuration files or the kernel is compared with it.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from flasher.protocol.text import printable
 
 LOWEST_BPS: Final = 5_000
 HIGHEST_BPS: Final = 1_000_000
-"""Of classic CAN."""
+"""Limits of classic CAN."""
 _TOLERANCE: Final = 0.005
-"""The kernel reports the rate that its clock can reach."""
+"""Relative: the kernel reports the bit rate that its clock can reach."""
 _NAMES: Final = ("timing", "bitrate", "nom_tseg1", "tseg1")
 """Keywords that determine the bit rate; python-can converts the last two to a timing."""
 DECIDING: Final = frozenset(
@@ -32,13 +31,13 @@ DECIDING: Final = frozenset(
         "nom_brp", "nom_tseg1", "nom_tseg2", "nom_sjw", "btr0", "btr1", "bitrate",
     }
 )  # fmt: skip
-"""All keywords of back ends that set the bit rate or part of it."""
+"""Keywords of all back ends that set the bit rate or a part of the bit timing."""
 _BY_OPTION: Final = {"bitrate": "-b", "timing": "--timing"}
 
 
 @dataclass(frozen=True)
 class BitRate:
-    """Bit rate in bit/s, and its source in words."""
+    """Bit rate in bit/s, and the option, file or variable that it comes from."""
 
     bps: int
     source: str
@@ -53,7 +52,7 @@ def bit_rate(
     merged: Mapping[str, Any],
     fallback: Fallback | None = None,
 ) -> BitRate:
-    """Return the bit rate that a bus has, or is opened with.
+    """Return the bit rate at which a bus runs, or is to be opened.
 
     `given` are the options, `merged` is their combination with python-can's variables and files and
     with the `fallback`. Raises UsageError for an invalid bit rate; BusError if it is not the
@@ -97,7 +96,7 @@ def named_bit_rate(
 
 
 def _configured_by(fallback: Fallback | None) -> str:
-    """The variable or file that names a bit rate where no option does."""
+    """Name the variable or file that sets the bit rate, if no option does."""
     from flasher.python_can import can  # noqa: PLC0415  slow, and not needed for a mock
 
     variables = can.util.load_environment_config()
@@ -114,14 +113,14 @@ def _configured_by(fallback: Fallback | None) -> str:
 
 
 def _of_kernel(merged: Mapping[str, Any]) -> BitRate | None:
-    """Return the bit rate of a SocketCAN interface as set in the kernel; None if unknown."""
+    """Return the bit rate of a SocketCAN interface; None if unknown."""
     channel = merged.get("channel")
     if merged.get("interface") != "socketcan" or not channel:
         return None
-    seen = read_interface(str(channel))
-    if not isinstance(seen, Interface) or seen.bitrate_bps is None:
+    interface = read_interface(str(channel))
+    if not isinstance(interface, Interface) or interface.bitrate_bps is None:
         return None
-    return BitRate(seen.bitrate_bps, f"the kernel's setting of {printable(str(channel))}")
+    return BitRate(interface.bitrate_bps, f"the kernel's setting of {printable(str(channel))}")
 
 
 def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) -> None:

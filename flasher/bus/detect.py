@@ -1,4 +1,4 @@
-"""Adapter detection: python-can's back ends, CAN interfaces of the kernel, and serial ports.
+"""Adapter detection: python-can's back ends, CAN interfaces of the kernel, serial ports.
 
 Vendors' libraries hang, print and crash, so they run in another process, `python -m
 flasher.bus.detect NAME...`, with a time limit. It asks every back end in its own thread, and prints
@@ -24,25 +24,25 @@ from typing import Any, Final
 from flasher.bus.inspect_interface import SYSFS, look_up
 
 LIMIT_S: Final = 4.5
-"""Total time limit. The slowest correct back end (socketcand) listens for 4 s."""
+"""Total time limit. The slowest back end (socketcand) listens for 4 s."""
 _NOT_LOADED: Final = "not_loaded"
 _CANNOT_TELL: Final = "cannot_tell"
 _MARK: Final = "detected: "
-"""Prefix of answer lines: vendors' libraries print too."""
+"""Prefix of lines with an answer, because vendors' libraries print too."""
 _LIFE_S: Final = 30.0
-"""A process whose parent was killed ends after this time."""
+"""Time after which a detection process ends by itself if its parent was killed."""
 _SLICE_S: Final = 0.2
-"""Interval of checks for cancellation."""
+"""Interval at which a wait checks for cancellation."""
 _COMMAND: Final = (sys.executable, "-m", "flasher.bus.detect")
 BUILT_IN: Final = frozenset({"virtual", "udp_multicast"})
-"""Interfaces that always exist and reach no adapter."""
+"""Interfaces of python-can without an adapter; they always exist."""
 SOCKETCAN: Final = "socketcan"
 SLOW: Final = frozenset({"socketcand"})
-"""Back ends that wait for servers on the network."""
+"""Back ends that wait for servers in the network."""
 SERIAL_PORTS: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
-"""Back ends that open a serial port. Only opening a port would show what is connected to it."""
+"""Back ends that open a serial port: which adapter is connected shows only then."""
 _SERIAL_KEYS: Final = ("serial_number", "serial", "unique_hardware_id", "hw_serial", "hwid")
-"""Keys of the back ends for an adapter's serial number."""
+"""Keys under which back ends report an adapter's serial number."""
 _USB_PATH: Final = "usb_path"
 _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
     "ixxat": ("unique_hardware_id",),
@@ -51,12 +51,12 @@ _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
     "systec": ("device_number",),
     "vector": ("channel_index",),
 }
-"""Keys besides the channel that a back end needs to open this adapter."""
+"""Keys besides the channel that a back end needs to open a certain adapter."""
 
 
 @dataclass(frozen=True)
 class DetectedAdapter:
-    """Connected adapter, as reported by its back end."""
+    """CAN adapter as its back end reports it."""
 
     interface: str
     channel: str
@@ -65,23 +65,23 @@ class DetectedAdapter:
 
     @property
     def serial_number(self) -> str:
-        """Empty if not reported."""
+        """Serial number of the adapter; empty if not reported."""
         return next((str(self.details[key]) for key in _SERIAL_KEYS if self.details.get(key)), "")
 
     @property
     def usb_path(self) -> str:
-        """USB path such as "1-1.4"; empty if not reported."""
+        """USB path of the adapter, such as "1-1.4"; empty if not reported."""
         return str(self.details.get(_USB_PATH, ""))
 
     @property
     def bus_kwargs(self) -> dict[str, Any]:
-        """Keywords besides interface and channel that choose it."""
+        """Bus arguments besides interface and channel that open this adapter."""
         names = _CHOOSING.get(self.interface, ())
         return {name: self.details[name] for name in names if name in self.details}
 
     @property
     def words(self) -> list[str]:
-        """Arguments that choose it on the command line."""
+        """Command-line options that open this adapter."""
         words = ["-i", self.interface, "-c", self.channel or "CHANNEL"]
         for key, value in self.bus_kwargs.items():
             words += ["--bus-kwargs", f"{key}={value}"]
@@ -89,29 +89,29 @@ class DetectedAdapter:
 
     @property
     def arguments(self) -> str:
-        """The same, quoted for a shell."""
+        """Command-line options that open this adapter, quoted for a shell."""
         return shlex.join(self.words)
 
 
 @dataclass
 class DetectionResult:
-    """Adapters found, and back ends without a result."""
+    """Detected adapters, and back ends without a result."""
 
     found: list[DetectedAdapter] = field(default_factory=list)
     hung: list[str] = field(default_factory=list)
-    """Did not answer in time."""
+    """Back ends without an answer in time."""
     failed: dict[str, str] = field(default_factory=dict)
-    """Failed or crashed, with their message."""
+    """Back ends that failed or crashed, with the message."""
     not_loaded: list[str] = field(default_factory=list)
-    """Package missing, or for another operating system."""
+    """Back ends whose package is missing or is for another operating system."""
     cannot_tell: list[str] = field(default_factory=list)
-    """Cannot list their adapters."""
+    """Back ends that cannot list their adapters."""
 
 
 class Detection:
-    """Starts the detection at once, in other processes.
+    """Adapter detection in other processes, which start at once and end in `collect`.
 
-    `collect` ends them. Use it as a context manager, so that no process is left.
+    A context manager, which ends the processes in any case.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class Detection:
         self._end()
 
     def collect(self, cancelled: Callable[[], bool] = lambda: False) -> DetectionResult:
-        """Return the result; `cancelled` is called five times a second and ends the wait."""
+        """Wait for the result; `cancelled` is called five times a second and ends the wait."""
         self._cancelled = cancelled
         detected = DetectionResult()
         if self._asks_kernel:
@@ -164,7 +164,7 @@ class Detection:
         )
 
     def _gather(self, detected: DetectionResult, unanswered: set[str]) -> bool:
-        """Collect the answers of all processes; True if one ended without answering."""
+        """Collect the answers of all processes; True if one ended without an answer."""
         crashed = False
         for names, process in self._processes:
             output, is_over = self._wait_for(process)
@@ -178,7 +178,7 @@ class Detection:
         return crashed
 
     def _wait_for(self, process: subprocess.Popen[str]) -> tuple[str, bool]:
-        """Return the output of a process, and whether it ended by itself; else it is killed."""
+        """Return the output of a process, and whether it ended by itself and not by the limit."""
         while True:
             remaining_s = max(self._ends_at - time.perf_counter(), 0.01)
             try:
@@ -222,7 +222,7 @@ def _take(output: str, detected: DetectionResult, unanswered: set[str]) -> None:
 
 
 def network_adapters(sysfs: Path = SYSFS) -> Iterator[DetectedAdapter]:
-    """Yield the CAN interfaces of Linux, up or down, with data of their USB device."""
+    """Yield the SocketCAN interfaces of Linux, up or down, with serial number and USB path."""
     for folder in sorted(sysfs.glob("*")):
         if not getattr(look_up(folder.name, sysfs=sysfs), "is_can", False):
             continue
@@ -239,7 +239,7 @@ def network_adapters(sysfs: Path = SYSFS) -> Iterator[DetectedAdapter]:
 
 
 def serial_ports(interface: str) -> Iterator[DetectedAdapter]:
-    """Yield the serial ports on USB, each as a possible adapter of one of `SERIAL_PORTS`. Built-in
+    """Yield the USB serial ports, each as a possible adapter of one of `SERIAL_PORTS`. Built-in
     ports (ttyS0, COM1) are skipped.
 
     Raises ImportError if pyserial is missing.
@@ -270,7 +270,7 @@ def _text(path: Path) -> str:
 
 
 def print_detected(names: Sequence[str]) -> None:
-    """Ask these interfaces and print their answers, one per line."""
+    """Detect the adapters of these interfaces and print one answer line for each."""
     threads = [threading.Thread(target=_ask, args=(name,), daemon=True) for name in names]
     for thread in threads:
         thread.start()
@@ -292,7 +292,7 @@ def _ask(name: str) -> None:
 
 
 def _sees(name: str) -> str:
-    """Why a back end can list nothing; empty where it can."""
+    """Reason why a back end cannot list adapters; empty if it can."""
     from flasher.python_can import can  # noqa: PLC0415
 
     place, kind = can.interfaces.BACKENDS[name]
@@ -305,7 +305,7 @@ def _sees(name: str) -> str:
 
 
 def _simple(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of a configuration that JSON can hold: some contain objects of a library."""
+    """Keep values that JSON can represent; some configurations contain objects of a library."""
     return {
         key: value
         for key, value in config.items()

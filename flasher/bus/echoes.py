@@ -1,9 +1,9 @@
-"""Recognises echoes: frames that an adapter returns after sending them.
+"""Echo detection: frames that an adapter returns after sending them.
 
-A link marks them as `Frame.is_echo`, so that nothing else has to recognise them. The delay of an
-echo proves nothing, because this computer may have stalled. An echo is recognised by the back end's
-flag if that identifies this handle, else by content and order. Echoes may be missing, slightly out
-of order, or doubled (a network with two paths).
+A link marks an echo as `Frame.is_echo`, so that no other code has to detect it. Its delay proves
+nothing, because this computer may have stalled. An echo is detected by the back end's flag if that
+identifies this handle, else by content and order. Echoes may be missing, slightly out of order, or
+doubled (a network with two paths).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Final
 from flasher.protocol.frame import Frame
 
 ECHO_FRAMES: Final = 1024
-"""Maximum number of frames without echo: 57 packets; the host sends one at a time."""
+"""Maximum number of sent frames without echo: 57 packets; the host sends one at a time."""
 REORDER_FRAMES: Final = 64
-"""Maximum delay of an echo after a later one: three packets and a half."""
+"""Maximum number of later echoes before an echo: three packets and a half."""
 DOUBLE_LIMIT_S: Final = 0.1
-"""Maximum difference of the time stamps of two copies of an echo."""
+"""Maximum difference of the time stamps of an echo and its second copy."""
 
 
 class Sender(Enum):
-    """Sender of a frame that python-can flags as transmitted (`is_rx` False)."""
+    """Possible senders of a frame that python-can flags as transmitted (`is_rx` False)."""
 
     THIS_HANDLE = "this handle"
     THIS_COMPUTER = "any program on this computer"
@@ -47,7 +47,7 @@ FLAGGED_SENDER: Final[Mapping[str, Sender]] = {
 
 
 class Echoes:
-    """Remembers frames sent through a link, and marks their echoes.
+    """Remembers the frames sent through a link, and marks their echoes.
 
     `gives_own` is False if the handle never receives its own frames (a SocketCAN socket by
     default): an apparent echo then has another sender.
@@ -55,31 +55,30 @@ class Echoes:
 
     def __init__(self, flagged: Sender = Sender.UNKNOWN, *, gives_own: bool = True) -> None:
         self.ids: set[int] = set()
-        """CAN ids of frames sent."""
+        """CAN ids of sent frames."""
         self._flagged = flagged
         self._gives_own = gives_own
         self._expected: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Frames without echo so far, oldest first."""
+        """Sent frames without echo so far, oldest first."""
         self._unreturned: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Frames sent that this handle will not receive."""
+        """Sent frames that this handle does not receive."""
         self._echoed: dict[Frame, float] = {}
-        """Last echoes, with their time stamps."""
+        """Time stamps of the latest echoes."""
 
     def sent(self, frame: Frame) -> None:
-        """Note a frame passed to the adapter."""
+        """Record a frame passed to the adapter."""
         (self._expected if self._gives_own else self._unreturned).append(frame)
         self.ids.add(frame[0])
 
     def reopened(self) -> None:
-        """Expect echoes of the old handle's frames: the driver may still send them."""
+        """Expect echoes of the previous handle's frames: the driver may still send them."""
         self._expected.extend(self._unreturned)
         self._unreturned.clear()
 
     def mark(self, frame: Frame, stamp_s: float, *, is_rx: bool) -> Frame:
         """Return a received frame, marked if it is an echo or a second copy of one.
 
-        `stamp_s` is the frame's time stamp in seconds on the adapter's clock, `is_rx` the back
-        end's flag.
+        `stamp_s` is its time stamp in seconds on the adapter's clock, `is_rx` the back end's flag.
         """
         if frame[0] not in self.ids:
             return frame

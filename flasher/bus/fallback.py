@@ -1,4 +1,4 @@
-"""Bus settings from a settings file, used if nothing else names them."""
+"""Adapter settings of a settings file, used where option, variable and python-can give none."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ class Fallback:
 
     bus: Mapping[str, Any]
     source: str
-    """Name of the file, escaped."""
+    """Name of the settings file, escaped."""

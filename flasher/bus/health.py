@@ -1,4 +1,4 @@
-"""Health of a link: decoded error frames and counters.
+"""Health of a CAN link: controller state, error counters, frame counts, decoded error frames.
 
 An error frame is not on the wire: the driver creates it to report trouble. Two formats are
 documented (Linux's error.h, PCAN-Basic); in any other, an error frame only means that something
@@ -17,7 +17,7 @@ from flasher.protocol.frame import Frame
 
 
 class TroubleKind(Enum):
-    """Content of an error frame, the worst first."""
+    """Kinds of trouble that an error frame reports, the worst first."""
 
     BUS_OFF = "bus_off"
     RESTARTED = "restarted"
@@ -29,18 +29,18 @@ class TroubleKind(Enum):
 
 @dataclass(frozen=True)
 class BusTrouble:
-    """Decoded error frame. Counters are those of the controller; None if not reported."""
+    """Decoded error frame. Counters are the controller's; None if not reported."""
 
     kinds: frozenset[TroubleKind]
     words: str
     tx_errors: int | None = None
     rx_errors: int | None = None
     is_active_again: bool = False
-    """The controller reports that it participates normally again."""
+    """The controller reports that it is error-active again."""
 
     @property
     def kind(self) -> TroubleKind:
-        """The worst kind reported."""
+        """Worst kind of trouble reported."""
         return next(kind for kind in TroubleKind if kind in self.kinds)
 
 
@@ -58,7 +58,7 @@ LAYOUTS: Final[Mapping[str, Layout]] = {
     "socketcand": Layout.SOCKETCAN,  # the class in the id, no data
     "pcan": Layout.PCAN,
 }
-"""By python-can's name of the interface; other formats are not documented."""
+"""Error frame format by python-can interface; other formats are not documented."""
 
 # -- Linux, include/uapi/linux/can/error.h --------------------------------------------------------
 
@@ -76,8 +76,7 @@ _WARNING_BITS: Final = 0x04 | 0x08
 _PASSIVE_BITS: Final = 0x10 | 0x20
 _ACTIVE_BIT: Final = 0x40
 _ACK_SLOT: Final = 0x19
-"""Position of an error in the frame: the acknowledge slot. Both formats use the SJA1000's
-numbers."""
+"""Position code of the acknowledge slot, the SJA1000's in both formats."""
 _CLASSES: Final = (
     (_TX_TIMEOUT, TroubleKind.OTHER, "the driver's transmission timed out"),
     (_LOST_ARBITRATION, TroubleKind.OTHER, "arbitration lost"),
@@ -105,7 +104,7 @@ _VIOLATIONS: Final = (
 )
 _ERROR_FRAME_SIZE: Final = 8
 WARNING_LIMIT: Final = 96
-"""Error counter at which a controller warns."""
+"""Error counter at which a controller reports error-warning."""
 PASSIVE_LIMIT: Final = 128
 """Error counter at which a controller becomes error-passive."""
 
@@ -137,7 +136,7 @@ def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
 
 
 def _decode_pcan(kind_of_error: int, data: bytes) -> BusTrouble:
-    """Decode a frame of PCAN-Basic: id = kind of error; data = direction, position, counters."""
+    """Decode an error frame of PCAN-Basic: id = kind; data = direction, position, counters."""
     is_received, place, rx_errors, tx_errors = data[:4]
     names = {0: "", 1: "bit error", 2: "form error", 4: "stuff error"}
     words = names.get(kind_of_error, "bus error")
@@ -175,7 +174,7 @@ def _trouble(
 
 
 class ControllerState(Enum):
-    """Participation of a CAN controller in the traffic."""
+    """State of a CAN controller: error-active, error-passive, bus-off."""
 
     ACTIVE = "active"
     PASSIVE = "passive"
@@ -185,29 +184,29 @@ class ControllerState(Enum):
 
 @dataclass(frozen=True)
 class LinkHealth:
-    """State of a link since it was opened. Counters are None if not reported."""
+    """Health of a link since it was opened. Counters are None if not reported."""
 
     state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
     frames_sent: int
-    """Frames that the adapter accepted; they may not have been sent."""
+    """Frames that the adapter accepted; some may still be in its queue."""
     frames_received: int
-    """Frames from the wire, without error frames."""
+    """Frames received from the bus, without error frames."""
     error_frames: int
     is_blocked: bool
-    """The adapter refused a frame for the whole time limit of a link."""
+    """The transmit queue stayed full for the whole time limit of a frame."""
     last_trouble: BusTrouble | None
     not_acknowledged: bool
-    """Frames were sent, nothing was ever received, and error frames, the state or the full queue
-    show that no node acknowledges."""
+    """No node acknowledges: frames were sent, nothing was ever received, and error frames, the
+    controller state or the full transmit queue show it."""
     unreadable: int
-    """Inputs of the adapter that are not frames, including those before it was reopened."""
+    """Number of inputs that were not frames, including those before the adapter was reopened."""
     last_unreadable: str
-    """Problem of the last one, in words."""
+    """Description of the last unreadable input."""
 
     def error(self, where: str = "") -> BusError | None:
-        """Create the error for this health; None if it is good."""
+        """Create the BusError for this health; None for a healthy link."""
         if self.state is ControllerState.BUS_OFF:
             return bus_off_error(where)
         if self.not_acknowledged:
@@ -232,7 +231,7 @@ class LinkHealth:
 
 
 def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> BusError:
-    """Create the error for a bus-off controller."""
+    """Create the error for a controller that is bus-off."""
     return BusError(
         what,
         where=where,
@@ -245,7 +244,7 @@ def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> Bu
 
 
 def unreadable_error(where: str, how_often: str, words: str) -> BusError:
-    """Create the error for an adapter whose input is unreadable."""
+    """Create the error for an adapter that delivers unreadable data."""
     return BusError(
         f"The adapter delivers unreadable data, {how_often}: {words}.",
         where=where,
@@ -256,7 +255,7 @@ def unreadable_error(where: str, how_often: str, words: str) -> BusError:
 
 
 class HealthKeeper:
-    """Counts frames and remembers trouble of one link."""
+    """Counts frames and error frames of a link."""
 
     def __init__(self, layout: Layout = Layout.UNKNOWN) -> None:
         self._layout = layout
@@ -265,7 +264,7 @@ class HealthKeeper:
         self.reset()
 
     def reset(self) -> None:
-        """Reset after the adapter was reopened; keeps the unreadable inputs."""
+        """Reset all but the count of unreadable inputs, after the adapter was reopened."""
         self.sent = 0
         self.received = 0
         self.error_frames = 0
@@ -284,12 +283,12 @@ class HealthKeeper:
         self.report(decode_error_frame(frame, self._layout))
 
     def add_unreadable(self, words: str) -> None:
-        """Count an input that is not a frame."""
+        """Count an unreadable input."""
         self._unreadable += 1
         self._last_unreadable = words
 
     def report(self, trouble: BusTrouble) -> None:
-        """Note trouble reported by the controller."""
+        """Record trouble that the controller reported."""
         self.error_frames += 1
         self._last = trouble
         if trouble.tx_errors is not None:
@@ -309,14 +308,14 @@ class HealthKeeper:
         tx_errors: int | None = None,
         rx_errors: int | None = None,
     ) -> LinkHealth:
-        """Return the health; values from the adapter override those from error frames."""
+        """Return the link's health; the adapter's own values override those of error frames."""
         if state is ControllerState.UNKNOWN:
             state = self.state
         if tx_errors is None:
             tx_errors, rx_errors = self._tx_errors, self._rx_errors
         # Without acknowledgement a sending controller stops at error-passive, never
         # bus-off. At a wrong bit rate the receive counter may be higher, so silence decides.
-        says_so = self._was_unacknowledged or self.is_blocked or state is ControllerState.PASSIVE
+        is_evident = self._was_unacknowledged or self.is_blocked or state is ControllerState.PASSIVE
         return LinkHealth(
             state=state,
             tx_errors=tx_errors,
@@ -328,7 +327,7 @@ class HealthKeeper:
             last_trouble=self._last,
             not_acknowledged=bool(self.sent)
             and not (self.received or self._unreadable)
-            and says_so,
+            and is_evident,
             unreadable=self._unreadable,
             last_unreadable=self._last_unreadable,
         )

@@ -1,5 +1,4 @@
-"""State of a SocketCAN interface on Linux, without sending anything or being root, and the commands
-to set one up.
+"""State of a SocketCAN interface on Linux, read without root, and commands to set one up.
 
 Uses `ip -details -json link show`; if that is missing or too old, /sys shows whether the interface
 exists and is up.
@@ -22,9 +21,9 @@ from flasher.bus.health import ControllerState
 
 SYSFS: Final = Path("/sys/class/net")
 _WITHOUT_RESTART: Final = frozenset({"can327", "gs_usb", "slcan"})
-"""Drivers whose restart after bus-off the kernel refuses, automatic or manual."""
+"""Drivers for which the kernel refuses a restart after bus-off, automatic or manual."""
 VIRTUAL_KINDS: Final = frozenset({"vcan", "vxcan"})
-"""Interfaces without a controller: no bit rate, no error states."""
+"""Interfaces without controller: no bit rate, no error states."""
 _IP_LIMIT_S: Final = 2.0
 _NAME_SIZE_MAX: Final = 15
 _ARPHRD_CAN: Final = 280
@@ -35,7 +34,7 @@ Run = Callable[[Sequence[str]], str]
 
 
 class Unseen(Enum):
-    """Why the state of an interface is unknown."""
+    """Reason why the state of an interface is unknown."""
 
     MISSING = "missing"
     CANNOT_TELL = "cannot_tell"
@@ -43,41 +42,40 @@ class Unseen(Enum):
 
 @dataclass(frozen=True)
 class Interface:
-    """Network interface as described by the kernel; None for unknown values."""
+    """Network interface as the kernel describes it; unknown values are None."""
 
     name: str
     is_can: bool
     is_up: bool
     has_carrier: bool | None = None
-    """False if the controller is bus-off, or the other end of a vxcan pair is down."""
+    """False if the controller is bus-off, or if the other end of a vxcan pair is down."""
     kind: str = ""
-    """"can" (hardware), "vcan", "vxcan", "slcan"; may be empty."""
+    """"can" (hardware), "vcan", "vxcan" or "slcan"; may be empty."""
     bitrate_bps: int | None = None
     state_name: str = ""
-    """The kernel's name: ERROR-ACTIVE, ERROR-WARNING, ERROR-PASSIVE, BUS-OFF, STOPPED."""
+    """Kernel's name: ERROR-ACTIVE, ERROR-WARNING, ERROR-PASSIVE, BUS-OFF, STOPPED."""
     tx_errors: int | None = None
     rx_errors: int | None = None
     restart_ms: int | None = None
-    """Time after which bus-off ends automatically; 0 for never."""
+    """Delay of the automatic restart after bus-off; 0 for none."""
     queue_frames: int | None = None
     modes: frozenset[str] = frozenset()
     """Active control modes: LISTEN-ONLY, LOOPBACK, ONE-SHOT, FD, ..."""
     driver: str = ""
-    """Name of the driver, from its bit timing limits; may be empty."""
+    """Driver name, from its bit timing limits; may be empty."""
 
     @property
     def state(self) -> ControllerState:
-        """State of its controller."""
         return _STATES.get(self.state_name, ControllerState.UNKNOWN)
 
     @property
     def only_listens(self) -> bool:
-        """True if it acknowledges nothing and drops frames to send."""
+        """True in listen-only mode: acknowledges no frame and sends none."""
         return "LISTEN-ONLY" in self.modes
 
     @property
     def can_restart(self) -> bool:
-        """True if its driver supports `restart-ms`; False for an unknown driver."""
+        """True if the driver supports `restart-ms`; False for an unknown driver."""
         return bool(self.driver) and self.driver not in _WITHOUT_RESTART
 
 
@@ -90,16 +88,16 @@ _STATES: Final = {
 
 
 def read_interface(name: str, *, run: Run | None = None, sysfs: Path = SYSFS) -> Interface | Unseen:
-    """Read all that is known about an interface. Takes 2 s at most; never raises."""
-    seen = look_up(name, sysfs=sysfs)
-    if seen is Unseen.MISSING:
-        return seen
+    """Read the state of an interface from `ip`, else from /sys. Takes up to 2 s; never raises."""
+    basic = look_up(name, sysfs=sysfs)
+    if basic is Unseen.MISSING:
+        return basic
     described = _ask_ip(name, run or _run)
-    return seen if described is None else described
+    return basic if described is None else described
 
 
 def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
-    """Read from /sys alone, without delay: existence, type, up, carrier."""
+    """Read the state of an interface from /sys alone, without delay: type, up, carrier."""
     if not sysfs.is_dir():
         return Unseen.CANNOT_TELL
     if not _is_a_name(name) or not (sysfs / name).exists():
@@ -117,7 +115,7 @@ def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
 
 
 def start_command(channel: object, bitrate_bps: object) -> str:
-    """Command for root to start a SocketCAN interface; virtual ones need no options."""
+    """Command (as root) that starts a SocketCAN interface; virtual ones need no options."""
     if str(channel).startswith(tuple(VIRTUAL_KINDS)):
         return f"ip link set {channel} up"
     return f"ip link set {channel} up type can bitrate {bitrate_bps}"
@@ -133,19 +131,19 @@ def kernel_has_can() -> bool:
 
 
 def find_commands(channel: object) -> tuple[str, str]:
-    """Commands that create a missing virtual interface, or list the existing ones."""
+    """Commands that create a missing virtual interface, or that list the existing ones."""
     if str(channel).startswith("vcan"):
         return (f"ip link add dev {channel} type vcan", f"ip link set {channel} up")
     return ("ip -brief link show type can", "dmesg | grep -i can")
 
 
 def restart_commands(channel: object) -> tuple[str, str]:
-    """Commands for root to restart an interface after bus-off; works with every driver."""
+    """Commands (as root) that restart an interface after bus-off, with every driver."""
     return (f"ip link set {channel} down", f"ip link set {channel} up")
 
 
 def change_commands(channel: object, *options: str) -> tuple[str, str, str]:
-    """Commands for root to change options of a CAN interface, which must be down meanwhile."""
+    """Commands (as root) that stop a CAN interface, change its options and start it again."""
     down, up = restart_commands(channel)
     return (down, f"ip link set {channel} type can {' '.join(options)}", up)
 
@@ -162,7 +160,7 @@ def _number(path: Path) -> int | None:
 
 
 def _ask_ip(name: str, run: Run) -> Interface | None:
-    """Return None if `ip` is missing, too old for JSON, or prints something unexpected."""
+    """Read an interface from `ip`; None if that is missing, too old, or prints something else."""
     try:
         answer = json.loads(run(("ip", "-details", "-json", "link", "show", "dev", name)))
         return _from_ip(answer[0])

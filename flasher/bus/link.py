@@ -1,7 +1,7 @@
-"""The interface between engine and bus: `Link`, and the clocks that belong to it.
+"""Interface between protocol engine and CAN bus: `Link` and its clocks.
 
-Deadlines of a link are times of its clock. A real adapter uses `MonotonicClock`; a simulated bus
-creates its own time.
+Deadlines of a link are times of its clock. A real adapter uses `MonotonicClock`, a simulated bus
+its own time.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from flasher.bus.health import LinkHealth
 from flasher.protocol.frame import Frame
 
 SEND_LIMIT_S: Final = 2.0
-"""How long a link waits for room in a full transmit queue. A packet takes 10 ms on a free bus."""
+"""Maximum wait for room in a full transmit queue. A packet takes 10 ms on a free bus."""
 
 
 AT_ONCE: Final = float("-inf")
-"""A deadline in the past: receive only what is already there."""
-_AWAKE_S: Final = 0.0001
-"""Real time for which a paced clock busy-waits."""
+"""Deadline in the past: receive only frames that have already arrived."""
+_BUSY_WAIT_S: Final = 0.0001
+"""Real seconds before a moment that a paced clock spends in a busy loop."""
 
 
-_MADE_UP_S: Final = 0.1
-"""Maximum pause, in real seconds, that a steady clock makes up for."""
+_CATCH_UP_S: Final = 0.1
+"""Longest pause of this computer, in real seconds, that a steady clock makes up for."""
 
 
 class Clock(Protocol):
-    """Seconds that only increase."""
+    """Time in seconds, which only increases."""
 
     def now(self) -> float: ...
 
@@ -37,7 +37,7 @@ class Clock(Protocol):
 
     @property
     def speed(self) -> float:
-        """Its seconds per real second."""
+        """Seconds of this clock per real second."""
         ...
 
 
@@ -47,14 +47,14 @@ class Link(Protocol):
     def send(self, frame: Frame) -> None:
         """Pass a frame to the adapter; return when it is accepted.
 
-        Waits for room in a full transmit queue up to the link's limit; then raises
+        Waits up to `SEND_LIMIT_S` for room in a full transmit queue; then raises
         TransmitBlockedError.
         """
         ...
 
     def receive(self, deadline: float) -> Frame | None:
         """Return the next received frame; None at `deadline`. A deadline in the past returns only
-        what is already there.
+        frames that have already arrived.
         """
         ...
 
@@ -63,24 +63,24 @@ class Link(Protocol):
         ...
 
     def close(self) -> None:
-        """Release the adapter; may be repeated."""
+        """Release the adapter; may be called again."""
         ...
 
     def reopen(self) -> None:
-        """Close the adapter and open it again with the same settings, after it was lost.
+        """Close the adapter and open it again with the same settings, after it was unplugged.
 
-        Raises BusError while it is not back; call it again at most every 100 ms.
+        Raises BusError while the adapter is gone; call it again at most every 100 ms.
         """
         ...
 
     @property
     def is_off(self) -> bool:
-        """True while the adapter reports bus-off, as last seen."""
+        """True while the adapter's last report is bus-off."""
         ...
 
     @property
     def is_physical(self) -> bool:
-        """True unless the bus is known to be virtual. Takes 2 s at most."""
+        """True unless the bus is known to be virtual. Takes up to 2 s."""
         ...
 
     def health(self) -> LinkHealth:
@@ -90,11 +90,11 @@ class Link(Protocol):
 
 @runtime_checkable
 class StampingLink(Link, Protocol):
-    """Link that may know the arrival time of a frame better than its reader."""
+    """Link whose adapter or driver time-stamps received frames."""
 
     @property
     def stamp_source(self) -> str:
-        """Source of the time stamps ("kernel"); empty without any."""
+        """Origin of the time stamps ("kernel"); empty without any."""
         ...
 
     @property
@@ -104,7 +104,7 @@ class StampingLink(Link, Protocol):
 
 
 class MonotonicClock:
-    """The finest clock, `time.perf_counter`; unaffected by changes of the wall clock."""
+    """Real time: `time.perf_counter`, unaffected by changes of the wall clock."""
 
     speed: Final = 1.0
     now = staticmethod(time.perf_counter)
@@ -117,9 +117,9 @@ class MonotonicClock:
 
 
 class PacedClock:
-    """Real time multiplied by `speed`, for realistic demonstrations.
+    """Real time multiplied by `speed`, for demonstrations.
 
-    A sleep ends about 0.1 ms late, so the last part is waited for actively.
+    A sleep ends about 0.1 ms late, so the last part is waited for in a busy loop.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
@@ -127,40 +127,40 @@ class PacedClock:
         self._origin = time.perf_counter()
 
     def now(self) -> float:
-        """Simulated seconds since the clock was made."""
+        """Simulated seconds since the clock was created."""
         return (time.perf_counter() - self._origin) * self.speed
 
     def wait_until(self, moment: float) -> None:
         """Sleep until the simulated `moment`."""
         until = self._origin + moment / self.speed
         remaining_s = until - time.perf_counter()
-        if remaining_s > _AWAKE_S:
-            time.sleep(remaining_s - _AWAKE_S)
+        if remaining_s > _BUSY_WAIT_S:
+            time.sleep(remaining_s - _BUSY_WAIT_S)
         while time.perf_counter() < until:
             pass
 
 
 class SteadyClock:
-    """Virtual time at the pace of real time, or `speed` times as fast. It advances only during
-    waits, so that a pause of this computer also pauses the simulation.
+    """Real time multiplied by `speed`, which stops while this computer stalls: it advances only
+    during waits.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
         self.speed = speed
         self._now = 0.0
         self._reached_at = time.perf_counter()
-        """Real time at which it should have reached this time."""
+        """Real time at which the current simulated time was due."""
 
     def now(self) -> float:
-        """Simulated seconds since the clock was made."""
+        """Simulated seconds since the clock was created."""
         return self._now
 
     def wait_until(self, moment: float) -> None:
-        """Sleep until the simulated `moment`; makes up for a short pause."""
+        """Sleep until the simulated `moment`; makes up for a short pause of this computer."""
         if moment <= self._now:
             return
         real = time.perf_counter()
-        from_s = max(self._reached_at, real - _MADE_UP_S)
+        from_s = max(self._reached_at, real - _CATCH_UP_S)
         self._reached_at = from_s + (moment - self._now) / self.speed
         if self._reached_at > real:
             time.sleep(self._reached_at - real)
@@ -168,7 +168,7 @@ class SteadyClock:
 
 
 class VirtualClock:
-    """Time that advances only by waiting."""
+    """Simulated time that advances by waiting, without sleeping."""
 
     speed: Final = 1.0
 

@@ -1,8 +1,8 @@
-"""Adapter lock: one tool at a time on an adapter, for the programs of one user on one computer.
+"""Adapter lock: one program at a time on an adapter, among those of one user on one computer.
 
 Two tools on a bus disturb each other. The lock is an advisory lock of the operating system on a
-file in the user's state folder, so that a dead process holds nothing. The file next to it only
-names the holder.
+file in the user's state folder; it ends with its process. A second file next to it names the
+holder.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from flasher.errors import BusError, ErrorCode
 from flasher.protocol.text import printable
 
 _LOG: Final = logging.getLogger("flasher.bus")
-_IN_PROCESS: Final = "virtual"
-"""python-can's bus inside a process: the same channel in another process is another bus."""
+_VIRTUAL: Final = "virtual"
+"""python-can's bus inside a process: another process has another bus of that name."""
 _OPENED_ONCE: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
-"""On serial ports: opening one reconfigures it, and so disturbs another program that uses it."""
+"""Back ends on serial ports: opening a port reconfigures it and disturbs another user."""
 _LONG_PORT: Final = re.compile(r"^[\\/]{2}[.?][\\/](?=COM\d+$)", re.IGNORECASE)
-r"""Prefix of a Windows serial port: \\.\COM3 is COM3."""
-_ON_A_PORT: Final = "udp_multicast"
-"""Receives every multicast group on its port, so the port is the bus."""
+r"""Prefix of Windows serial ports: \\.\COM3 is COM3."""
+_MULTICAST: Final = "udp_multicast"
+"""Receives all multicast groups of its port, so that the port is the bus."""
 _MULTICAST_PORT: Final = 43113
-_PLACE: Final = ("channel", "host", "port", "index", "bus", "address", "serial", "serial_number",
+_KEYS: Final = ("channel", "host", "port", "index", "bus", "address", "serial", "serial_number",
                  "unique_hardware_id")  # fmt: skip
-"""Keywords of python-can's back ends that identify an adapter."""
+"""python-can keywords that identify an adapter."""
 
 
 def acquire(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     """Lock the adapter that `config` (python-can's keywords) names; return the function that
     unlocks it, which may be called twice.
 
-    `holder` is shown to others. None is for programs that never send as the tool: they lock only
-    what cannot be opened twice. Raises BusError with the holder if it is locked. If the state
-    folder is not writable, only a warning is logged.
+    `holder` is shown to other programs. None is for programs that only listen: they lock only
+    serial ports, which cannot be opened twice. Raises BusError with the holder if the adapter is
+    locked. If the state folder is not writable, a warning is logged and nothing is locked.
     """
     interface = config["interface"]
     name = f"{interface} {config.get('channel') or ''}".strip()
-    if interface == _IN_PROCESS or (holder is None and interface not in _OPENED_ONCE):
+    if interface == _VIRTUAL or (holder is None and interface not in _OPENED_ONCE):
         return lambda: None
     try:
         folder = user_state_path("flasher", appauthor=False) / "locks"
@@ -88,10 +88,10 @@ def acquire(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]
 
 
 def lock_name(config: Mapping[str, Any]) -> str:
-    """File name for an adapter, however it is named, on this computer."""
+    """Lock file name of an adapter, the same for all names of that adapter."""
     interface = str(config["interface"])
-    place = {key: str(config[key]) for key in _PLACE if config.get(key) is not None}
-    if interface == _ON_A_PORT:
+    place = {key: str(config[key]) for key in _KEYS if config.get(key) is not None}
+    if interface == _MULTICAST:
         place = {"port": str(config.get("port", _MULTICAST_PORT))}
     if interface in _OPENED_ONCE and "channel" in place:
         port = _LONG_PORT.sub("", place["channel"].partition("@")[0])  # slcan: DEVICE@BAUDRATE
@@ -103,7 +103,7 @@ def lock_name(config: Mapping[str, Any]) -> str:
 
 
 def _holder_of(path: Path) -> str:
-    """Name the holder of the lock."""
+    """Describe the program that holds the lock."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
         note = json.loads(path.with_suffix(".json").read_text())
         return printable(f"{note['holder']} (process {note['pid']}, since {note['since']})")

@@ -1,4 +1,4 @@
-"""Opens a python-can bus: merged configuration, and plain error messages."""
+"""Opens a python-can bus: merged configuration, and errors with cause and remedy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "slcan": ("serial", "serial"),
     "udp_multicast": ("multicast", "msgpack"),
 }
-"""Extra of python-can that an interface needs, and the module it contains."""
+"""python-can extra that an interface needs, and the module it installs."""
 _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
     "cantact": {"monitor": True},
     "kvaser": {"driver_mode": False},
@@ -48,29 +48,29 @@ _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
     "systec": {"state": can.BusState.PASSIVE},
     "vector": {"listen_only": True},
 }
-"""Arguments that make a back end listen without acknowledging. SocketCAN is configured by root; for
-others python-can offers nothing."""
+"""Bus arguments for listen-only mode. SocketCAN is configured by root; python-can has no argument
+for other back ends."""
 _PERMISSION: Final = frozenset({errno.EACCES, errno.EPERM})
 
 
 def needed_extra(interface: str) -> tuple[str, str] | None:
-    """Return python-can's extra for an interface and its module; None if none is needed."""
+    """Return the python-can extra and the module that an interface needs; None if it needs none."""
     return _EXTRAS.get(interface)
 
 
 def can_listen_only(interface: str) -> bool:
-    """True if an argument makes the back end listen without acknowledging."""
+    """True if a bus argument puts the adapter in listen-only mode."""
     return interface in _LISTEN_ONLY
 
 
 def bus_config(
     given: Mapping[str, Any], fallback: Fallback | None = None, *, listen_only: bool = False
 ) -> dict[str, Any]:
-    """Merge all keywords for `can.Bus` from arguments, variables, files and the `fallback`, in this
-    order, without a bit rate that none of them names (`flasher.bus.bit_rate`).
+    """Merge the keywords for `can.Bus` from arguments, variables, files and the `fallback`, in this
+    order. A bit rate is included only if one of them names it (see `flasher.bus.bit_rate`).
 
-    `listen_only` adds arguments that keep the adapter silent, if its back end has any. Raises
-    UsageError for an invalid configuration, BusError without one.
+    `listen_only` adds arguments for listen-only mode, if the back end has any. Raises UsageError
+    for an invalid configuration, BusError if no adapter is configured.
     """
     merged = _configured(given, fallback)
     if "timing" in given:
@@ -110,7 +110,7 @@ def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) -> bool:
-    """True if arguments, a variable or a file name an adapter. Raises as `bus_config`."""
+    """True if arguments, a variable or a file name an adapter. Raises UsageError."""
     try:
         return bool(bus_config(given, fallback))
     except BusError:
@@ -118,8 +118,8 @@ def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) ->
 
 
 def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
-    """Open the bus of `bus_config`. Raises BusError with cause and remedy, also for an interface
-    that opens but is unusable, or only listens although the program `sends`.
+    """Open a bus by the result of `bus_config`. Raises BusError with cause and remedy, also for an
+    interface that is down, bus-off, or in listen-only mode although the program `sends`.
     """
     interface, channel = str(config["interface"]), config.get("channel")
     try:
@@ -142,14 +142,14 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
 
 
 def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:
-    """Return the error for a SocketCAN interface that is down, bus-off or only listens, which opens
-    without error. The carrier alone is not enough: gs_usb keeps it after bus-off.
+    """Return the error for a SocketCAN interface that is down, bus-off or in listen-only mode, all
+    of which open without error. The carrier alone is not enough: gs_usb keeps it after bus-off.
     """
-    seen = read_interface(channel)
-    if isinstance(seen, Unseen) or not seen.is_can:
+    interface = read_interface(channel)
+    if isinstance(interface, Unseen) or not interface.is_can:
         return None
     where = f"interface socketcan, channel {channel}"
-    if not seen.is_up:
+    if not interface.is_up:
         return BusError(
             f"The adapter cannot be opened: the interface {channel} is down.",
             where=where,
@@ -157,17 +157,17 @@ def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | N
             remedy=f"`{start_command(channel, bitrate_bps)}` (as root) starts it.",
             code=ErrorCode.ADAPTER_NOT_OPENED,
         )
-    if seen.state is ControllerState.BUS_OFF or seen.has_carrier is False:
-        what = "is bus-off" if seen.state is ControllerState.BUS_OFF else "has no carrier"
+    if interface.state is ControllerState.BUS_OFF or interface.has_carrier is False:
+        what = "is bus-off" if interface.state is ControllerState.BUS_OFF else "has no carrier"
         error = bus_off_error(where, f"The adapter cannot be used: {channel} {what}.")
-        if seen.has_carrier is False:
+        if interface.has_carrier is False:
             error.cause += ", or the other end of a vxcan pair is down"
         error.remedy = (
             f"Check bit rate and wiring; `{'; '.join(restart_commands(channel))}` (as root) "
             "starts the controller again."
         )
         return error
-    if sends and seen.only_listens:
+    if sends and interface.only_listens:
         return BusError(
             f"The adapter cannot be used: {channel} only listens, and nothing was sent.",
             where=where,

@@ -1,4 +1,4 @@
-"""Distinguishes physical adapters from virtual buses."""
+"""Distinguishes physical CAN adapters from virtual buses."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PSEUDO_TERMINAL_MAJORS: Final = range(136, 144)
 
 
 def is_physical(interface: str, channel: str) -> bool:
-    """Return False for python-can's own buses, for vcan and vxcan interfaces (as reported by the
-    kernel), and for a serial adapter at a pseudo terminal. Unknown adapters are physical. Takes 2 s
-    at most; never raises.
+    """Return False for python-can's own buses, vcan and vxcan interfaces (by the kernel), and
+    serial adapters on a pseudo terminal. Unknown adapters are physical. Takes up to 2 s; never
+    raises.
     """
     if interface in BUILT_IN:
         return False
     if interface == SOCKETCAN:
-        seen = read_interface(channel)
-        return not (isinstance(seen, Interface) and seen.kind in VIRTUAL_KINDS)
+        state = read_interface(channel)
+        return not (isinstance(state, Interface) and state.kind in VIRTUAL_KINDS)
     if interface in SERIAL_PORTS:
         # python-can takes PORT@BAUD.
         return not _is_pseudo_terminal(channel.partition("@")[0])
@@ -31,7 +31,7 @@ def is_physical(interface: str, channel: str) -> bool:
 
 
 def _is_pseudo_terminal(port: str) -> bool:
-    """Ask the kernel for the type of the device."""
+    """Ask the kernel for the device type of a serial port."""
     try:
         found = os.stat(port)  # noqa: PTH116  a name that is no path fails here
     except (OSError, ValueError):

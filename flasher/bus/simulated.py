@@ -1,12 +1,12 @@
-"""CAN bus in memory: exact bit times, arbitration by id, every node receives every frame.
+"""Simulated CAN bus: exact bit times, arbitration by id, every node receives every frame.
 
 Arbitration does not separate simultaneous senders of one id: equal frames merge; different frames
 destroy each other until the error counters silence one sender. Without `collides` they take turns,
 as on a virtual network.
 
-Devices are engines (`attach`); the host uses a `SimulatedLink`. The link's calls drive the bus,
-without a thread: sending and receiving advance its time, on the given clock. With a `VirtualClock`
-an upgrade takes no time, with a `PacedClock` as long as on a real bus.
+Devices are engines (`attach`); the host uses a `SimulatedLink`. The bus has no thread: sending and
+receiving advance its time, on the given clock. With a `VirtualClock` an upgrade takes no time, with
+a `PacedClock` as long as on a real bus.
 """
 
 from __future__ import annotations
@@ -32,30 +32,28 @@ from flasher.protocol.frame import Frame
 _ERROR_FRAME_BITS: Final = 20
 """Error flag, delimiter and following pause, approximately."""
 _ID_BITS: Final = 13
-"""Start, id and remote bit, which are equal for two senders of one id."""
+"""Start bit, id and remote bit, equal for two senders of one id."""
 _PASSIVE: Final = 128
 _OFF: Final = 256
-"""Transmit errors at which a controller stops disturbing others, or is reset."""
+"""Transmit error counters of a controller that is error-passive, and bus-off."""
 Disturbance = Callable[[Frame, float], Iterable[Frame]]
-"""Maps a frame and its end time to the frames received: itself, nothing, two copies, another
-one."""
+"""Replaces a frame that ends at a time by the frames received: itself, none, two copies,
+another."""
 
 DEFAULT_QUEUE_FRAMES = 32
-"""Transmit queue of the host's simulated adapter."""
+"""Frames that the host's simulated adapter queues."""
 
 
 class _Node:
-    """Node on the bus."""
-
     def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
-        """Frames to send, with the time at which each was queued."""
+        """Frames to send, each with the time at which it was queued."""
         self.tx_errors = 0
         """Transmit error counter: plus 8 for an error, minus 1 for a frame sent."""
 
 
 class _Host(_Node):
-    """Driven from outside through a link."""
+    """Node of a program, driven through a `SimulatedLink`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -63,18 +61,18 @@ class _Host(_Node):
 
 
 class _Device(_Node):
-    """Engine driven by the bus."""
+    """Node of an engine, driven by the bus."""
 
     def __init__(self, engine: Engine, on_event: Callable[[object], None] | None) -> None:
         super().__init__()
         self.engine = engine
         self.on_event = on_event
         self.deadline: float | None = None
-        """Deadline of the engine when it was last served."""
+        """Deadline that the engine last asked for."""
 
 
 class SimulatedBus:
-    """The wire, its nodes and its time."""
+    """CAN bus with hosts and devices, and its time."""
 
     def __init__(
         self,
@@ -87,53 +85,53 @@ class SimulatedBus:
         self.clock = clock
         self.frames_carried = 0
         self.busy_s = 0.0
-        """Time during which the wire was in use."""
+        """Seconds during which the wire was in use."""
         self._bitrate_bps = bitrate_bps
         self._disturbance = disturbance
         self._collides = collides
         self._nodes: list[_Node] = []
-        """All hosts and devices in the order of arrival."""
+        """Hosts and devices in the order in which they were added."""
         self._hosts: list[_Host] = []
         self._devices: list[_Device] = []
         self._sending: tuple[Sequence[_Node], Frame | None] | None = None
-        """Current senders, several for equal frames in the same bits; None as frame is a collision,
-        which no node receives."""
+        """Senders of the frame on the wire, several for equal frames in the same bits; None as
+        frame is a collision, which no node receives."""
         self._sending_ends_at = 0.0
         self._delivered_at: float | None = None
-        """Time of a delivered frame without answer: devices are as exact as the wire, even if the
+        """Time of a delivered frame to which devices answer: as exact as the wire, even if the
         clock woke late."""
         self.faults = AdapterFaults()
-        """Faults of the host's adapter; see `unplug`, `bus_off` and `is_unacknowledged`."""
+        """Faults of the host's adapter: `unplug`, `bus_off` and `is_unacknowledged`."""
 
     def unplug(self, back_after_s: float | None = None) -> None:
-        """Unplug the host's adapter: its links raise BusError until it is back (`plug`, or
-        automatically after `back_after_s`) and they were opened again.
+        """Unplug the host's adapter: its links raise BusError until it is plugged in again (`plug`,
+        or after `back_after_s`) and the link is reopened.
         """
         now = self.clock.now()
         self.faults.unplug(None if back_after_s is None else now + back_after_s)
         self._silence_hosts()
 
     def bus_off(self, restart_after_s: float | None = None) -> None:
-        """Set the host's controller bus-off until `plug`, or for `restart_after_s`."""
+        """Set the host's controller bus-off until `plug`, or for `restart_after_s` seconds."""
         now = self.clock.now()
-        self.faults.go_off(now, None if restart_after_s is None else now + restart_after_s)
+        self.faults.enter_bus_off(now, None if restart_after_s is None else now + restart_after_s)
         self._silence_hosts()
 
     def plug(self) -> None:
-        """End `unplug` and `bus_off`."""
-        self.faults.come_back(self.clock.now())
+        """Plug the host's adapter in again and restart its controller."""
+        self.faults.restore(self.clock.now())
 
     @property
     def is_unacknowledged(self) -> bool:
-        """True while the host is alone: it can neither send nor receive, and its queue fills up."""
-        return self.faults.is_alone
+        """True while the host is isolated: it neither sends nor receives, and its queue fills."""
+        return self.faults.is_isolated
 
     @is_unacknowledged.setter
     def is_unacknowledged(self, alone: bool) -> None:
-        self.faults.be_alone(self.clock.now(), alone=alone)
+        self.faults.isolate(self.clock.now(), alone=alone)
 
     def attach(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
-        """Add a device; `on_event` gets its events."""
+        """Add a device; `on_event` is called with its events."""
         device = _Device(engine, on_event)
         self._nodes.append(device)
         self._devices.append(device)
@@ -145,14 +143,14 @@ class SimulatedBus:
         self._devices.remove(device)
 
     def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
-        """Create a link for a host."""
+        """Add a host to the bus; return its link."""
         host = _Host()
         self._nodes.append(host)
         self._hosts.append(host)
         return SimulatedLink(self, host, queue_frames)
 
     def advance(self, limit: float) -> None:
-        """Advance to the next thing that happens, `limit` at the latest."""
+        """Advance to the next event on the bus, at latest to `limit`."""
         self._report_faults()
         now, self._delivered_at = self._delivered_at, None
         self._serve_devices(self.clock.now() if now is None else now)
@@ -177,14 +175,14 @@ class SimulatedBus:
                     host.inbox.append(report)
 
     def _silence_hosts(self) -> None:
-        """Drop everything that the hosts queued or were sending."""
+        """Drop the frames that hosts queued or were sending."""
         for host in self._hosts:
             host.outbox.clear()
         if self._sending is not None and self._sending[0][0] in self._hosts:
             self._sending = None
 
     def _serve_devices(self, now: float) -> None:
-        """Serve every device: one frame each waits for the wire."""
+        """Call every engine that is due; each device queues one frame at a time."""
         anything_happened = False
         for device in self._devices:
             engine = device.engine
@@ -207,7 +205,7 @@ class SimulatedBus:
     def _arbitrate(self) -> None:
         waiting = [node for node in self._nodes if node.outbox]
         if waiting and not self.faults.takes_part:
-            self._try_in_vain(host for host in self._hosts if host.outbox)
+            self._send_unacknowledged(host for host in self._hosts if host.outbox)
             waiting = [device for device in self._devices if device.outbox]
         if not waiting:
             return
@@ -232,8 +230,8 @@ class SimulatedBus:
         self.busy_s += bits / self._bitrate_bps
 
     def _contend(self, rivals: Sequence[_Node]) -> Sequence[_Node]:
-        """Return the senders among several with one id: those of the frame with the first dominant
-        bit, and any that still disturb it.
+        """Select among senders of one id those of the frame with the first dominant bit, and any
+        that are still error-active and disturb it.
         """
         first = min(_bits_after_id(node.outbox[0][1]) for node in rivals)
         strongest = [node for node in rivals if _bits_after_id(node.outbox[0][1]) == first]
@@ -245,18 +243,18 @@ class SimulatedBus:
         return strongest
 
     def _collide(self, rivals: Sequence[_Node]) -> int:
-        """Let senders of different frames with one id destroy each other; return the bits used."""
+        """Let different frames with one id destroy each other; return the bit times used."""
         different = {_bits_after_id(node.outbox[0][1]) for node in rivals}
         same = next(i for i, bits in enumerate(zip(*different, strict=False)) if len(set(bits)) > 1)
         for node in rivals:
             _count_error(node)
         return _ID_BITS + 8 * same + _ERROR_FRAME_BITS
 
-    def _try_in_vain(self, hosts: Iterable[_Host]) -> None:
+    def _send_unacknowledged(self, hosts: Iterable[_Host]) -> None:
         for host in hosts:
             queued_at, frame = host.outbox[0]
             duration_s = frame_bits(frame) / self._bitrate_bps
-            self.faults.try_in_vain(queued_at, duration_s, 1 / self._bitrate_bps)
+            self.faults.send_unacknowledged(queued_at, duration_s, 1 / self._bitrate_bps)
 
     def _deliver(self, senders: Sequence[_Node], frame: Frame | None) -> None:
         self._sending = None
@@ -282,7 +280,7 @@ def _bits_after_id(frame: Frame) -> bytes:
 
 
 def _count_error(node: _Node) -> None:
-    """Count an error; a node at bus-off loses its frame and comes back at once."""
+    """Count a transmit error; a node at bus-off loses its frame and restarts at once."""
     node.tx_errors += 8
     if node.tx_errors >= _OFF:
         node.tx_errors = 0
@@ -290,7 +288,7 @@ def _count_error(node: _Node) -> None:
 
 
 class SimulatedLink:
-    """Host's adapter on a simulated bus."""
+    """Host's adapter on a simulated bus: a `Link` without hardware."""
 
     def __init__(self, bus: SimulatedBus, host: _Host, queue_frames: int) -> None:
         self._bus = bus
@@ -303,7 +301,7 @@ class SimulatedLink:
         return "the simulated bus"
 
     def send(self, frame: Frame) -> None:
-        """Queue a frame; wait up to `SEND_LIMIT_S` for room in a full queue."""
+        """Queue a frame; wait up to `SEND_LIMIT_S` for room. Raises TransmitBlockedError."""
         clock = self._bus.clock
         give_up_at = clock.now() + SEND_LIMIT_S
         self._check("sending")
@@ -323,7 +321,7 @@ class SimulatedLink:
             self._host.outbox.append((clock.now(), frame))
 
     def receive(self, deadline: float) -> Frame | None:
-        """Advance time until a frame arrives or the deadline comes."""
+        """Advance the bus until a frame arrives or the deadline comes."""
         inbox = self._host.inbox
         self._check_plugged("receiving")
         while not inbox:
@@ -336,7 +334,7 @@ class SimulatedLink:
         return frame
 
     def drain(self) -> int:
-        """Discard received frames, but count the adapter's reports."""
+        """Discard received frames, but count error frames."""
         count = len(self._host.inbox)
         for frame in self._host.inbox:
             self._health.count_frame(frame)
@@ -347,7 +345,7 @@ class SimulatedLink:
         """Nothing to release."""
 
     def reopen(self) -> None:
-        """Reopen with empty queues. Raises BusError while the adapter is not back."""
+        """Reopen with empty queues. Raises BusError while the adapter is unplugged or bus-off."""
         faults = self._bus.faults
         self._bus.advance(self._bus.clock.now())  # time may have passed elsewhere
         if not faults.is_plugged:
@@ -375,7 +373,7 @@ class SimulatedLink:
         return False
 
     def health(self) -> LinkHealth:
-        """Report like an adapter on Linux: error-active unless there was a fault."""
+        """Return the health as an adapter on Linux: error-active unless there was a fault."""
         faults = self._bus.faults
         if not faults.is_plugged:
             return self._health.health()

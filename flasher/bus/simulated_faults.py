@@ -1,7 +1,6 @@
-"""Faults of the host's adapter on a simulated bus, and its error frames.
+"""Adapter faults on a simulated bus: unplugged, bus-off, or not acknowledged; pure.
 
-The adapter is unplugged, goes bus-off, or is alone, without acknowledgement. The error frames are
-those of Linux's SocketCAN drivers. Pure: time is an argument.
+Error frames have the format of Linux's SocketCAN drivers.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from flasher.bus.health import PASSIVE_LIMIT, WARNING_LIMIT
 from flasher.protocol.frame import Frame
 
 _ERRORS_PER_TRY: Final = 8
-"""Increase of the transmit error counter per frame without acknowledgement."""
+"""Increase of the transmit error counter for a frame without acknowledgement."""
 _ERROR_BITS: Final = 20
 """Error flag, delimiter and following pause, approximately."""
 
 
 def _error_frame(classes: int, controller: int = 0, tx_errors: int = 0) -> Frame:
-    """Create a frame in Linux's format: class bits in the id, state and counters in the data."""
+    """Create an error frame in Linux's format: classes in the id, state and counters in data."""
     return Frame(classes, bytes((0, controller, 0, 0, 0, 0, tx_errors, 0)), is_error=True)
 
 
@@ -31,59 +30,59 @@ ACTIVE_AGAIN: Final = _error_frame(0x204, 0x40)
 
 
 class AdapterFaults:
-    """Fault state of the adapter; initially plugged in and working."""
+    """Faults of the host's adapter; it starts plugged in and working."""
 
     def __init__(self) -> None:
         self.is_plugged = True
         self.is_off = False
-        self.is_alone = False
-        """True while no node acknowledges."""
+        self.is_isolated = False
+        """True while no node acknowledges its frames."""
         self.times_unplugged = 0
-        """A link opened before the last time must be opened again."""
+        """A link that was opened before the last unplugging must be reopened."""
         self.due_at = inf
-        """Time of the next event; infinite without one."""
+        """Time of the next fault or error frame; infinite without one."""
         self._back_at: float | None = None
         self._reports: list[tuple[float, Frame]] = []
         self._has_reported = False
 
     @property
     def takes_part(self) -> bool:
-        """True if its frames are sent and others' frames are received."""
-        return self.is_plugged and not self.is_off and not self.is_alone
+        """True if the adapter sends and receives frames."""
+        return self.is_plugged and not self.is_off and not self.is_isolated
 
     def unplug(self, back_at: float | None) -> None:
-        """Unplug it until a time, or until it is plugged in."""
+        """Unplug the adapter until `back_at`, or until `restore`."""
         self.is_plugged = False
         self.times_unplugged += 1
         self._back_at = back_at
         self._reports.clear()
         self._look_ahead()
 
-    def go_off(self, now: float, back_at: float | None) -> None:
-        """Go bus-off until a time, or until it is plugged in again."""
+    def enter_bus_off(self, now: float, back_at: float | None) -> None:
+        """Set the controller bus-off until `back_at`, or until `restore`."""
         self.is_off = True
         self._back_at = back_at
         self._reports = [(now, BUS_OFF)]
         self._look_ahead()
 
-    def come_back(self, now: float) -> None:
-        """Plug it in and restart its controller."""
+    def restore(self, now: float) -> None:
+        """Plug the adapter in and restart its controller."""
         if self.is_off and self.is_plugged:
             self._reports.append((now, RESTARTED))
         self.is_plugged, self.is_off = True, False
         self._back_at = None
         self._look_ahead()
 
-    def be_alone(self, now: float, *, alone: bool) -> None:
-        """Isolate it from all other nodes, or reconnect it."""
+    def isolate(self, now: float, *, alone: bool) -> None:
+        """Isolate the adapter from all other nodes, or reconnect it."""
         if not alone and self._has_reported:
             self._reports = [(now, ACTIVE_AGAIN)]
-        self.is_alone, self._has_reported = alone, False
+        self.is_isolated, self._has_reported = alone, False
         self._look_ahead()
 
-    def try_in_vain(self, now: float, frame_s: float, bit_s: float) -> None:
-        """Send without acknowledgement: the error counter rises to error-passive."""
-        if not self.is_alone or self._has_reported:
+    def send_unacknowledged(self, now: float, frame_s: float, bit_s: float) -> None:
+        """Send a frame without acknowledgement: the error counter rises to error-passive."""
+        if not self.is_isolated or self._has_reported:
             return
         self._has_reported = True
         try_s = frame_s + _ERROR_BITS * bit_s
@@ -92,9 +91,9 @@ class AdapterFaults:
         self._look_ahead()
 
     def tick(self, now: float) -> list[Frame]:
-        """Come back when due; return the error frames to report now."""
+        """End a fault that is over; return the error frames to report now."""
         if self._back_at is not None and self._back_at <= now:
-            self.come_back(now)
+            self.restore(now)
         due = [frame for at, frame in self._reports if at <= now]
         self._reports = [(at, frame) for at, frame in self._reports if at > now]
         self._look_ahead()

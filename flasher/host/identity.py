@@ -220,7 +220,7 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
         text += ": the manifest was made for these very bytes"
         yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     else:
-        yield identity.refusal(IdentityCheck.PLAUSIBLE, text, found.ways)
+        yield identity.refusal(IdentityCheck.PLAUSIBLE, text, found.other_waivers)
 
 
 # -- the device -------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from flasher.host import waivers
 from flasher.host.table import Ending
 from flasher.i18n import Text, text
 from flasher.image.plan import Plan
-from flasher.image.plausible import UNLIKELY
+from flasher.image.plausible import LIKELY_CAUSES
 from flasher.protocol.spec import Target
 from flasher.validation import json_keys
 from flasher.wording import wording
@@ -268,7 +268,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.IMPLAUSIBLE: _Explanation(
         ImageError,
-        UNLIKELY,
+        LIKELY_CAUSES,
         "Name the firmware file itself; flasher image-info shows what is in a file.",
         code=ErrorCode.IMAGE_IMPLAUSIBLE,
     ),

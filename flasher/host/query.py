@@ -128,7 +128,7 @@ class Query:
 def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     """Run one query; see the module for the times."""
     title = query.request.item.title
-    run.tx.all_left(run.now)
+    run.tx.limit_left_at(run.now)
     run.also_listen_on(query.answer_item.can_id, *_others_ask(query))
     query.repeat_at = run.now
     query.ends_at = run.now + run.timings.command_timeout_s

@@ -59,7 +59,7 @@ class Runner(Generic[T]):
         """Return the next frame to send."""
         self.frame_sent: Callable[[float], Any] = self.tx.frame_sent
         """Note that the adapter accepted it."""
-        self.tx.on_left = self._message_left
+        self.tx.on_message_sent = self._message_left
         self.now = 0.0
         """Time of the current input."""
         self.is_cancelled = False

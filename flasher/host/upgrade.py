@@ -28,7 +28,7 @@ from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
-from flasher.protocol.engine import WELL_BEYOND
+from flasher.protocol.engine import DROP_MARGIN
 from flasher.protocol.fields import Content
 from flasher.protocol.messages import (
     Ack,
@@ -315,7 +315,7 @@ class UpgradeStage:
             try:
                 came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
             except LinkRestored:
-                self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * WELL_BEYOND)
+                self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * DROP_MARGIN)
                 self._heard_at = self._run.now  # it may have sent something meanwhile
                 self._dispatch(UpgradeEvent.LINK_BACK)
             except SecondToolSeen as tool:
@@ -775,7 +775,7 @@ class UpgradeStage:
             self._repeat_packet(row, Reason.PACKET_REFUSED)
             return
         self._acknowledged = at.packet
-        self._tx.all_left(self._run.now)
+        self._tx.limit_left_at(self._run.now)
         self._run.emit(events.PacketAcknowledged(at.packet, total, at.tries))
         if at.packet < total:
             self._go(UpgradeState.TRANSFERRING)
@@ -981,7 +981,7 @@ class UpgradeStage:
         self._ending = (ending, detail)
         self.state = UpgradeState.STOPPING
         self._tx.drop_unstarted()
-        self._tx.hurry()
+        self._tx.send_without_gaps()
         if self._tx.idle:
             self._finish()
 

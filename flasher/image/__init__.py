@@ -1,1 +1,1 @@
-"""Firmware images: file formats, checks, releases, and the plan of packets to send."""
+"""Firmware images: file formats, plausibility checks, release manifests, packet plans."""

@@ -1,10 +1,9 @@
-"""Cortex-M vector tables: check that an image looks like a program and starts inside itself.
+"""Cortex-M vector tables: whether an image begins with one, and starts inside itself (R8).
 
-The first word of such a program is its initial stack pointer, the second its reset vector: an
-address with bit 0 set, for Thumb. The protocol does not require a Cortex-M:
-`flasher.image.plausible` refuses an image without a plausible vector table unless waived. This
-module refuses one that starts outside itself (R8): part of a program, or the wrong part of a merged
-file.
+A vector table begins with the initial stack pointer and the reset vector, an address with bit 0 set
+(Thumb). The protocol does not require a Cortex-M: `flasher.image.plausible` refuses an image
+without vector table unless waived. This module refuses an image whose reset vector points outside
+it: part of a program, or the wrong part of a merged file.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import Image
 
 _VECTORS: Final = Struct("<4I")
-"""Initial stack pointer, then reset, NMI and hard fault."""
+"""Initial stack pointer; reset, NMI and hard fault vectors."""
 _FIRST_TWO_SIZE: Final = 8
 _RAM_START: Final = 0x1000_0000
 _RAM_END: Final = 0x4000_0000
-"""RAM in the code region (core-coupled, or of some makers), then the SRAM region. A stack pointer
-starts at the end of a RAM and grows down: the start of the area is outside, its end inside."""
+"""Code RAM (core-coupled, or of some makers) and SRAM region. A stack pointer starts at the end of
+a RAM and grows down: the start of the area is outside, its end inside."""
 _THUMB: Final = 1
 _MEMORY_SIZE: Final = 1 << 24
-"""Larger than the program memory of any device; the handlers of one program are closer together."""
+"""More than the program memory of any device: the handlers of a program are closer together."""
 _ERASED: Final = 0xFFFF_FFFF
 _EMPTY: Final = (0, _ERASED)
 _BASE_ALIGNMENT: Final = 128
@@ -37,16 +36,16 @@ _INNER_NAMED_MAX: Final = 4
 
 @dataclass(frozen=True)
 class VectorTable:
-    """First two words of an image, and the problems found with them."""
+    """Stack pointer and reset vector of an image, and the problems found with them."""
 
     stack_pointer: int
     reset_vector: int
     plausible: bool
-    """It looks like a Cortex-M vector table and suits its address. `check_starts_inside` checks
-    where it starts."""
+    """The words look like a Cortex-M vector table at this address. Whether the program starts
+    inside the image is the question of `check_starts_inside`."""
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    """Checks that were not possible, and why."""
+    """Checks that could not be made, and why."""
 
     @property
     def stack_pointer_plausible(self) -> bool:
@@ -54,12 +53,12 @@ class VectorTable:
 
     @property
     def entry(self) -> int:
-        """Address at which the processor starts: the reset vector without its Thumb bit."""
+        """Start address of the program: the reset vector without its Thumb bit."""
         return self.reset_vector & ~_THUMB
 
 
 def vector_table(image: Image) -> VectorTable | None:
-    """Return the vector table at the start of an image; None if the image is too short."""
+    """Read the vector table at the start of an image; None if the image is shorter."""
     if image.size_bytes < _FIRST_TWO_SIZE:
         return None
     head = image.data[: _VECTORS.size]
@@ -104,7 +103,7 @@ def vector_table(image: Image) -> VectorTable | None:
 
 
 def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
-    """Return the problem with vectors that point too far apart, as a list of one or none."""
+    """Problem of vectors that point too far apart: a list of one or none."""
     reach = image.size_bytes if image.base is None else _MEMORY_SIZE
     if max(vectors) - min(vectors) < reach:
         return []
@@ -115,10 +114,10 @@ def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
 
 
 def check_starts_inside(image: Image) -> None:
-    """Check the rule for merged files (R8).
+    """Check that an image contains its own entry point, against merged files (R8).
 
     Raises ImageError if the image has a Cortex-M stack pointer and a known base, but its reset
-    vector points outside the image. Does nothing without a base.
+    vector points outside the image. Images without base are not checked.
     """
     table = vector_table(image)
     if table is None or image.base is None or not table.stack_pointer_plausible:
@@ -141,7 +140,7 @@ def check_starts_inside(image: Image) -> None:
 
 
 def _inner_tables(image: Image) -> list[int]:
-    """Addresses at which a second program seems to start, as in a merged file."""
+    """Addresses of further vector tables, as in a merged file."""
     if image.base is None:
         return []
     found = []

@@ -1,4 +1,4 @@
-"""ELF files: sections inside loadable segments, at their physical addresses, as in objcopy.
+"""ELF reader: sections inside loadable segments, at physical addresses, like objcopy.
 
 Other bytes of a segment (the file's own headers, padding) are not part of the program. A segment
 with bytes but no section is refused as ambiguous.
@@ -48,12 +48,12 @@ _NO_BITS: Final = 8
 _ALLOCATED: Final = 2
 _PROGRAM_HEADERS_MAX: Final = 64
 _SECTIONS_MAX: Final = 4096
-"""An image has a few dozen. Processing time grows with the product of the two limits."""
+"""A linked program has a few dozen. Processing time grows with the product of both limits."""
 
 
 @dataclass(frozen=True)
 class _Load:
-    """Loadable segment with bytes in the file."""
+    """Loadable segment (program header) with bytes in the file."""
 
     number: int
     offset: int
@@ -69,7 +69,7 @@ class _Load:
 
 
 def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """Read the bytes of all loaded sections. Raises ImageError for a damaged file."""
+    """Read the bytes of all loadable sections. Raises ImageError for a damaged ELF file."""
     data = file.read()
     order, fields = _header(data, source)
     sections_at, section_size, section_count = fields[6], fields[11], fields[12]
@@ -99,18 +99,18 @@ def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
 
 
 def machine_of(head: bytes) -> int | None:
-    """Return the processor (e_machine) of a file with this `head`; None if truncated."""
+    """Processor number (e_machine) from the first bytes of an ELF file; None if truncated."""
     order = _BYTE_ORDERS.get(head[_BYTE_ORDER_AT]) if len(head) >= _MACHINE_END else None
     return None if order is None else int(Struct(f"{order}H").unpack_from(head, _MACHINE_AT)[0])
 
 
 def machine_name(machine: int | None) -> str:
-    """Name of a processor, for messages."""
+    """Processor name of an ELF machine number."""
     return _MACHINES.get(machine or 0, f"ELF machine {machine}")
 
 
 def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
-    """Return the byte order (as in struct) and the header fields."""
+    """Return the byte order, as in `struct`, and the ELF header fields."""
     if not data.startswith(MAGIC):
         raise _refuse(source, "it does not start with 7F 45 4C 46")
     order = _BYTE_ORDERS.get(data[_BYTE_ORDER_AT]) if len(data) > _BYTE_ORDER_AT else None
@@ -132,7 +132,7 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
 def _table(
     data: bytes, source: str, what: str, entry: Struct, place: tuple[int, int, int]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the entries of a table at `place`: offset, size and number of entries."""
+    """Yield the entries of an ELF header table; `place` is its offset, entry size and length."""
     at, size, count = place
     if count and (size != entry.size or at + count * size > len(data)):
         raise _refuse(source, f"{what} truncated")
@@ -140,7 +140,7 @@ def _table(
 
 
 def _loads(data: bytes, source: str, order: str, fields: tuple[int, ...]) -> list[_Load]:
-    """Return the loadable segments that have bytes in the file."""
+    """Return the loadable segments. Raises ImageError for one outside file or address space."""
     place = fields[5], fields[9], fields[10]
     table = _table(data, source, "its program headers are", Struct(order + _PROGRAM_HEADER), place)
     loads = []

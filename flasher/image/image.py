@@ -1,4 +1,4 @@
-"""Firmware image: the bytes to send, and where they came from."""
+"""Firmware image: the bytes to send, their addresses, hash, version and target names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ADDRESS_SPACE: Final = 1 << 32
 
 @dataclass(frozen=True)
 class AddressSpan:
-    """A run of bytes of the file."""
+    """Contiguous address range of a firmware file."""
 
     start: int
     size_bytes: int
@@ -34,28 +34,28 @@ class AddressSpan:
 
 @dataclass(frozen=True)
 class Image:
-    """Bytes to send, from first to last (R8), with their origin."""
+    """Firmware image: the bytes to send (R8), and the file and address that they come from."""
 
     data: bytes = field(repr=False)
-    """The exact bytes to send, with gaps filled."""
+    """The bytes to send, gaps filled."""
     base: int | None
     """Address of `data[0]`; None for a raw binary with unknown base."""
     format: str
-    """Name of the file format: "Intel HEX", "raw binary", ..."""
+    """File format, such as "Intel HEX" or "raw binary"."""
     source: str
     """File name as given, for messages."""
     segments: tuple[AddressSpan, ...]
-    """Ranges with bytes in the file; offsets if `base` is None."""
+    """Address ranges with bytes in the file; offsets if `base` is None."""
     filled_bytes: int
     """Number of filler bytes in `data`."""
     version: str | None = None
-    """Firmware version `Vxrxrx_YYYYMMDD` found in `data`; None for none or several."""
+    """Firmware version `Vxrxrx_YYYYMMDD` in `data`; None if it has none or several."""
     elf_machine: int | None = field(default=None, compare=False)
     """Processor of an ELF file; None for other formats."""
 
     @classmethod
     def from_bytes(cls, data: bytes, *, base: int | None = None, source: str = "(memory)") -> Self:
-        """Create an image from bytes in memory, like a loaded raw binary."""
+        """Create an image from bytes, as from a raw binary file."""
         return cls(
             data=data,
             base=base,
@@ -72,12 +72,12 @@ class Image:
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 of `data` in hexadecimal."""
+        """SHA-256 of `data`, lower-case hexadecimal."""
         return hashlib.sha256(self.data).hexdigest()
 
     @cached_property
     def named_targets(self) -> frozenset[Target]:
-        """Targets named inside `data`; may be empty."""
+        """Targets whose names are in `data`; may be empty."""
         return named_targets(self.data)
 
 
@@ -87,11 +87,11 @@ class Image:
 # right beside a firmware version, or the whole text of an update command.
 
 NEIGHBOURHOOD_SIZE: Final = 64
-"""Bytes before and after a firmware version in which a name belongs to it."""
+"""Maximum distance in bytes between a firmware version and the device name that belongs to it."""
 
 
 def _whole_words(texts: dict[str, Target]) -> re.Pattern[bytes]:
-    """Compile a pattern that matches these texts as whole words."""
+    """Compile a pattern that matches any of these texts as a whole word."""
     choice = "|".join(map(re.escape, texts)).encode("ascii")
     return re.compile(rb"(?<![A-Za-z0-9_])(?:" + choice + rb")(?![A-Za-z0-9_])")
 
@@ -105,7 +105,7 @@ _UPDATE_TEXT: Final = _whole_words(_UPDATE_TEXTS)
 
 
 def named_targets(data: bytes) -> frozenset[Target]:
-    """Return the targets that an image names; several for contradicting texts."""
+    """Targets named in an image; several if its texts contradict each other."""
     found = {_UPDATE_TEXTS[match[0].decode("ascii")] for match in _UPDATE_TEXT.finditer(data)}
     for start, end in firmware_version_spans(data):
         # The version itself ends a word: packed structures have no separators.

@@ -1,8 +1,8 @@
-"""Load a firmware file as an `Image`: detect the format, read, check and join its bytes.
+"""Firmware file loader: detects Intel HEX, S-record, ELF or raw binary, checks it, fills gaps.
 
-The format is detected by content first and by suffix second. A damaged record file still counts as
-one, so that its reader reports the damage. Anything else is a raw binary; `flasher.image.plausible`
-checks whether it can be a program.
+The format is detected by content first and by suffix second. A damaged HEX or S-record file is
+still detected, so that its reader reports the damage. Other files are raw binaries;
+`flasher.image.plausible` checks whether one can be a program.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from flasher.protocol.text import find_firmware_version, printable
 
 HEAD_SIZE: Final = 65_536
 """Bytes examined to detect the format."""
-_LINES_JUDGED: Final = 100
+_LINES_EXAMINED: Final = 100
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
-"""In bytes. Covers the gap between vector table and code; a larger gap separates another part."""
+"""Bytes. Covers the gap between vector table and code; a larger gap separates another part."""
 FILE_MAX_SIZE: Final = 128 * 1024 * 1024
-"""Maximum size in bytes of a file that is not a raw binary; a larger one is not read."""
+"""Maximum size in bytes of a HEX, S-record or ELF file."""
 
 
 class Format(Enum):
-    """File formats; the value is the option's word, `title` the name in messages."""
+    """File formats; the value is the word of `--format`, `title` the name in messages."""
 
     HEX = "hex"
     BIN = "bin"
@@ -68,7 +68,7 @@ _RECORDS: Final = {
 _STARTS: Final = {Format.HEX: re.compile(rb":"), Format.SREC: re.compile(rb"S[0-9]")}
 _TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\n\v\f\r"
 FORMATS: Final = tuple(form.value for form in Format)
-"""Accepted values of `format`."""
+"""Values of `--format`."""
 _READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf.read}
 
 
@@ -81,12 +81,12 @@ def load(
     fill_gaps_up_to: int = DEFAULT_FILL_GAPS_UP_TO,
     allow_outside_vector: bool = False,
 ) -> Image:
-    """Load and check the image in a firmware file (R8, R9).
+    """Load a firmware file and check it (R8, R9).
 
     `format` is one of `FORMATS`; None detects it. `base` is the address of the first byte of a raw
     binary. `range_` is (start, end), end exclusive: other bytes of the file are ignored. Gaps up to
-    `fill_gaps_up_to` bytes are filled with FF, starting at the range's start.
-    `allow_outside_vector` waives the merged-file rule of R8.
+    `fill_gaps_up_to` bytes are filled with FF, from the start of the range. `allow_outside_vector`
+    waives the merged-file rule of R8.
 
     Raises ImageError if the file cannot be used; UsageError if it does not exist, is not a regular
     file, or the options contradict each other.
@@ -148,7 +148,7 @@ def _detect(head: bytes, source: str) -> Format:
         for form, start in _STARTS.items():
             if start.match(body):
                 return form
-    lines = [line.strip() for line in body.splitlines()[:_LINES_JUDGED]]
+    lines = [line.strip() for line in body.splitlines()[:_LINES_EXAMINED]]
     for form, record in _RECORDS.items():
         matching = sum(record.match(line) is not None for line in lines)
         if 2 * matching > len(lines):
@@ -160,7 +160,7 @@ def _detect(head: bytes, source: str) -> Format:
 
 
 def _is_mostly_text(head: bytes) -> bool:
-    """Distinguish a damaged text file from a program that happens to begin like a record."""
+    """Distinguish a damaged text file from a program whose first bytes look like a record."""
     return 2 * len(head.translate(None, _TEXT)) <= len(head)
 
 
@@ -171,7 +171,7 @@ def _binary(
     base: int | None,
     fill_gaps_up_to: int,
 ) -> Image:
-    """Load a raw binary, or only its part in the range."""
+    """Load a raw binary, or the part of it inside the address range."""
     source, window = sparse.source, sparse.window
     if window and base is None:
         raise UsageError(

@@ -1,7 +1,7 @@
-"""Plan of an upgrade: packets, frames and time on the wire, before anything is sent.
+"""Upgrade plan: number of packets and CAN frames of an image, and their time on the bus.
 
-Times are exact bit times of the actual frames, including stuff bits, without idle time. The
-device's time to restart, erase and answer is not included.
+Times are exact bit times of the actual frames with stuff bits, without idle time. Restart, erasing
+and answer times of the device are not included.
 """
 
 from __future__ import annotations
@@ -43,34 +43,34 @@ from flasher.protocol.wire import Message, encode, split
 
 _FILLER: Final = bytes((PACKET_FILLER,))
 _NOMINAL_BOOT_VERSION: Final = "V1.0.0"
-"""Another version differs by a few stuff bits at most."""
+"""Other versions differ by a few stuff bits."""
 _CHUNK_PACKETS: Final = 1024
-"""Packets encoded at once: a compromise between speed and memory."""
+"""Packets encoded at once, as a compromise between speed and memory."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Upgrade without errors: every message of both directions once."""
+    """Traffic of an upgrade without errors: each message of tool and device once."""
 
     image: Image
     target: Target
     bitrate_bps: int
     total_packets: int
     host_frames: int
-    """CAN frames of the tool: reset, update command, packets, end of transfer."""
+    """CAN frames sent by the tool: reset, update command, packets, end of transfer."""
     device_frames: int
-    """CAN frames of the device: general feedback, one boot version, request transfer, an ACK for
-    each packet, complete."""
+    """CAN frames sent by the device: general feedback, one boot version, request transfer, an ACK
+    for each packet, complete."""
     host_messages: int
-    """Messages of the tool."""
+    """Messages sent by the tool."""
     bytes_on_wire: int
     """Data bytes of all frames."""
     wire_s: float
-    """Time of all frames on the bus without idle time."""
+    """Seconds of all frames on the bus, without idle time."""
     transfer_wire_s: float
-    """Time of the packets and their ACKs."""
+    """Seconds of the packets and their ACKs on the bus."""
     packet_bits: array[int] = field(repr=False, compare=False)
-    """Bit times of the frames of each packet, packet 1 first."""
+    """Bit times of each packet, packet 1 first."""
 
     @property
     def frames(self) -> int:
@@ -78,11 +78,11 @@ class Plan:
         return self.host_frames + self.device_frames
 
     def packet_frames(self, number: int) -> list[Frame]:
-        """Return the CAN frames of packet `number`, from 1; raises IndexError for any other."""
+        """CAN frames of packet `number`, from 1. Raises IndexError for any other."""
         return split(self.target.request_id, self._packet_wire(number))
 
     def packet_wire_s(self, number: int) -> float:
-        """Return the wire time of packet `number`, from 1; raises IndexError for any other."""
+        """Seconds of packet `number`, from 1, on the bus. Raises IndexError for any other."""
         self._check(number)
         return self.packet_bits[number - 1] / self.bitrate_bps
 
@@ -105,8 +105,8 @@ def make_plan(
 ) -> Plan:
     """Plan an upgrade, at the dialect's bit rate unless another one is given.
 
-    Raises UsageError for a dialect without upgrade, unless `has_upgrade` enables it for a product;
-    else as `plan`.
+    Raises UsageError for a dialect without upgrade, unless `has_upgrade` enables it, and for an
+    unknown target or dialect; ImageError and UsageError like `plan`.
     """
     chosen = as_dialect(dialect)
     if chosen.has_upgrade and has_upgrade is False:
@@ -126,7 +126,7 @@ def make_plan(
 def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
     """Plan the upgrade of `target` with `image` at `bitrate_bps`.
 
-    Raises ImageError if the image is empty or needs more than 65535 packets (R9), UsageError for an
+    Raises ImageError for an empty image or one of more than 65535 packets (R9), UsageError for an
     invalid bit rate.
     """
     if bitrate_bps <= 0:
@@ -177,7 +177,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
 
 
 class _Traffic:
-    """Totals of messages."""
+    """Sums of messages, CAN frames, bytes and bit times."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -196,14 +196,14 @@ class _Traffic:
 
 
 def _packet_wire(data: bytes, number: int, total: int, can_id: int) -> bytes:
-    """Encode a packet; the last one is padded with FF (R9)."""
+    """Encode packet `number`; the last one is padded with FF (R9)."""
     end = number * PACKET_DATA_SIZE
     payload = data[end - PACKET_DATA_SIZE : end].ljust(PACKET_DATA_SIZE, _FILLER)
     return encode(Packet(number, total, payload).to_message(can_id))
 
 
 def _packet_bits(data: bytes, total: int, can_id: int) -> array[int]:
-    """Bit times of each packet. Packets are whole frames, so they form one stream."""
+    """Bit times of each packet. A packet is 18 full frames, so that packets form one stream."""
     bits = array("H")
     for first in range(1, total + 1, _CHUNK_PACKETS):
         numbers = range(first, min(first + _CHUNK_PACKETS, total + 1))

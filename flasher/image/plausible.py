@@ -1,8 +1,8 @@
 """Plausibility check: whether the bytes of an image can be a program for the device.
 
-There are two degrees of doubt: certainly something else (another file type, a text, one repeated
-byte, a program for another processor), or no plausible Cortex-M vector table. The second may still
-be correct: the documents name no processor, and an image may be encrypted.
+An image is either certainly something else (another file type, a text, one repeated byte, a program
+for another processor), or has no plausible Cortex-M vector table. The latter may be correct: the
+documents name no processor, and an image may be encrypted.
 """
 
 from __future__ import annotations
@@ -47,43 +47,43 @@ _PE_HEADER_AT: Final = 0x3C
 _HTML: Final = re.compile(rb"\s*(<!--|<!doctype|<html|<head|<body)", re.IGNORECASE)
 _XML: Final = re.compile(rb"\s*<\?xml")
 _UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_UTF_16_JUDGED: Final = 64
+_UTF_16_EXAMINED: Final = 64
 _CONTROLS: Final = bytes(byte for byte in range(0x20) if byte not in b"\t\n\v\f\r\x1b") + b"\x7f"
 _OTHER_ENCODING_SIZE: Final = 256
-"""So many bytes without a control character are text in some encoding; random bytes pass this once
-in 10^13."""
-UNLIKELY: Final = "the wrong file, an encrypted image, a header in front, or another processor"
-"""Possible reasons for an image without a vector table."""
-_OTHER_WAYS: Final = (
+"""So many bytes without control character are text in some encoding. The probability for random
+bytes is 10^-13."""
+LIKELY_CAUSES: Final = "the wrong file, an encrypted image, a header in front, or another processor"
+"""Causes of an image without vector table, for messages."""
+_OTHER_WAIVERS: Final = (
     ", as does a manifest of these very bytes (flasher manifest create --allow-implausible), or "
     'cpu = "other" in the target\'s profile'
 )
 
 
 class Cpu(Enum):
-    """Processor types of a profile; the value is the word used there."""
+    """Processor type in a target profile."""
 
     CORTEX_M = "cortex-m"
     OTHER = "other"
 
 
 class Doubt(NamedTuple):
-    """Why an image is probably not a program for the device; `text` completes "the image ...".
+    """Reason why an image is implausible; `text` completes "the image ...".
 
-    `is_certain`: its content identifies it as something else, and no profile or manifest can waive
-    that. `ways` names what waives the check besides the option --allow-implausible.
+    `is_certain`: the bytes are another file type, and no profile or manifest can waive the check.
+    `other_waivers` names what waives it besides --allow-implausible.
     """
 
     text: str
     is_certain: bool
 
     @property
-    def ways(self) -> str:
-        return "" if self.is_certain else _OTHER_WAYS
+    def other_waivers(self) -> str:
+        return "" if self.is_certain else _OTHER_WAIVERS
 
 
 def find_doubt(image: Image) -> Doubt | None:
-    """Return the reason why an image is implausible; None if it looks like a program."""
+    """Find the reason why an image is implausible; None for a plausible program."""
     foreign = _foreign(image)
     if foreign is not None:
         return Doubt(f"is {foreign}", is_certain=True)
@@ -97,12 +97,12 @@ def find_doubt(image: Image) -> Doubt | None:
 
 
 def check_plausible(image: Image) -> None:
-    """Raise ImageError for an implausible image; for commands without manifest or profile."""
+    """Raise ImageError for an implausible image, for commands without manifest and profile."""
     found = find_doubt(image)
     if found is not None:
         raise ImageError(
             f"{image.source} {found.text}: not plausible as firmware.",
-            cause="the wrong file" if found.is_certain else UNLIKELY,
+            cause="the wrong file" if found.is_certain else LIKELY_CAUSES,
             remedy="Name the firmware file itself; if these really are the bytes to send, add "
             "--allow-implausible.",
             code=ErrorCode.IMAGE_IMPLAUSIBLE,
@@ -110,7 +110,7 @@ def check_plausible(image: Image) -> None:
 
 
 def _foreign(image: Image) -> str | None:
-    """Name what an image certainly is instead of a program."""
+    """Name the file type of bytes that are certainly no program for the device."""
     data = image.data
     if image.elf_machine not in (None, EM_ARM):
         return f"a program for another processor ({machine_name(image.elf_machine)})"
@@ -138,7 +138,7 @@ def _text(data: bytes) -> str | None:
     if _XML.match(data):
         return "an XML document"
     if data.startswith(_UTF_16):
-        if data[:_UTF_16_JUDGED].decode("utf-16", "ignore").isascii():
+        if data[:_UTF_16_EXAMINED].decode("utf-16", "ignore").isascii():
             return "a text in UTF-16"
         return None
     # A dump of a flash memory that contains a text is padded with FF or 00.

@@ -1,4 +1,4 @@
-"""Intel HEX and Motorola S-record files: strictly checked here, loaded by intelhex and bincopy.
+"""Intel HEX and S-record reader: a strict check, then intelhex or bincopy, and a comparison.
 
 The libraries accept a missing end record, wrapping addresses and lost records, reject repeated
 records, and need a hundred bytes of memory per byte of image. So a strict pass first rejects
@@ -24,16 +24,16 @@ from flasher.image.image import ADDRESS_SPACE
 from flasher.image.segments import PIECES_MAX, SparseBytes, scattered_error
 
 LINES_MAX: Final = 1_100_000
-"""The largest image has 1,048,560 records of eight bytes; usual programs write 16 or 32 bytes each.
-Limits the time for a file of blank lines."""
+"""Maximum number of lines, against files of blank lines. The largest image has 1,048,560 records of
+eight bytes; usual programs write 16 or 32 bytes per record."""
 _LINE_MAX: Final = 1024
-"""Longer than any record of either format."""
+"""More characters than any record of either format has."""
 _SHOWN_MAX: Final = 40
 
 
 @dataclass
 class _Scanner:
-    """Reads the lines of a file; common checks of both formats."""
+    """Reads the lines of a record file and checks what both formats have in common."""
 
     file: BinaryIO
     source: str
@@ -41,12 +41,12 @@ class _Scanner:
     line: int = 0
     """Number of the current line, from 1."""
     ended: bool = False
-    """The end record was read."""
+    """The end record has been read."""
     counted: bool = False
     """The last record was a correct count of all records, which ends a file like an end record."""
 
     def lines(self) -> Iterator[str]:
-        """Yield the stripped lines that are not blank.
+        """Yield the stripped lines of the file, without blank ones.
 
         Raises ImageError for a line longer than a record, for non-ASCII characters, for anything
         after the end record, and for a missing end record.
@@ -82,10 +82,10 @@ class _Scanner:
     def record(
         self, text: str, digits_at: int, *, least_size: int, uncounted_size: int, total: int
     ) -> bytes:
-        """Decode the record `text`, whose hex digits begin at `digits_at`. The first byte counts
+        """Decode a record whose hex digits begin at `digits_at` in `text`. The first byte counts
         all but `uncounted_size` bytes; the last is a checksum, so that all bytes add up to `total`.
 
-        Raises ImageError if any of this is wrong.
+        Raises ImageError for wrong digits, length or checksum.
         """
         try:
             record = unhexlify(text[digits_at:])
@@ -99,7 +99,7 @@ class _Scanner:
         return record
 
     def refuse(self, what: str, cause: str = "") -> ImageError:
-        """Create the error for the current line."""
+        """Create the ImageError for the current line."""
         return ImageError(
             f"{self.source} is a damaged {self.format} file: {what}",
             where=_place(self.line),
@@ -114,7 +114,7 @@ def _place(line: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """Escape and shorten a line for a message."""
+    """Escape and shorten a line for an error message."""
     cut = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
     return ascii(cut)
 
@@ -125,28 +125,27 @@ def _shown(text: str) -> str:
 _Piece = tuple[int, bytes]
 """Address and the bytes from there on."""
 _Source = tuple[int, str, str]
-"""Origin of a piece: line number, the record that its address is relative to (may be empty), and
-the line itself."""
+"""Line number of a piece, the record that sets its base address (may be empty), and its line."""
 _Load = Callable[[str], list[_Piece]]
-"""Loads lines with a library; returns pieces in ascending order."""
+"""Loads lines with a library; returns their pieces in ascending order."""
 _BATCH_MAX: Final = 1024
-"""Records per call of a library. Limits its memory, and the time of bincopy, which grows with the
-square of its pieces."""
+"""Maximum number of records per library call. Limits memory, and the time of bincopy, which grows
+with the square of its pieces."""
 
 
 class _Reading:
-    """Collects checked records, loads them with a library, and compares both readings."""
+    """Loads checked records with a library, and compares its bytes with the strict check."""
 
     def __init__(self, scanner: _Scanner, load: _Load, into: SparseBytes) -> None:
         self._scanner = scanner
         self._load = load
         self._into = into
         self._batch: dict[_Piece, _Source] = {}
-        """In the order of the file, without repetitions: intelhex rejects them."""
+        """In file order, without repetitions, which intelhex rejects."""
         self._loads_left = PIECES_MAX
 
     def add(self, address: int, data: bytes, text: str, prefix: str = "") -> None:
-        """Add a record. Raises ImageError past 32-bit addresses, and as `SparseBytes.add`."""
+        """Add a record. Raises ImageError past 32-bit addresses and for contradicting bytes."""
         end = address + len(data)
         if end > ADDRESS_SPACE:
             raise self._scanner.refuse("the record runs past the last 32-bit address, 0xFFFFFFFF")
@@ -156,14 +155,14 @@ class _Reading:
                 self.finish()
 
     def finish(self) -> None:
-        """Load the collected records."""
+        """Load the remaining records."""
         batch, self._batch = list(self._batch.items()), {}
         if batch:
             self._load_apart(batch)
 
     def _load_apart(self, batch: Sequence[tuple[_Piece, _Source]]) -> None:
-        """Load a batch. One whose records overlap is halved: a library rejects overlaps or lets one
-        of two contradicting bytes win.
+        """Load a batch. Overlapping records are loaded in halves, because a library rejects an
+        overlap or keeps one of two contradicting bytes.
         """
         ascending = sorted(batch)
         checked = [piece for piece, _ in ascending]
@@ -209,7 +208,7 @@ class _Reading:
 
 
 def _digest(pieces: Sequence[_Piece]) -> tuple[list[list[int]], int]:
-    """Return the joined ranges with bytes as [start, end], and the CRC-32 of all bytes."""
+    """Return the contiguous address ranges as [start, end], and the CRC-32 of all bytes."""
     spans: list[list[int]] = []
     end = -1
     for start, data in pieces:
@@ -232,11 +231,11 @@ _SEGMENT_SIZE: Final = 0x1_0000
 
 
 _FROM_ZERO: Final = ":020000040000FA"
-"""Record with the state at the start of a file."""
+"""Extended linear address record with the base address at the start of a file."""
 
 
 def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """Read an Intel HEX file. Raises ImageError with the line number for any damage."""
+    """Read an Intel HEX file. Raises ImageError with the line number of any damage."""
     scanner = _Scanner(file, source, "Intel HEX")
     reading = _Reading(scanner, _by_intelhex, into)
     offset, prefix = 0, _FROM_ZERO
@@ -294,7 +293,7 @@ _ENDS: Final = "789"
 
 
 def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
-    """Read an S-record file. Raises ImageError with the line number for any damage."""
+    """Read an S-record file. Raises ImageError with the line number of any damage."""
     scanner = _Scanner(file, source, "Motorola S-record")
     reading = _Reading(scanner, _by_bincopy, into)
     data_records = 0

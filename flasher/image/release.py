@@ -1,7 +1,7 @@
-"""Release: statements of a manifest, compared with an image, a target and a device.
+"""Release manifest: target, version, size, hash and rules of an image, and their checks.
 
-Size and SHA-256 are those of `Image.data`, the exact bytes to send: a range, a base or filled gaps
-change them.
+Size and SHA-256 are those of `Image.data`, the bytes to send: a range, a base or filled gaps change
+them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flasher.validation import NumberRange, Parsed
 
 
 def _text(value: object) -> str:
-    """Check a text as devices send it: printable ASCII, not empty."""
+    """Check a text that a device may send: printable ASCII, not empty."""
     if not isinstance(value, str):
         raise TypeError
     if not (value and value.isascii() and value.isprintable()):
@@ -70,57 +70,55 @@ BootText = Annotated[str, Parsed(f"a text of the form {BOOT_VERSION_FORM}", _boo
 
 @dataclass(frozen=True)
 class Comparison:
-    """One statement of a manifest compared with an image."""
+    """Value of a manifest key, compared with the image."""
 
     key: str
     stated: str | None
-    """None if the manifest does not state it."""
+    """None if the manifest has no such key."""
     found: str | None
-    """Value of the image; None if unknown."""
+    """Value in the image; None if unknown."""
     agrees: bool | None
-    """None if one of the two values is missing."""
+    """None if one of the values is missing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Release:
-    """Statements of a manifest. A stated rule also fails for a value to which it cannot be
-    applied.
-    """
+    """Contents of a release manifest. A value to which a rule cannot be applied breaks the rule."""
 
     target: TargetName
-    """The device that the image is for."""
+    """Device that the image is for."""
     firmware_version: FirmwareText | None = None
-    """The version inside the image."""
+    """Firmware version inside the image."""
     size_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)]
     """Number of bytes to send."""
     sha256: Annotated[str, Parsed("64 hex digits", _sha256)]
-    """Of the bytes to send, in lower-case hexadecimal."""
+    """SHA-256 of the bytes to send, lower-case hexadecimal."""
     hardware_versions: tuple[DeviceText, ...] = ()
-    """Compatible hardware versions; `*` matches any text. Empty: any hardware."""
+    """Compatible hardware versions, with `*` for any characters; empty for all hardware."""
     minimum_boot_version: BootText | None = None
-    """Oldest compatible bootloader."""
+    """Oldest compatible bootloader version."""
     previous_from: FirmwareText | None = None
-    """Oldest running version that it may replace."""
+    """Oldest firmware version that may be replaced."""
     previous_except: tuple[DeviceText, ...] = ()
-    """Running versions that it must not replace."""
+    """Firmware versions that must not be replaced."""
     notes: str = ""
-    """Remarks for people."""
+    """Release notes for people."""
     source: str
-    """File name of the manifest, for messages."""
+    """File name of the manifest."""
 
     @property
     def rules_previous(self) -> bool:
-        """True if a rule restricts which versions may be replaced."""
+        """True if the manifest restricts which firmware versions may be replaced."""
         return self.previous_from is not None or bool(self.previous_except)
 
     def fits_hardware(self, text: str) -> bool:
-        """True if this hardware version is listed, or no rule is stated."""
+        """True if this hardware version is compatible."""
         return not self.hardware_versions or any(
             fnmatchcase(text, _only_stars(pattern)) for pattern in self.hardware_versions
         )
 
     def fits_previous(self, text: str) -> bool:
-        """True if this running version may be replaced, or no rule is stated."""
+        """True if this firmware version may be replaced."""
         if text in self.previous_except:
             return False
         if self.previous_from is None:
@@ -129,7 +127,7 @@ class Release:
         return running is not None and oldest is not None and running >= oldest
 
     def findings(self, image: Image) -> tuple[Comparison, ...]:
-        """Compare every statement about the image with `image.data`."""
+        """Compare size, SHA-256, firmware version and target with those of an image."""
         names = image.named_targets
         return (
             _compared("size_bytes", str(self.size_bytes), str(image.size_bytes)),
@@ -144,7 +142,7 @@ class Release:
         )
 
     def check_bytes(self, image: Image) -> None:
-        """Raise ImageError if size, SHA-256 or version of the image differ from this release."""
+        """Raise ImageError if size, SHA-256 or firmware version differ from those of the image."""
         for finding in self.findings(image):
             if finding.agrees is False and finding.key != "target":
                 raise ImageError(
@@ -165,7 +163,7 @@ def _compared(key: str, stated: str | None, found: str | None) -> Comparison:
 
 
 def target_problem(image: Image, release: Release | None, target: Target) -> str | None:
-    """Why manifest or names inside contradict `target`; None if nothing does."""
+    """Describe how manifest or names inside an image contradict `target`; None if they do not."""
     asked = target.node.name
     if release is not None and release.target != target:
         return f"by its manifest the image is for the {release.target.node.name}, not the {asked}"
@@ -175,7 +173,7 @@ def target_problem(image: Image, release: Release | None, target: Target) -> str
 
 
 def check_target(image: Image, release: Release | None, target: Target) -> None:
-    """Raise WrongDeviceError if an image is not meant for `target`."""
+    """Raise WrongDeviceError if an image is for another target."""
     problem = target_problem(image, release, target)
     if problem is not None:
         raise WrongDeviceError(
@@ -188,10 +186,10 @@ def check_target(image: Image, release: Release | None, target: Target) -> None:
 
 
 def names_of(targets: frozenset[Target]) -> str:
-    """Names of targets for people; may be empty."""
+    """Join target names for messages; may be empty."""
     return " and ".join(sorted(target.node.name for target in targets))
 
 
 def _only_stars(pattern: str) -> str:
-    """Escape a pattern of fnmatch so that only `*` is special."""
+    """Escape a pattern for fnmatch, except `*`."""
     return pattern.replace("[", "[[]").replace("?", "[?]")

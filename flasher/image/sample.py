@@ -1,7 +1,7 @@
-"""Mark of the firmware samples, which are not firmware and must not reach a real device.
+"""Firmware samples: the mark that keeps them from real devices.
 
-`firmware_samples/make_samples.py` writes it into every sample, so often that any plausible part of
-one contains it. Converting the file to another format keeps the mark.
+`firmware_samples/make_samples.py` repeats the mark so often that any usable part of a sample
+contains it. It survives conversion to another file format.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from flasher.i18n import text
 from flasher.image.image import Image
 
 MARK: Final = b"#flasher:sample#"
-"""Sixteen bytes at a multiple of sixteen, so that one line of a hex or S-record file contains all
-of it."""
+"""Sixteen bytes, at multiples of sixteen: one line of a HEX or S-record file contains a whole
+mark."""
 _MARK_IN_RECORDS: Final = MARK.hex().encode("ascii")
 
 
 def is_sample(image: Image) -> bool:
-    """True if the image contains a firmware sample, even as an unparsed record file."""
+    """True if the image contains the mark of a firmware sample, also as undecoded hex records."""
     return MARK in image.data or _MARK_IN_RECORDS in image.data.lower()
 
 
 def sample_error(image: Image, adapter: str) -> ImageError:
-    """Create the error for sending a sample through a physical adapter. It cannot be waived."""
+    """Create the error for a sample on a physical adapter. It cannot be waived."""
     return ImageError(
         text("{image} is a firmware sample: no device can run it.", image=image.source),
         where=text("{adapter}, a physical CAN controller or one of unknown kind", adapter=adapter),

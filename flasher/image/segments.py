@@ -1,4 +1,4 @@
-"""Sparse bytes at addresses, until they are known to form an image.
+"""Sparse memory: pieces of bytes at addresses, joined to an image with filled gaps.
 
 Memory use does not depend on the address range: two bytes four gigabytes apart take two bytes.
 Pieces may arrive in any order and may repeat, but not contradict each other.
@@ -15,12 +15,12 @@ from flasher.image.image import AddressSpan
 from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_COUNT_MAX, PACKET_FILLER
 
 PIECES_MAX: Final = 32_768
-"""More than any linker produces; limits time and memory for a file of scattered bytes."""
+"""Maximum number of separate pieces, more than any linker makes. Limits time and memory."""
 _NAMED_SPANS_MAX: Final = 8
 
 
 class SparseBytes:
-    """Sorted pieces of bytes without overlaps; only those inside `window` are kept."""
+    """Sorted pieces of bytes without overlaps, limited to the addresses of `window`."""
 
     def __init__(self, source: str, window: tuple[int, int] | None = None) -> None:
         self.source = source
@@ -31,7 +31,7 @@ class SparseBytes:
         self.size_bytes = 0
 
     def add(self, start: int, data: bytes, place: Callable[[int], str]) -> None:
-        """Add `data` at address `start`; `place` maps an address to its place in the file.
+        """Add `data` at address `start`; `place` maps an address to a line or section for messages.
 
         Raises ImageError for bytes that contradict earlier ones, and when a limit is exceeded.
         """
@@ -65,19 +65,19 @@ class SparseBytes:
                 start += common
 
     def leaves_out(self, start: int, end: int) -> bool:
-        """Return True, and note the range, if none of these addresses is inside the window."""
+        """Return True, and record the range, if all its addresses are outside the window."""
         if self.window is None or (start < self.window[1] and self.window[0] < end):
             return False
         self.note(start, end)
         return True
 
     def note(self, start: int, end: int) -> None:
-        """Note that the file has bytes from `start` up to `end`, inside the window or not."""
+        """Record that the file has bytes from `start` up to `end`, for messages."""
         low, high = self._seen or (start, end)
         self._seen = min(low, start), max(high, end)
 
     def spans(self) -> tuple[AddressSpan, ...]:
-        """Return the ranges with bytes, ascending, neighbours joined."""
+        """Return the contiguous address ranges with bytes, ascending."""
         spans: list[AddressSpan] = []
         for start, piece in zip(self._starts, self._pieces, strict=True):
             if spans and spans[-1].end == start:
@@ -184,7 +184,7 @@ def empty_error(source: str) -> ImageError:
 
 
 def scattered_error(source: str) -> ImageError:
-    """Create the error for more pieces than any linker produces."""
+    """Create the error for too many separate pieces."""
     return ImageError(
         f"{source} contains more than {PIECES_MAX} separate pieces of data",
         cause="the file is damaged, or was not made by a linker",
@@ -194,7 +194,7 @@ def scattered_error(source: str) -> ImageError:
 
 
 def too_large_error(source: str, size_bytes: int, *, more: bool = False) -> ImageError:
-    """Create the error for more than 65535 packets (R9); `more`: the size is a lower bound."""
+    """Create the error for more than 65535 packets (R9); with `more`, the size is a lower bound."""
     return ImageError(
         f"{source} is too large: {'at least ' if more else ''}{size_bytes} bytes to send, "
         f"and {PACKET_COUNT_MAX} packets hold {IMAGE_MAX_SIZE}",

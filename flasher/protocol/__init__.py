@@ -1,1 +1,1 @@
-"""Protocol documents as data and pure functions: no clock, no bus, no state but receive buffers."""
+"""Welling and MOTINOVA CAN protocol: message tables, codecs, CRC, timings, frame lengths."""

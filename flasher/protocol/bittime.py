@@ -30,7 +30,7 @@ _RUN_BEFORE_STUFFING: Final = 5
 
 
 def _stuff(state: int, bits: int, width: int) -> tuple[int, int]:
-    """Send `width` bits from a state; the new state and the number of bits inserted."""
+    """Insert stuff bits into `width` bits; return the new stuffing state and their number."""
     last, run = state >> 3, state & 7
     inserted = 0
     for shift in range(width - 1, -1, -1):
@@ -63,7 +63,7 @@ _LOW_NIBBLE: Final = bytes(byte & 15 for byte in range(256))
 
 @cache
 def _head(can_id: int, size: int) -> tuple[int, int, int]:
-    """Stuffing state, inserted bits and CRC register after SOF .. DLC of a frame."""
+    """Stuffing state, stuff bits and CRC register of a frame after its DLC field."""
     bits = can_id << 7 | size
     state, inserted = _stuff(0, bits, _HEAD_BITS)
     crc = 0
@@ -82,13 +82,13 @@ follows."""
 
 
 def fixed_bits(size: int) -> int:
-    """Bits of a frame with `size` data bytes before stuffing, interframe space included."""
+    """Bit times of a frame with `size` data bytes and interframe space, without stuff bits."""
     return _HEAD_BITS + 8 * size + _CRC_BITS + _UNSTUFFED_TAIL_BITS
 
 
 @lru_cache(maxsize=4096)  # a repeated message, an image that is sent again and again
 def frame_bits(frame: Frame) -> int:
-    """Bit times of one frame, interframe space included."""
+    """Length of a CAN frame in bit times: stuff bits and interframe space included."""
     can_id, data = frame[0], frame[1]
     state, inserted, crc = _head(can_id, len(data))
     for byte in data:
@@ -109,7 +109,7 @@ def frame_bits(frame: Frame) -> int:
 
 
 def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
-    """Return the tables of `frame_bits` for these ids, for generated code."""
+    """Lookup tables of `frame_bits` for these CAN ids, for the generated Wireshark script."""
     return {
         "fixed": [fixed_bits(size) for size in range(FRAME_DATA_SIZE + 1)],
         "heads": {
@@ -126,12 +126,12 @@ def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
 
 
 def message_bits(frames: Iterable[Frame]) -> int:
-    """Bit times of consecutive frames without idle time between them."""
+    """Length in bit times of consecutive CAN frames, without idle time between them."""
     return sum(map(frame_bits, frames))
 
 
 class _Columns:
-    """The same state machine for `count` frames at once, one byte column at a time."""
+    """Lengths of `count` CAN frames with one id and size, computed a byte column at a time."""
 
     def __init__(self, can_id: int, size: int, count: int) -> None:
         state, inserted, crc = _head(can_id, size)
@@ -142,7 +142,7 @@ class _Columns:
         self._crc_low = bytes((crc & 0xFF,)) * count
 
     def feed(self, column: bytes) -> None:
-        """Take the next data byte of every frame."""
+        """Process the next data byte of every frame."""
         self._nibbles(column.translate(_HIGH_NIBBLE))
         self._nibbles(column.translate(_LOW_NIBBLE))
         high, low = self._number(self._crc_high), self._number(self._crc_low)
@@ -153,7 +153,7 @@ class _Columns:
         self._crc_low = index.translate(_CRC_LOW)
 
     def finish(self) -> bytes:
-        """Bit times of every frame, one byte each."""
+        """Return the length of every frame in bit times, one byte each."""
         high, low = self._crc_high, self._crc_low
         top = self._number(high.translate(_HIGH_NIBBLE))
         index = self._column(self._number(self._state) << 3 | top)
@@ -178,7 +178,7 @@ class _Columns:
 
 
 def stream_bits(can_id: int, stream: bytes) -> bytes:
-    """Bit times of every frame of a stream cut into full frames of 8 bytes, one byte each.
+    """Length in bit times of each CAN frame of a byte stream, 8 data bytes a frame; one byte each.
 
     Raises ValueError when the stream is not a whole number of frames.
     """

@@ -1,7 +1,7 @@
-"""Catalogue of all messages of chapter 3, in both dialects: sender, receiver, command, answer.
+"""Message catalogue: sender, receiver, command and answer of each message of chapter 3.
 
-The id, the answer's id and the size of the content follow from each row. The upgrade of appendix 3
-is in `messages`.
+CAN ids and content sizes follow from each row. The upgrade messages of appendix 3 are in
+`messages`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from flasher.protocol.wire import Message
 
 @dataclass(frozen=True)
 class Item:
-    """One row of the document's message tables."""
+    """Message definition: one row of the documents' message tables (tables 4 to 7)."""
 
     sender: Node
     receiver: Node | None
@@ -38,10 +38,10 @@ class Item:
     content: type[Content]
     title: str
     answer_command: int | None = None
-    """Command of the BMS's answer, if there is one."""
+    """Command of the BMS's answer; None for reports."""
     dialects: tuple[Dialect, ...] = tuple(DIALECTS.values())
     manufacturer_only: bool = False
-    """The document marks it as optional and for the manufacturer."""
+    """True for an optional write that only the manufacturer may use (table 7)."""
 
     @cached_property
     def can_id(self) -> int:
@@ -54,14 +54,14 @@ class Item:
 
     @property
     def name(self) -> str:
-        """Id and command as the documents print them."""
+        """CAN id and command in hexadecimal, such as "752 3300"."""
         return f"{self.can_id:03X} {self.command:04X}"
 
 
-_OLD: Final = (WELLING,)
-_HMI: Final = (MOTINOVA,)
+_WELLING: Final = (WELLING,)
+_MOTINOVA: Final = (MOTINOVA,)
 _R, _W, _P = Mode.READ, Mode.WRITE, Mode.REPORT
-_WMC, _BMS, _OBC, _HMI_NODE, _CDL = Node.WMC, Node.BMS, Node.OBC, Node.HMI, Node.CDL
+_WMC, _BMS, _OBC, _HMI, _CDL = Node.WMC, Node.BMS, Node.OBC, Node.HMI, Node.CDL
 _FEEDBACK: Final = Command.GENERAL_FEEDBACK
 _VERSION: Final = Command.VERSION_INFORMATION
 _ASK_VERSION: Final = Command.READ_VERSION
@@ -86,7 +86,7 @@ ITEMS: Final = (
     Item(_BMS, _CDL, _P, 0x5688, contents.Memory, "memory"),
     # 5.2, sent by the others.
     Item(_WMC, None, _P, 0x1305, contents.Ready, "ready for shutdown"),
-    Item(_WMC, None, _P, 0x1808, contents.Shutdown, "SHUTDOWN", dialects=_OLD),
+    Item(_WMC, None, _P, 0x1808, contents.Shutdown, "SHUTDOWN", dialects=_WELLING),
     Item(_WMC, _BMS, _R, 0x3009, contents.Handshake, "handshake", 0x3005),
     Item(_WMC, _BMS, _R, 0x3100, contents.Empty, "read physical id", 0x160C),
     Item(_WMC, _BMS, _R, 0x3200, contents.Empty, "read check code", 0x170C),
@@ -96,10 +96,10 @@ ITEMS: Final = (
     Item(_OBC, _BMS, _R, 0x5100, contents.Empty, "read version information", _VERSION),
     Item(_OBC, _BMS, _R, 0x5200, contents.Empty, "read design information", 0x1410),
     Item(_OBC, _BMS, _R, 0x5300, contents.Empty, "read cell voltages", 0x1120),
-    Item(_HMI_NODE, None, _P, 0x1305, contents.Ready, "ready for shutdown", dialects=_HMI),
-    Item(_HMI_NODE, _BMS, _R, 0x5000, contents.Empty, "read version information", _VERSION, _HMI),
-    Item(_HMI_NODE, _BMS, _R, 0x5100, contents.Empty, "read design information", 0x1410, _HMI),
-    Item(_HMI_NODE, _BMS, _R, 0x5200, contents.Empty, "read cell voltages", 0x1120, _HMI),
+    Item(_HMI, None, _P, 0x1305, contents.Ready, "ready for shutdown", dialects=_MOTINOVA),
+    Item(_HMI, _BMS, _R, 0x5000, contents.Empty, "read version information", _VERSION, _MOTINOVA),
+    Item(_HMI, _BMS, _R, 0x5100, contents.Empty, "read design information", 0x1410, _MOTINOVA),
+    Item(_HMI, _BMS, _R, 0x5200, contents.Empty, "read cell voltages", 0x1120, _MOTINOVA),
     Item(_CDL, _BMS, _R, 0x3000, contents.Empty, "read physical id", 0x160C),
     Item(_CDL, _BMS, _R, 0x3100, contents.Empty, "read check code", 0x170C),
     Item(_CDL, _BMS, _W, 0x320C, contents.CheckCode, "write check code", _FEEDBACK),
@@ -132,12 +132,12 @@ ITEMS: Final = (
 )  # fmt: skip
 
 UPGRADE_COMMANDS: Final = frozenset(Command) - {item.command for item in ITEMS}
-"""Commands that only the upgrade uses."""
+"""Commands of the upgrade messages (appendix 3)."""
 BY_KEY: Final = {item.key: item for item in ITEMS}
 
 
 def answer_of(item: Item) -> Item | None:
-    """Return the row that answers a query or write; None for reports."""
+    """Return the catalogue row of the answer to a query or write; None for reports."""
     if item.answer_command is None:
         return None
     for receiver in (None, item.sender):
@@ -149,15 +149,15 @@ def answer_of(item: Item) -> Item | None:
 
 @dataclass(frozen=True)
 class Decoded:
-    """A decoded message: its row and its content."""
+    """Decoded application message with its catalogue row."""
 
     item: Item
     content: Content
 
 
 def decode(message: Message, dialect: Dialect | None = None) -> Decoded | None:
-    """Decode a message of chapter 3. Return None if no row of the dialect (of either dialect if
-    None) has its id, mode and command. Never raises.
+    """Decode an application message (chapter 3). Return None if the dialect, or either one if None,
+    has no message with its CAN id, mode and command. Never raises.
     """
     item = BY_KEY.get((message.can_id, message.command))
     if item is None or item.mode != message.mode:
@@ -170,8 +170,8 @@ def decode(message: Message, dialect: Dialect | None = None) -> Decoded | None:
 
 
 def has_message(dialect: Dialect, message: Message) -> bool:
-    """Return False for a documented message that this dialect lacks: a row of the other dialect, or
-    an upgrade message where the upgrade was cancelled.
+    """Return False for a documented message that this dialect lacks: one of the other dialect, or
+    an upgrade message in a dialect without upgrade.
     """
     item = BY_KEY.get((message.can_id, message.command))
     if item is not None:
@@ -180,8 +180,8 @@ def has_message(dialect: Dialect, message: Message) -> bool:
 
 
 def encode(item: Item, content: Content) -> Message:
-    """Encode a message of chapter 3. Raises ValueError for the content of another item or for a
-    value that does not fit its field.
+    """Encode an application message (chapter 3). Raises ValueError for the content type of another
+    message and for a value that does not fit its field.
     """
     if type(content) is not item.content:
         wrong = type(content).__name__

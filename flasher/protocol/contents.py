@@ -1,4 +1,4 @@
-"""Contents of the messages of chapter 3, one class each (5.1, 5.2); senders are in `catalogue`."""
+"""Data of the application messages, one class each (chapter 3); their ids are in `catalogue`."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def _temperature() -> Any:
 
 
 class BatteryStatus(Bits):
-    """Status bits of the running information; 0 may mean asleep, or awake without charger (R21)."""
+    """Status bits of the running information; 0 is also sent by a sleeping BMS (R21)."""
 
     CHARGER_CONNECTED = 0x01
 
 
 class BatteryFault(Bits):
     """Fault flags of the BMS: warnings in the upper half, protections and defects in the lower
-    (5.1). The document neither names nor reserves the other bits (R24).
+    (table 5). The document neither names nor reserves the other bits (R24).
     """
 
     SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION = 1 << 0
@@ -81,42 +81,42 @@ class Empty(Content):
 
 @dataclass(frozen=True)
 class Handshake(Content):
-    """Asks whether the BMS is present."""
+    """Asks whether a BMS is present."""
 
     text: bytes = constant(b"HANDSHAKE")
 
 
 @dataclass(frozen=True)
 class Ready(Content):
-    """Confirms a shutdown, or answers a handshake."""
+    """Agrees to a shutdown, or answers a handshake."""
 
     text: bytes = constant(b"READY")
 
 
 @dataclass(frozen=True)
 class Shutdown(Content):
-    """Announces that the sender switches off."""
+    """Command of the BMS or WMC to prepare for switching off."""
 
     text: bytes = constant(b"SHUTDOWN")
 
 
 @dataclass(frozen=True)
 class Reset(Content):
-    """Requests a restart."""
+    """Command to restart into the bootloader."""
 
     text: bytes = constant(b"RESET")
 
 
 @dataclass(frozen=True)
 class GeneralFeedback(Content):
-    """Confirms that a write was received."""
+    """Acknowledges a write."""
 
     text: bytes = constant(b"ACK")
 
 
 @dataclass(frozen=True)
 class RunningInformation(Content):
-    """Present state of the battery. Four bytes are reserved (R1)."""
+    """Battery voltage, current, capacity, temperature, charge, health. 4 reserved bytes (R1)."""
 
     voltage_mv: int = number(2, "mV")
     mean_current_ma: int = number(2, "mA", signed=True)
@@ -140,14 +140,14 @@ class CellVoltages(Content):
 
 @dataclass(frozen=True)
 class Faults(Content):
-    """Fault flags, sent every 200 ms while any is set."""
+    """Fault flags of the BMS, sent every 200 ms while any is set."""
 
     faults: BatteryFault = field(FlagsField(4, BatteryFault))
 
 
 @dataclass(frozen=True)
 class DesignInformation(Content):
-    """Design data of the battery."""
+    """Design capacity, design voltage and cell model of the battery."""
 
     design_capacity_mah: int = number(2, "mAh")
     design_voltage_v: int = number(1, "V")
@@ -157,7 +157,7 @@ class DesignInformation(Content):
 
 @dataclass(frozen=True)
 class VersionInformation(Content):
-    """Model, serial number and versions of the battery."""
+    """Model, serial number, hardware version and firmware version of the battery."""
 
     model: WireText = field(TextField(16))
     serial_number: WireText = field(TextField(16))
@@ -167,21 +167,21 @@ class VersionInformation(Content):
 
 @dataclass(frozen=True)
 class PhysicalId(Content):
-    """Physical ID; a short one is padded with 01 (R13)."""
+    """Physical ID of the BMS; a short one is padded with 01 (R13)."""
 
     physical_id: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
 class CheckCode(Content):
-    """Check code; its structure is not documented."""
+    """Check code of the BMS; its structure is not documented."""
 
     check_code: bytes = field(BytesField(12))
 
 
 @dataclass(frozen=True)
 class History(Content):
-    """Extreme values and counters since production; both currents are unsigned."""
+    """Extreme values and protection counts since production; both currents are unsigned."""
 
     highest_cell_temperature_c: int = _temperature()
     lowest_cell_temperature_c: int = _temperature()
@@ -206,7 +206,7 @@ class History(Content):
 
 @dataclass(frozen=True)
 class ProductionInformation(Content):
-    """Manufacturer, place and date of production."""
+    """Manufacturer, place and date of the battery's production."""
 
     manufacturer: WireText = field(TextField(8))
     place: WireText = field(TextField(8))
@@ -216,28 +216,28 @@ class ProductionInformation(Content):
 
 @dataclass(frozen=True)
 class UserString(Content):
-    """Free text of the user."""
+    """User string of the BMS: free text."""
 
     text: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class Model(Content):
-    """Writes the model of the version information."""
+    """Sets the battery's model, as in the version information."""
 
     model: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class SerialNumber(Content):
-    """Writes the serial number of the version information."""
+    """Sets the battery's serial number, as in the version information."""
 
     serial_number: WireText = field(TextField(16))
 
 
 @dataclass(frozen=True)
 class ReadMemory(Content):
-    """Requests memory; `end` is exclusive (R5)."""
+    """Requests BMS memory from address `start` up to `end`, exclusive (R5)."""
 
     start: int = field(AddressField(4))
     end: int = field(AddressField(4))
@@ -245,7 +245,7 @@ class ReadMemory(Content):
 
 @dataclass(frozen=True)
 class Memory(Content):
-    """Memory contents; FF after the end."""
+    """BMS memory from `start` up to `end`; the remaining bytes are FF."""
 
     start: int = field(AddressField(4))
     end: int = field(AddressField(4))

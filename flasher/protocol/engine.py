@@ -14,13 +14,12 @@ from typing import Final, NamedTuple, Protocol
 from flasher.protocol.bittime import frame_bits, message_bits
 from flasher.protocol.frame import Frame
 
-WELL_BEYOND: Final = 1.5
-"""Silence after a truncated message, as a multiple of the time after which its receiver drops it
-(R12)."""
+DROP_MARGIN: Final = 1.5
+"""Silence after an abandoned message, as a multiple of the receiver's inter-frame timeout (R12)."""
 
 
 class Engine(Protocol):
-    """The interface between an engine and the driver loop."""
+    """Interface between a protocol engine, host or device, and the driver loop."""
 
     @property
     def done(self) -> bool:
@@ -32,11 +31,11 @@ class Engine(Protocol):
         ...
 
     def tick(self, now: float) -> None:
-        """Process the time that `deadline` asked for."""
+        """Process the timeouts that are due at `now`."""
         ...
 
     def deadline(self) -> float | None:
-        """When to call `tick` or `next_frame` next; None for never."""
+        """Time of the next call of `tick` or `next_frame`; None for never."""
         ...
 
     def next_frame(self, now: float) -> Frame | None:
@@ -44,11 +43,11 @@ class Engine(Protocol):
         ...
 
     def frame_sent(self, now: float) -> None:
-        """Note that the adapter accepted the frame of `next_frame`."""
+        """Record that the adapter accepted the frame of `next_frame`."""
         ...
 
     def cancel(self, now: float) -> None:
-        """End at the next message boundary."""
+        """Stop at the next message boundary."""
         ...
 
     def take_events(self) -> Sequence[object]:
@@ -64,12 +63,12 @@ class _Outgoing(NamedTuple):
 
 
 class Transmitter:
-    """Sends queued messages whole and in order, so that no message is interleaved with its own
+    """Transmit queue of an engine: sends each message whole and in order, never mixed with its
     repetition.
 
-    `frame_gap_s` separates the frames of a message for slow receivers. If the computer pauses
-    between two frames for longer than `dropped_after_s`, the receiver has dropped the message
-    (R12): it is sent again after a longer silence.
+    `frame_gap_s` is the minimum time between frames of a message, for slow receivers. If the
+    computer pauses between two frames for longer than `dropped_after_s`, the receiver has dropped
+    the message (R12): it is sent again after a longer silence.
     """
 
     def __init__(
@@ -85,13 +84,13 @@ class Transmitter:
         self._asked_at = 0.0
         self._frame_sent_at = 0.0
         self.due_at = inf
-        """When `next_frame` has a frame to send; infinite while the queue is empty."""
+        """Time of the next frame to send; infinite while the queue is empty."""
         self.left_at = -inf
-        """When the last frame of the last message was on the wire: accepted by the adapter plus its
-        time on the wire (R12)."""
+        """Time at which the last sent message ended on the wire: its last frame was accepted by the
+        adapter, plus its time on the wire (R12)."""
         self.left_tag: object = None
-        """Tag of that message."""
-        self.on_left: Callable[[float], None] | None = None
+        """`tag` of that message."""
+        self.on_message_sent: Callable[[float], None] | None = None
         """Called with the time when the adapter accepts the last frame of a message."""
 
     @property
@@ -114,8 +113,8 @@ class Transmitter:
     ) -> None:
         """Queue a message; its first frame is not sent before `not_before`.
 
-        `wire_s` is its time on the wire, computed if None. `tag` identifies the message when it has
-        been sent (`left_tag`).
+        `wire_s` is its time on the wire in seconds, computed if None. `left_tag` becomes `tag` when
+        it has been sent.
         """
         if wire_s is None:
             wire_s = message_bits(frames) / self._bitrate_bps
@@ -125,7 +124,7 @@ class Transmitter:
         self._queue.append(_Outgoing(frames, wire_s, not_before, tag))
 
     def drop_unstarted(self) -> None:
-        """Drop the messages of which no frame was accepted yet."""
+        """Drop queued messages, except one that is partly sent."""
         if self._sent_frames:
             started = self._queue[0]
             self._queue.clear()
@@ -134,19 +133,19 @@ class Transmitter:
             self._queue.clear()
             self.due_at = inf
 
-    def hurry(self) -> None:
-        """Send the rest of a partly sent message without gaps: nothing follows it."""
+    def send_without_gaps(self) -> None:
+        """Send the remaining frames of a message without gaps, because no message follows it."""
         self._frame_gap_s = 0.0
         if self._sent_frames:
             self.due_at = 0.0
 
-    def all_left(self, now: float) -> None:
-        """Assume that all was sent by `now`: an answer came, as on a fast in-process bus."""
+    def limit_left_at(self, now: float) -> None:
+        """Limit `left_at` to `now`: an answer came sooner than the estimate, as in-process."""
         self.left_at = min(self.left_at, now)
 
     def abandon(self, quiet_until: float) -> None:
-        """Drop all messages, a partly sent one included. New messages wait until `quiet_until`, so
-        that the receiver drops the partial one (R12).
+        """Drop all messages, even one that is partly sent. New messages wait until `quiet_until`,
+        so that the receiver drops the partial one (R12).
         """
         self._queue.clear()
         self._sent_frames = 0
@@ -154,22 +153,22 @@ class Transmitter:
         self.due_at = inf
 
     def deadline(self) -> float | None:
-        """When `next_frame` has a frame to send; None while the queue is empty."""
+        """Time of the next frame to send; None while the queue is empty."""
         return None if self.due_at == inf else self.due_at
 
     def next_frame(self, now: float) -> Frame | None:
-        """Return the next frame to send; None during a gap or while the queue is empty."""
+        """Return the next frame to send; None during a gap and while the queue is empty."""
         if now < self.due_at:
             return None
         if self._sent_frames and now - self._frame_sent_at > self._dropped_after_s:
             self._sent_frames = 0
-            self.due_at = now + self._dropped_after_s * WELL_BEYOND
+            self.due_at = now + self._dropped_after_s * DROP_MARGIN
             return None
         self._asked_at = now
         return self._queue[0].frames[self._sent_frames]
 
     def frame_sent(self, now: float) -> bool:
-        """Note that the adapter accepted the frame; True for the last one of its message."""
+        """Record that the adapter accepted a frame; return True for the last one of its message."""
         if not self._queue:
             return False
         frames = self._queue[0].frames
@@ -191,6 +190,6 @@ class Transmitter:
         self.left_tag = message.tag
         self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)
         self.due_at = self._queue[0].not_before if self._queue else inf
-        if self.on_left is not None:
-            self.on_left(now)
+        if self.on_message_sent is not None:
+            self.on_message_sent(now)
         return True

@@ -1,8 +1,8 @@
-"""Field codecs of message data: one declaration gives encoder, decoder, label and unit.
+"""Field codecs for message data: encoding, decoding, label and unit from one declaration.
 
-A content is a frozen dataclass whose fields each have a codec, in wire order. Decoding accepts any
-bytes of the right size, and encoding the result gives the same bytes: out-of-range numbers,
-malformed texts and reserved bytes are kept.
+A message's content is a frozen dataclass whose fields each have a codec, in wire order. Decoding
+accepts any bytes of the right size, and encoding the result gives the same bytes: out-of-range
+numbers, malformed texts and reserved bytes are kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _CODEC: Final = "codec"
 
 
 class Codec(Protocol):
-    """Encoding of one field."""
+    """Encodes and decodes one field of a message."""
 
     @property
     def size_bytes(self) -> int: ...
@@ -31,21 +31,21 @@ class Codec(Protocol):
         ...
 
     def encode(self, value: Any) -> bytes:
-        """Raises ValueError for a value that does not fit."""
+        """Encode a value. Raises ValueError if it does not fit."""
         ...
 
     def decode(self, raw: bytes) -> Any:
-        """Never raises."""
+        """Decode the bytes of a field. Never raises."""
         ...
 
     def show(self, value: Any) -> str:
-        """Format the value for people: without its unit, escaped."""
+        """Format a value for display: without its unit, control characters escaped."""
         ...
 
 
 @dataclass(frozen=True)
 class NumberField:
-    """Little-endian integer; the value is the wire value minus `offset`."""
+    """Little-endian integer; `offset` is added on the wire."""
 
     size_bytes: int
     unit: str = ""
@@ -72,7 +72,7 @@ class AddressField(NumberField):
 
 @dataclass(frozen=True)
 class NumberListField:
-    """Several integers of the same kind."""
+    """Array of integers of the same size and unit."""
 
     count: int
     each: NumberField
@@ -102,11 +102,11 @@ class NumberListField:
 
 
 class Bits(IntFlag):
-    """Named bits; the document reserves the others."""
+    """Bit flags with names; other bits are reserved."""
 
     @classmethod
     def unnamed(cls, bit: int) -> str:
-        """Name of a bit that has none."""
+        """Text for a set bit without a name."""
         return f"reserved bit {bit}"
 
 
@@ -115,7 +115,7 @@ _ABBREVIATIONS: Final = re.compile(r"\b(?:afe|mcu|mos)\b")
 
 @dataclass(frozen=True)
 class FlagsField:
-    """A set of named bits, little-endian; unknown bits are kept."""
+    """Bit flags, little-endian; unknown bits are kept."""
 
     size_bytes: int
     names: type[Bits]
@@ -134,7 +134,7 @@ class FlagsField:
 
 
 def flag_names(names: type[Bits], value: int) -> list[str]:
-    """Names of the bits that are set, in order, as used in JSON; an unnamed bit by its number."""
+    """Names of the set bits in ascending order, as in JSON; unnamed bits by number."""
     named = {int(flag): (flag.name or "").lower().replace("_", " ") for flag in names}
     bits = (1 << bit for bit in range(int(value).bit_length()) if value >> bit & 1)
     return [named.get(bit) or names.unnamed(bit.bit_length() - 1) for bit in bits]
@@ -142,7 +142,7 @@ def flag_names(names: type[Bits], value: int) -> list[str]:
 
 @dataclass(frozen=True)
 class WireText:
-    """ASCII field as received; `str()` gives its text, escaped (R20)."""
+    """ASCII field as received; `str()` decodes and escapes it (R20)."""
 
     raw: bytes
 
@@ -152,7 +152,7 @@ class WireText:
 
 @dataclass(frozen=True)
 class TextField:
-    """Text, terminator, spaces (5.1). Encodes a str or a `WireText`."""
+    """ASCII text with terminator and padding (chapter 3). Encodes a str or a `WireText`."""
 
     size_bytes: int
     unit: str = ""
@@ -171,8 +171,8 @@ class TextField:
 
 @dataclass(frozen=True)
 class DateField:
-    """Eight digits YYYYMMDD without terminator. Encodes a `WireText` or a str of eight digits; the
-    caller checks the calendar.
+    """Date of eight digits, YYYYMMDD, without terminator. Encodes a `WireText` or a str of eight
+    digits; the caller checks that the date exists.
     """
 
     size_bytes: int = 8
@@ -197,7 +197,7 @@ class DateField:
 
 @dataclass(frozen=True)
 class LatinField:
-    """Text that fills its field, one Latin-1 character per byte."""
+    """Latin-1 text of exactly the field's size."""
 
     size_bytes: int
     unit: str = ""
@@ -231,7 +231,7 @@ class BytesField:
 
 @dataclass(frozen=True)
 class ConstantField:
-    """Constant text; any other text is kept and shown."""
+    """Field with a constant value; any other received value is kept and shown."""
 
     expected: bytes
     unit: str = ""
@@ -291,11 +291,11 @@ def reserved(size_bytes: int) -> Any:
 
 @dataclass(frozen=True)
 class Content:
-    """Message data as typed values; subclasses declare their fields in wire order."""
+    """Decoded data of a message; subclasses declare their fields in wire order."""
 
     SIZE_BYTES: ClassVar[int] = 0
     LAYOUT: ClassVar[tuple[tuple[str, Codec], ...]] = ()
-    """Name and codec of every field, in wire order."""
+    """Name and codec of each field, in wire order."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -325,7 +325,7 @@ class Content:
         return cls(*values)
 
     def shown(self) -> Iterator[tuple[str, str, str]]:
-        """Yield label, value and unit of every field; reserved bytes only if not zero."""
+        """Yield label, value and unit of each field for display; no reserved bytes of zero."""
         for name, codec in self.LAYOUT:
             value = getattr(self, name)
             if not isinstance(codec, ReservedField) or any(value):
@@ -347,7 +347,7 @@ _OWN_LABELS: Final = {
 
 
 def label(name: str, codec: Codec) -> str:
-    """Name of a field for people, without its unit."""
+    """Display name of a field, without its unit."""
     bare = name.removesuffix(_UNIT_SUFFIXES.get(codec.unit, ""))
     if bare.endswith("_count"):  # of the history; warnings have the same names (chapter 3)
         bare = f"{bare.removesuffix('count')}protection_count"

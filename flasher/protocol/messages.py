@@ -1,8 +1,8 @@
-"""Typed messages of the upgrade (appendix 3).
+"""Upgrade messages: reset, update command, packets, ACK, NAK, completion (appendix 3).
 
-Each class is one row of the document; `to_message` encodes it for a CAN id, `decode` is the
-inverse. Decoding is strict: mode, size and every constant byte must match the document. Mismatches
-are returned as `Malformed`, unlisted commands as `Unknown`.
+`to_message` encodes for a CAN id, `decode` is the inverse. Decoding is strict: mode, size and every
+constant byte must match the document. Mismatches are returned as `Malformed`, other commands as
+`Unknown`.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from flasher.protocol.wire import Message
 
 @dataclass(frozen=True)
 class PacketNumber(NumberField):
-    """Number of a packet, or total of packets: 1 or more."""
+    """Packet number or number of packets, at least 1."""
 
     size_bytes: int = 2
 
 
 @dataclass(frozen=True)
 class UpdateText(LatinField):
-    """Text that names a target."""
+    """Text of the update command: `WMC_UPD`, `BMS_UPD` or `OBC_UPD` for the target (table 8)."""
 
     KNOWN: ClassVar[frozenset[str]] = frozenset(each.update_text for each in TARGETS.values())
 
 
 @dataclass(frozen=True)
 class Malformed:
-    """Message with a known command whose mode or data break the document."""
+    """Message with an upgrade command, but another mode or other data than documented."""
 
     message: Message
     problem: str
@@ -49,7 +49,7 @@ class Malformed:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Intact message with a command outside the upgrade."""
+    """Intact message whose command is not of the upgrade."""
 
     message: Message
 
@@ -61,7 +61,7 @@ class _UpgradeMessage:
     MODE: ClassVar[Mode]
     COMMAND: ClassVar[Command]
     LAYOUT: ClassVar[tuple[tuple[str, Codec], ...]]
-    """Name and codec of every field, in wire order."""
+    """Name and codec of each field, in wire order."""
 
     _STRUCT: ClassVar[Struct]
 
@@ -77,7 +77,7 @@ class _UpgradeMessage:
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        """Decode `data` of the command's size. Raises ValueError with the problem."""
+        """Decode message data. Raises ValueError for data that differ from the document."""
         raise NotImplementedError
 
     def to_message(self, can_id: int) -> Message:
@@ -92,7 +92,7 @@ def _struct_format(codec: Codec) -> str:
 
 @dataclass(frozen=True)
 class _Constant(_UpgradeMessage):
-    """Message with constant data."""
+    """Base of messages with constant data."""
 
     DATA: ClassVar[bytes]
 
@@ -112,7 +112,7 @@ class _Constant(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class _Numbered(_UpgradeMessage):
-    """Message with one packet number (little-endian, R4)."""
+    """Base of messages with one packet number (little-endian, R4)."""
 
     LAYOUT = (("number", NumberField(2)),)
 
@@ -128,7 +128,7 @@ class _Numbered(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class ResetCommand(_Constant):
-    """Tool to application: restart into the bootloader."""
+    """Tool to application: restart into the bootloader (chapter 3)."""
 
     MODE = Mode.WRITE
     COMMAND = Command.RESET
@@ -137,7 +137,7 @@ class ResetCommand(_Constant):
 
 @dataclass(frozen=True)
 class GeneralFeedbackMessage(_Constant):
-    """Application to tool: the write was received."""
+    """Application to tool: acknowledges a write (chapter 3)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.GENERAL_FEEDBACK
@@ -146,7 +146,7 @@ class GeneralFeedbackMessage(_Constant):
 
 @dataclass(frozen=True)
 class BootVersion(_UpgradeMessage):
-    """Bootloader to tool: its name and version, kept as received, well formed or not (SE-02)."""
+    """Bootloader to tool: its name and version after a restart, well formed or not (table 9)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.BOOT_VERSION
@@ -157,7 +157,7 @@ class BootVersion(_UpgradeMessage):
 
     @property
     def is_version(self) -> bool:
-        """True when the version has the form Vx.x.x."""
+        """True for a version of the form Vx.x.x."""
         return boot_version_number(self.version) is not None
 
     def data(self) -> bytes:
@@ -171,7 +171,7 @@ class BootVersion(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class UpdateCommand(_UpgradeMessage):
-    """Tool to bootloader: prepare for an image of `size_bytes`; the text names the target."""
+    """Tool to bootloader: start an upgrade with `size_bytes`; `text` names the target (table 8)."""
 
     MODE = Mode.WRITE
     COMMAND = Command.UPDATE
@@ -194,7 +194,7 @@ class UpdateCommand(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class RequestTransfer(_Constant):
-    """Bootloader to tool: ready for packet 1."""
+    """Bootloader to tool: flash is erased, send packet 1 (table 9)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.REQUEST_TRANSFER
@@ -203,7 +203,7 @@ class RequestTransfer(_Constant):
 
 @dataclass(frozen=True)
 class Packet(_UpgradeMessage):
-    """Tool to bootloader: packet `number` of `total`, 128 bytes of the image."""
+    """Tool to bootloader: packet `number` of `total`, 128 bytes of the image (table 8)."""
 
     MODE = Mode.WRITE
     COMMAND = Command.PACKET
@@ -233,7 +233,7 @@ class Packet(_UpgradeMessage):
 
 @dataclass(frozen=True)
 class Ack(_Numbered):
-    """Bootloader to tool: packet received."""
+    """Bootloader to tool: packet `number` was received (table 9)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.ACK
@@ -241,7 +241,7 @@ class Ack(_Numbered):
 
 @dataclass(frozen=True)
 class Nak(_Numbered):
-    """Bootloader to tool: packet not received; after the end of transfer: image refused (R6)."""
+    """Bootloader to tool: packet not received; after end of transfer: image refused (R6)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.NAK
@@ -249,7 +249,7 @@ class Nak(_Numbered):
 
 @dataclass(frozen=True)
 class EndOfTransfer(_Constant):
-    """Tool to bootloader: that was the last packet."""
+    """Tool to bootloader: all packets were sent (table 8)."""
 
     MODE = Mode.WRITE
     COMMAND = Command.END_OF_TRANSFER
@@ -258,7 +258,7 @@ class EndOfTransfer(_Constant):
 
 @dataclass(frozen=True)
 class Complete(_Constant):
-    """Bootloader to tool: the image is whole."""
+    """Bootloader to tool: the image passed the integrity check (table 9)."""
 
     MODE = Mode.REPORT
     COMMAND = Command.COMPLETE
@@ -293,11 +293,11 @@ UPGRADE_MESSAGES: Final[dict[int, type[UpgradeMessage]]] = {
         Complete,
     )
 }
-"""All upgrade messages by command."""
+"""Upgrade message classes by command."""
 
 
 def decode(message: Message) -> UpgradeMessage | Malformed | Unknown:
-    """Decode an intact message. Never raises."""
+    """Decode an upgrade message. Never raises."""
     row = UPGRADE_MESSAGES.get(message.command)
     if row is None:
         return Unknown(message)

@@ -1,7 +1,7 @@
-"""Constants of the protocol documents: nodes, ids, dialects, framing, commands.
+"""Protocol constants: nodes, CAN ids, commands, framing, upgrade targets and dialects.
 
 Sources: Welling protocol (BMS) V1.0.0 and MOTINOVA protocol (BMS) V2.7.1, chapters 1 to 3 and
-appendix 3. Timings are in `timing`, layouts of messages in `messages`.
+appendix 3. Timings are in `timing`, message layouts in `messages` and `contents`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ CRC_SIZE: Final = 4
 LENGTH_MIN: Final = COMMAND_SIZE
 LENGTH_MAX: Final = 0xFF
 PREFIX_SIZE: Final = len(HEADER) + MODE_SIZE + LENGTH_SIZE
-"""Bytes before those that the length field counts."""
+"""Bytes of a message before its command."""
 OVERHEAD_SIZE: Final = PREFIX_SIZE + CRC_SIZE + len(TAIL)
 """Bytes of a message that the length field does not count."""
 MESSAGE_MIN_SIZE: Final = OVERHEAD_SIZE + LENGTH_MIN
 MESSAGE_MAX_SIZE: Final = OVERHEAD_SIZE + LENGTH_MAX
 FRAME_DATA_SIZE: Final = 8
-"""Bytes in every CAN frame of a message but the last (2.2.3)."""
+"""Data bytes of each CAN frame of a message; the last may be shorter (2.2.3)."""
 
 
 class Mode(IntEnum):
@@ -45,7 +45,7 @@ class Mode(IntEnum):
 
 
 class Node(Enum):
-    """Node on the bus; the value is its digit in CAN ids."""
+    """Node on the bus; the value is its digit in CAN ids (2.2.2)."""
 
     WMC = 1
     BMS = 2
@@ -59,7 +59,7 @@ _ID_BASE: Final = 0x700
 
 
 def can_id(sender: Node, receiver: Node | None) -> int:
-    """CAN id of messages from `sender` to `receiver`; None is broadcast."""
+    """CAN id of messages from `sender` to `receiver`; None means broadcast (2.2.2)."""
     receiver_digit = BROADCAST_DIGIT if receiver is None else receiver.value
     return _ID_BASE | sender.value << 4 | receiver_digit
 
@@ -68,7 +68,7 @@ def can_id(sender: Node, receiver: Node | None) -> int:
 
 
 class Command(IntEnum):
-    """Commands in wire order: serial number, then size of the data."""
+    """Command numbers as sent: serial number, then size of the data (2.2.1)."""
 
     RESET = 0x4205
     GENERAL_FEEDBACK = 0x5503
@@ -85,30 +85,30 @@ class Command(IntEnum):
 
 
 def data_size(command: int) -> int:
-    """Size in bytes of a command's data: its second byte (2.2.1)."""
+    """Size in bytes of a command's data, which is its second byte (2.2.1)."""
     return command & 0xFF
 
 
 # -- upgrade (appendix 3) -----------------------------------------------------------------------
 
 PACKET_START: Final = 0x01
-"""SOH, first data byte of a packet."""
+"""SOH, the first data byte of a packet (table 8)."""
 END_OF_TRANSFER_MARK: Final = 0x04
-"""EOT, the data of the end of transfer."""
+"""EOT, the data byte of end of transfer (table 8)."""
 PACKET_DATA_SIZE: Final = 128
 PACKET_FILLER: Final = 0xFF
 PACKET_COUNT_MAX: Final = 0xFFFF
 IMAGE_MAX_SIZE: Final = PACKET_COUNT_MAX * PACKET_DATA_SIZE
 """Largest image in bytes (R9)."""
 BOOT_VERSION_BURST: Final = 4
-"""Number of announcements of a bootloader (figure 2)."""
+"""Number of boot versions that a bootloader sends after a restart (figure 2)."""
 FRAMES_PER_PACKET: Final = (
     OVERHEAD_SIZE + COMMAND_SIZE + data_size(Command.PACKET)
 ) // FRAME_DATA_SIZE
 
 
 def packet_count(size_bytes: int) -> int:
-    """Number of packets for an image of `size_bytes`; the last one is padded (R9)."""
+    """Number of packets of an image of `size_bytes`; the last one is padded (R9)."""
     return -(-size_bytes // PACKET_DATA_SIZE)
 
 
@@ -124,13 +124,13 @@ VERSION_FIELD_SIZE: Final = 16
 
 @dataclass(frozen=True)
 class Target:
-    """Upgradable device with its names on the wire (tables 8, 9)."""
+    """Device with an upgradable bootloader, and its names in messages (tables 8, 9)."""
 
     node: Node
     update_text: str
     boot_name: str
     has_version_query: bool
-    """True if the document has a version query for it (chapter 3: the BMS only)."""
+    """True if the documents have a version query for it: the BMS only (table 7)."""
 
     @property
     def name(self) -> str:
@@ -148,7 +148,7 @@ class Target:
 
     @property
     def broadcast_id(self) -> int:
-        """CAN id of this device's broadcasts."""
+        """CAN id of this device's broadcasts (2.2.2)."""
         return can_id(self.node, None)
 
 
@@ -158,11 +158,11 @@ OBC: Final = Target(Node.OBC, "OBC_UPD", "PBU", has_version_query=False)
 
 TARGETS: Final = {target.name: target for target in (WMC, BMS, OBC)}
 TARGET_ALIASES: Final = {"mc": WMC, "pbu": OBC}
-"""Other names of the documents for the same devices."""
+"""Other names of the same devices in the documents."""
 
 
 def find_target(name: str) -> Target | None:
-    """Find a target by name or alias, ignoring case."""
+    """Find a target by name or alias, ignoring case; None if unknown."""
     lower = name.lower()
     return TARGETS.get(lower) or TARGET_ALIASES.get(lower)
 
@@ -177,7 +177,7 @@ def as_target(target: str | Target) -> Target:
 
 @dataclass(frozen=True)
 class Dialect:
-    """One of the two protocol documents, with its differences."""
+    """Protocol dialect: one of the two documents, with its bit rate and nodes."""
 
     name: str
     version: str

@@ -1,7 +1,7 @@
-"""ASCII text fields of the protocol, and safe display of malformed ones.
+"""ASCII text fields of messages, firmware and boot versions, and safe display of malformed texts.
 
-A field contains its text, `.` as terminator, then spaces (5.1). A text that breaks this rule is
-shown as received, with control characters escaped (R20).
+A field contains its text, `.` as terminator, then spaces (chapter 3). A text that breaks this rule
+is shown as received, with control characters escaped (R20).
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from flasher.errors import printable as printable  # noqa: PLC0414  most have it
 from flasher.protocol.spec import TEXT_END, TEXT_FILLER
 
 FIRMWARE_VERSION_FORM: Final = "Vxrxrx_YYYYMMDD"
-"""Naming rule of firmware versions, as printed in the documents (5.1)."""
+"""Naming rule of firmware versions, as printed in the documents (table 5)."""
 BOOT_VERSION_FORM: Final = "Vx.x.x"
-"""Format of boot versions, as printed in the documents (4.1)."""
+"""Format of boot versions, as printed in the documents (table 9)."""
 _FIRMWARE_VERSION: Final = re.compile(
     rb"V([0-9]{1,2})r([0-9]{1,2})r([0-9]{1,2})"
     rb"_([0-9]{4}(?:0[1-9]|1[0-2])(?:0[1-9]|[12][0-9]|3[01]))"
 )
 """Matches `FIRMWARE_VERSION_FORM`; each number may have two digits."""
 _FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
-"""First characters that make a spreadsheet read a cell as a formula."""
+"""First characters that make a spreadsheet interpret a cell as a formula."""
 _BOOT_VERSION: Final = re.compile(r"V([0-9])\.([0-9])\.([0-9])")
 
 
 @dataclass(frozen=True, order=True)
 class FirmwareVersion:
-    """Firmware version that follows the naming rule. Ordered by its three numbers, then by date."""
+    """Firmware version by the naming rule, ordered by its three numbers, then by date."""
 
     major: int
     minor: int
@@ -40,7 +40,7 @@ class FirmwareVersion:
 
     @classmethod
     def parse(cls, text: str) -> Self | None:
-        """Parse all of `text`; None if it breaks the naming rule."""
+        """Parse a whole text; None if it breaks the naming rule."""
         match = _FIRMWARE_VERSION.fullmatch(text.encode("ascii", "replace"))
         if match is None:
             return None
@@ -55,7 +55,7 @@ def boot_version_number(text: str) -> tuple[int, int, int] | None:
 
 
 def encode_text(text: str, size_bytes: int) -> bytes:
-    """Encode `text` as a field of `size_bytes`.
+    """Encode `text` as an ASCII field of `size_bytes`.
 
     Raises ValueError if the text is not printable ASCII, contains the terminator, or is too long.
     """
@@ -70,7 +70,7 @@ def encode_text(text: str, size_bytes: int) -> bytes:
 
 
 def decode_text(field: bytes) -> str:
-    """Decode a field to escaped text: up to the terminator, or all if the rule is broken."""
+    """Decode an ASCII field up to its terminator, or whole if malformed, with escapes."""
     text, end, rest = field.partition(TEXT_END)
     if end and rest.strip(TEXT_FILLER):
         text = field
@@ -78,20 +78,18 @@ def decode_text(field: bytes) -> str:
 
 
 def find_firmware_version(data: bytes) -> str | None:
-    """Find the one firmware version `Vxrxrx_YYYYMMDD` in an image; None for none or several
-    different.
-
-    The surroundings do not matter: a packed structure has no separators.
+    """Find the firmware version `Vxrxrx_YYYYMMDD` in an image; None if it has none or several
+    different ones. A version needs no separators around it, because a packed structure has none.
     """
     found = {data[start:end] for start, end in firmware_version_spans(data)}
     return found.pop().decode("ascii") if len(found) == 1 else None
 
 
 def firmware_version_spans(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield start and end offset of every firmware version in `data`."""
+    """Yield start and end offset of each firmware version in `data`."""
     return (match.span() for match in _FIRMWARE_VERSION.finditer(data))
 
 
 def no_formula(text: str) -> str:
-    """Quote `text` so that a spreadsheet does not read it as a formula."""
+    """Quote a CSV cell that a spreadsheet would interpret as a formula."""
     return f"'{text}" if text.startswith(_FORMULA_STARTS) else text

@@ -1,6 +1,6 @@
-"""Timings in seconds and numbers of tries: the documents' own, and the defaults of R12.
+"""Timeouts, intervals and numbers of tries, as documented or by default (R12).
 
-Hosts and device models take a `Timings`; a product with other values replaces fields.
+Hosts and device models take a `Timings`; a target profile replaces single values.
 """
 
 from __future__ import annotations
@@ -11,49 +11,49 @@ from typing import Annotated
 from flasher.validation import NumberRange
 
 Timeout = Annotated[float, NumberRange(gt=0, le=3600)]
-"""A timeout of zero would fail at once."""
+"""Seconds; a timeout of zero would expire at once."""
 Pause = Annotated[float, NumberRange(ge=0, le=3600)]
 Tries = Annotated[int, NumberRange(ge=1, le=1000)]
 
 
 @dataclass(frozen=True)
 class Timings:
-    """Timings of both sides of the upgrade."""
+    """Timeouts, intervals and numbers of tries of host and device."""
 
     # Given by the documents.
     command_repeat_s: Timeout = 0.2
-    """The tool repeats an application command at this interval (chapter 3)."""
+    """Interval at which the tool repeats an application command (3.4)."""
     command_timeout_s: Timeout = 1.0
-    """The tool stops repeating an application command after this time (chapter 3)."""
+    """Time after which the tool stops repeating an application command (3.4)."""
     boot_version_spacing_s: Pause = 0.05
-    """Time between two announcements of a bootloader (figure 2)."""
+    """Interval between boot versions of a bootloader (figure 2)."""
 
     # Readings.
     inter_frame_timeout_s: Timeout = 0.1
-    """Frames of one message follow each other within this time (R12)."""
+    """Maximum time between two frames of a message (R12)."""
     boot_version_timeout_s: Timeout = 5.0
     """From reset to the first boot version (R12)."""
     request_transfer_timeout_s: Timeout = 10.0
-    """From the update command to request transfer: the device may be erasing (R12)."""
+    """From update command to request transfer, while the device erases its flash (R12)."""
     ack_timeout_s: Timeout = 0.5
     """From a packet to its ACK or NAK (R12)."""
     complete_timeout_s: Timeout = 10.0
     """From end of transfer to complete (R12)."""
     packet_tries: Tries = 5
-    """Maximum number of transmissions of a packet (R12)."""
+    """Maximum number of transmissions of one packet (R12)."""
     end_tries: Tries = 3
     """Maximum number of transmissions of end of transfer without an answer (R12)."""
     boot_watch_s: Pause = 0.025
-    """Time between boot version and update command in which a second bootloader can be detected
-    (R27): half of the time to the next announcement."""
+    """Wait between boot version and update command in which a second bootloader can be detected
+    (R27): half of the interval between boot versions."""
     update_spacing_s: Pause = 0.03
     """Minimum time between two update commands (R2)."""
     leftover_boot_version_s: Pause = 0.06
-    """A boot version within this time after request transfer is a leftover of the burst (R11)."""
+    """A boot version so soon after request transfer belongs to the announcement before it (R11)."""
     announcing_on_s: Timeout = 1.0
-    """A device that still announces itself this long after its first announcement since end of
-    transfer did not accept the image (R11). Five times as long as a burst, so that a doubled
-    announcement, or a second pass through the bootloader, erases no good image."""
+    """A device that still sends boot versions this long after its first one since end of transfer
+    did not accept the image (R11). Five bursts long: a doubled announcement, or a second pass
+    through the bootloader, must not cause a good image to be erased."""
     quiet_after_repeat_s: Pause = 0.05
     """Silence required after a repetition before the next message (R10)."""
     application_start_timeout_s: Timeout = 5.0

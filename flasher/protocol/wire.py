@@ -1,9 +1,8 @@
-"""Encoding and reassembly of messages on CAN (2.2.1, 2.2.3).
+"""Message framing on CAN: encoding, and reassembly of frames to messages (2.2.1, 2.2.3).
 
-Encoding is a pure function. A `Reassembler` per CAN id turns a byte stream into intact messages and
-classified damage. It never raises and buffers at most one message and one frame. After damage it
-skips the misleading header and scans its buffer again, so that it finds the next intact message
-wherever it starts.
+`Reassembler` joins the frames of one CAN id to intact messages and classified damage. It never
+raises and buffers at most one message and one frame. After damage it skips the header and scans its
+buffer again, so that it finds the next intact message wherever it starts.
 
 Redundancy distinguishes a header from the same two bytes inside data (2.2.1): the length must be at
 least 2, and the command's second byte must be the length minus 2. CRC and tail decide then.
@@ -43,7 +42,7 @@ class Message(NamedTuple):
 
 
 class DamageReason(Enum):
-    """Why received bytes are not a message."""
+    """Reason why received bytes are not a valid message."""
 
     JUNK = "junk"
     BAD_LENGTH = "bad_length"
@@ -54,7 +53,7 @@ class DamageReason(Enum):
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes on one CAN id that are not a message; `data` starts at the header."""
+    """Received bytes of one CAN id that are not a valid message; `data` starts at the header."""
 
     can_id: int
     reason: DamageReason
@@ -65,9 +64,9 @@ class Damage:
 
 
 def encode(message: Message) -> bytes:
-    """Encode a complete message, header to tail.
+    """Encode a message from header to tail.
 
-    Raises ValueError if the size of the data differs from the one in the command.
+    Raises ValueError if the data have another size than the command specifies.
     """
     can_id, mode, command, data = message
     if len(data) != data_size(command):
@@ -98,11 +97,11 @@ _NOTHING: Final[tuple[Message | Damage, ...]] = ()
 
 
 class Reassembler:
-    """Reassembles the messages of one CAN id from frame payloads.
+    """Reassembles the messages of one CAN id from the data of its frames.
 
-    Feed payloads as they arrive and call `tick` at `deadline` or later. An unfinished message is
-    dropped `inter_frame_timeout_s` after its last payload (R12), but only by `tick`: payloads that
-    were queued while the computer was busy are not late.
+    Call `tick` at `deadline` or later. An unfinished message is dropped `inter_frame_timeout_s`
+    after its last frame (R12), but only by `tick`: frames that were queued while the computer was
+    busy are not late.
     """
 
     def __init__(self, can_id: int, inter_frame_timeout_s: float) -> None:
@@ -112,15 +111,15 @@ class Reassembler:
         self._junk = bytearray()
         self._needed = len(HEADER)
         self.due_at = inf
-        """When to call `tick` next; infinite while the buffer is empty."""
+        """Time of the next `tick`; infinite while the buffer is empty."""
 
     @property
-    def held_size(self) -> int:
-        """Buffered bytes."""
+    def buffered_bytes(self) -> int:
+        """Number of buffered bytes."""
         return len(self._buffer) + len(self._junk)
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
-        """Add the payload of a frame; return what it completes, usually nothing."""
+        """Add the data of a frame; return what it completes, usually no message and no damage."""
         if not payload:
             return _NOTHING
         self._buffer += payload
@@ -133,11 +132,11 @@ class Reassembler:
         return found
 
     def deadline(self) -> float | None:
-        """When to call `tick` next; None while the buffer is empty."""
+        """Time of the next `tick`; None while the buffer is empty."""
         return None if self.due_at == inf else self.due_at
 
     def tick(self, now: float) -> Sequence[Message | Damage]:
-        """Drop bytes that waited too long; return what was found in them."""
+        """Drop bytes that waited too long; return the damage and messages among them."""
         if now < self.due_at:
             return _NOTHING
         self.due_at = inf
@@ -154,7 +153,6 @@ class Reassembler:
         return found
 
     def reset(self) -> None:
-        """Clear the buffer."""
         self._buffer.clear()
         self._junk.clear()
         self._needed = len(HEADER)
@@ -175,7 +173,7 @@ class Reassembler:
         return found
 
     def _align(self) -> bool:
-        """Move everything before the next header to the junk; False if no header can follow."""
+        """Move all bytes before the next header to the junk; False if the buffer is empty then."""
         buffer = self._buffer
         if not buffer.startswith(HEADER):
             start = buffer.find(HEADER)
@@ -214,7 +212,7 @@ class Reassembler:
         return crc == int.from_bytes(wire[-CRC_SIZE - len(TAIL) : -len(TAIL)], "big")
 
     def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
-        """Report the first `size` bytes and skip only their header, so that the rest is scanned.
+        """Report `size` bytes as damaged and skip only their header: the rest is scanned again.
 
         Bytes between that header and the next one belong to this report.
         """

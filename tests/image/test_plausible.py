@@ -44,7 +44,7 @@ def test_another_kind_of_file_is_named_and_is_certain(data: bytes, words: str) -
     found = find_doubt(Image.from_bytes(data))
     assert found is not None
     assert found.is_certain
-    assert found.ways == ""
+    assert found.other_waivers == ""
     with pytest.raises(ImageError, match=f"is {words}: not plausible as firmware") as caught:
         check_plausible(Image.from_bytes(data, source="it.bin"))
     assert caught.value.exit_code is ExitCode.IMAGE
@@ -76,7 +76,7 @@ def test_no_random_bytes_begin_like_a_program() -> None:
         found = find_doubt(Image.from_bytes(data, base=None if seed % 2 else 0x0800_4000))
         assert found is not None
         assert not found.is_certain
-        assert "cpu" in found.ways
+        assert "cpu" in found.other_waivers
 
 
 @each("base", [None, 0x0800_4000])

@@ -94,7 +94,7 @@ def test_headers_with_a_fitting_length_inside_a_damaged_packet_do_not_hide_what_
     found += reassembler.tick(INTER_FRAME_TIMEOUT_S)
     assert messages_of(found) == [_RESET.message, _END.message]
     assert DamageReason.BAD_CRC in reasons_of(found)
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
 
 
 # -- damaged fields ---------------------------------------------------------------------------
@@ -156,7 +156,7 @@ def test_a_length_of_255_with_an_unknown_command_waits_for_no_more_than_264_byte
     head = bytes.fromhex("55 AA 16 FF 77 FD")
     reassembler = make_reassembler(_ID)
     assert feed_all(reassembler, pieces(head + bytes(257), 8)) == []
-    assert reassembler.held_size == 263
+    assert reassembler.buffered_bytes == 263
     found = feed_all(reassembler, [b"\xf0"])
     assert found == [Damage(_ID, DamageReason.BAD_CRC, head + bytes(257) + b"\xf0")]
     found = feed_all(reassembler, _RESET.payloads)
@@ -234,7 +234,7 @@ def test_a_partial_message_is_dropped_at_the_timeout_and_after(late_s: float) ->
     assert deadline is not None
     found = list(reassembler.tick(deadline + late_s))
     assert found == [Damage(_ID, DamageReason.INCOMPLETE, _RESET.payloads[0])]
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
     assert reassembler.deadline() is None
     assert feed_all(reassembler, _RESET.payloads, now=6.0) == [_RESET.message]
 
@@ -293,7 +293,7 @@ def test_reset_forgets_what_was_held() -> None:
     reassembler = make_reassembler(_ID)
     feed_all(reassembler, [b"\x01\x02", *_PACKET.payloads[:5]])
     reassembler.reset()
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
     assert reassembler.deadline() is None
 
 

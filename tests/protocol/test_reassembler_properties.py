@@ -74,7 +74,7 @@ def test_valid_messages_in_any_split_come_back_as_they_were(
     stream = b"".join(encode(message) for message in messages)
     reassembler = make_reassembler(_ID)
     assert feed_all(reassembler, _split(stream, sizes)) == messages
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
@@ -85,7 +85,7 @@ def test_after_any_noise_and_silence_the_next_message_is_found(
     reassembler = make_reassembler(_ID)
     feed_all(reassembler, _split(noise, sizes))
     reassembler.tick(0.101)
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
     assert feed_all(reassembler, _ACK.payloads, now=0.2) == [_ACK.message]
 
 
@@ -143,7 +143,7 @@ def test_endless_bytes_of_no_use_do_not_fill_the_memory(pattern: bytes, size_byt
     reported = 0
     for payload in pieces((pattern * 3000)[:3000], size_bytes):
         reported += len(reassembler.feed(payload, 0.0))
-        assert reassembler.held_size <= _HELD_MAX
+        assert reassembler.buffered_bytes <= _HELD_MAX
     assert reported
 
 
@@ -154,7 +154,7 @@ def test_endless_random_bytes_do_not_fill_the_memory() -> None:
         reassembler.feed(
             rng.choice([rng.randbytes(8), b"\x55\xaa", b"\x55\xaa\x0c\xff\xc2\xfd"]), 0
         )
-        assert reassembler.held_size <= _HELD_MAX
+        assert reassembler.buffered_bytes <= _HELD_MAX
 
 
 # -- what the checksum catches (CR-01, CR-02, CR-03) ------------------------------------------

@@ -200,7 +200,7 @@ def test_the_rest_of_the_last_message_is_hurried_on_without_gaps() -> None:
     transmitter = Transmitter(_BITRATE_BPS, frame_gap_s=0.01)
     transmitter.queue(_FIRST)
     assert _send_all(transmitter, 1.0) == _FIRST[:1]
-    transmitter.hurry()
+    transmitter.send_without_gaps()
     assert transmitter.deadline() == 0.0
     assert _send_all(transmitter, 1.0) == _FIRST[1:]
 
@@ -208,7 +208,7 @@ def test_the_rest_of_the_last_message_is_hurried_on_without_gaps() -> None:
 def test_a_message_that_has_not_begun_is_not_hurried_before_its_time() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST, not_before=2.0)
-    transmitter.hurry()
+    transmitter.send_without_gaps()
     assert transmitter.deadline() == 2.0
 
 
@@ -272,9 +272,9 @@ def test_a_message_has_left_at_the_latest_when_its_answer_comes() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST)
     _send_all(transmitter, 10.0)
-    transmitter.all_left(10.0001)
+    transmitter.limit_left_at(10.0001)
     assert transmitter.left_at == 10.0001
-    transmitter.all_left(11.0)
+    transmitter.limit_left_at(11.0)
     assert transmitter.left_at == 10.0001
 
 

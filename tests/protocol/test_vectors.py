@@ -35,7 +35,7 @@ def test_a_message_is_split_into_the_frames_of_the_table(vector: Case) -> None:
 def test_the_frames_of_the_table_are_decoded(vector: Case) -> None:
     reassembler = make_reassembler(vector.message.can_id)
     assert feed_all(reassembler, vector.payloads) == [vector.message]
-    assert reassembler.held_size == 0
+    assert reassembler.buffered_bytes == 0
     assert reassembler.deadline() is None
 
 
@@ -52,7 +52,7 @@ def test_a_message_is_there_with_its_last_byte_and_not_before(vector: Case) -> N
     reassembler = make_reassembler(vector.message.can_id)
     *early, last = pieces(vector.wire, 1)
     assert feed_all(reassembler, early) == []
-    assert reassembler.held_size == len(vector.wire) - 1
+    assert reassembler.buffered_bytes == len(vector.wire) - 1
     assert feed_all(reassembler, [last]) == [vector.message]
 
 

@@ -108,7 +108,7 @@ class PaddingFatal(Reassembler):
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
-        if self.held_size and any(isinstance(one, Message) for one in found):
+        if self.buffered_bytes and any(isinstance(one, Message) for one in found):
             self.reset()
             return (Damage(self.can_id, DamageReason.JUNK, payload),)
         return found
