@@ -1,11 +1,31 @@
-"""`.ci/package` removes nothing that it did not make. (That it builds, the gate sees.)"""
+"""The wheel holds every data file, and `.ci/package` removes nothing that it did not make. (That it
+builds, the gate sees.)
+"""
 
 from __future__ import annotations
 
 import subprocess
+import tomllib
 from pathlib import Path
 
-SCRIPT = Path(__file__).parents[1] / ".ci" / "package"
+CHECKOUT = Path(__file__).parents[1]
+SCRIPT = CHECKOUT / ".ci" / "package"
+
+
+def test_every_data_file_is_packed() -> None:
+    settings = tomllib.loads((CHECKOUT / "pyproject.toml").read_text("utf-8"))
+    packed = {
+        path
+        for package, patterns in settings["tool"]["setuptools"]["package-data"].items()
+        for pattern in patterns
+        for path in CHECKOUT.joinpath(*package.split(".")).glob(pattern)
+    }
+    data = {
+        path
+        for path in (CHECKOUT / "flasher").rglob("*")
+        if path.is_file() and path.suffix not in (".py", ".pyc") and not path.name.startswith(".")
+    }
+    assert data - packed == set()
 
 
 def test_a_build_that_cannot_be_made_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
