@@ -626,7 +626,7 @@ class Line:
         except ValueError as error:
             raise Refused(
                 Refusal.WRONG_SERIAL.value,
-                text("No serial number of this recipe: {why}.", why=str(error)),
+                text("Not a serial number of this recipe: {why}.", why=str(error)),
                 text("Scan the label of the unit."),
             ) from error
         check_known(self.sockets, serial)

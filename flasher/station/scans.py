@@ -136,7 +136,7 @@ def understand(scan: str) -> Label | ScanCommand | NotUnderstood:
     return Label(scanned)
 
 
-WAIT: Final = text("Wait for its end.")
+WAIT: Final = text("Wait until that run ends.")
 Sockets = Mapping[str, Socket]
 
 

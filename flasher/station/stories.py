@@ -16,7 +16,7 @@ from flasher.trace.story import Story
 def explained(files: FileStore, file: AttachmentFile) -> Story | str:
     """Explain a trace of the records. Returns a text with the reason when that fails."""
     try:
-        with files.named(file) as path:
+        with files.temporary_copy(file) as path:
             return replace(explain_path(path), source=printable(file.name))
     except RecordError as error:
         return error.what

@@ -152,7 +152,7 @@ class SupervisorPages:
 
     def runs(self, question: Question) -> Answer:
         chosen = filter_of(question)
-        page = self.overview.runs(chosen, _cut(question))
+        page = self.overview.runs(chosen, _cursor(question))
         return self._page(
             question,
             "runs.html",
@@ -209,7 +209,7 @@ class SupervisorPages:
             part = parts[0] if len(parts) == 1 else ""
         if not part:
             return self._page(question, "units.html", serial=serial, parts_found=parts)
-        page = self.overview.life(serial, part, _cut(question))
+        page = self.overview.life(serial, part, _cursor(question))
         if not page.rows:
             raise NotFoundError(f"There is no such run of {serial}.")
         newest = self.overview.life(serial, part, PageCursor(), 1).rows[0]
@@ -277,7 +277,7 @@ class SupervisorPages:
             "images.html",
             images=images,
             chosen=chosen[0] if chosen else None,
-            page=self.overview.holders(sha256, _cut(question)) if chosen else None,
+            page=self.overview.holders(sha256, _cursor(question)) if chosen else None,
             count=self.overview.holder_count(sha256) if chosen else 0,
             counted_up_to=HOLDERS_COUNTED,
         )
@@ -401,7 +401,7 @@ class SupervisorPages:
 
     def audit(self, question: Question) -> Answer:
         page = self.overview.audit(
-            _cut(question),
+            _cursor(question),
             event=question.fields.get("event"),
             since=_moment(question, "from"),
             until=_moment(question, "to"),
@@ -440,22 +440,24 @@ Place = tuple[str, Path, KeyLocations]
 def place_of(store: Store) -> Place:
     """Location of these records: their URL, the folder of their files, external files."""
     url = store.database.location.url.render_as_string(hide_password=False)
-    return url, store.files.folder, store.signer.keeping
+    return url, store.files.folder, store.signer.key_locations
 
 
 def open_supervisor(
-    url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
+    url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
 ) -> SupervisorPages:
     """Open the records of a place read-only. Raises what `Store.open` does."""
-    store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
+    store = Store.open(
+        url, station="pages", folder=folder, read_only=True, key_locations=key_locations
+    )
     return SupervisorPages(store, shifts)
 
 
 def serve_supervisor(
-    url: str, folder: Path, keeping: KeyLocations, shifts: Sequence[time]
+    url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
 ) -> SupervisorPages:
     """The same, and keep daily figures updated while this process lives."""
-    supervisor = open_supervisor(url, folder, keeping, shifts)
+    supervisor = open_supervisor(url, folder, key_locations, shifts)
     rollup = Rollup(supervisor.store.database)
     Thread(
         target=rollup.keep_up, args=(lambda: datetime.now(UTC), sleep), name="sums", daemon=True
@@ -518,7 +520,7 @@ def _moment(question: Question, name: str) -> datetime | None:
 
 def _oldest(question: Question) -> PageCursor:
     """Begin of a part of a file; the first one starts at the oldest row."""
-    return PageCursor(after=_cut(question).after or 0)
+    return PageCursor(after=_cursor(question).after or 0)
 
 
 def _part(
@@ -532,7 +534,7 @@ def _part(
     return Answer(text.encode("utf-8"), _CSV, file_name=name, after=after)
 
 
-def _cut(question: Question) -> PageCursor:
+def _cursor(question: Question) -> PageCursor:
     def at(name: str) -> int | None:
         text = question.fields.get(name, "")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
@@ -550,13 +552,13 @@ class _Addresses:
             if name not in ("before", "after")
         }
 
-    def with_cut(self, path: str, cut: PageCursor | None = None, **more: str) -> str:
-        """The same list from a cut on."""
+    def with_cursor(self, path: str, cursor: PageCursor | None = None, **more: str) -> str:
+        """The same list from a cursor on."""
         fields = self._fields | more
-        if cut is not None and cut.before is not None:
-            fields["before"] = str(cut.before)
-        if cut is not None and cut.after is not None:
-            fields["after"] = str(cut.after)
+        if cursor is not None and cursor.before is not None:
+            fields["before"] = str(cursor.before)
+        if cursor is not None and cursor.after is not None:
+            fields["after"] = str(cursor.after)
         return f"{path}?{urlencode(fields)}" if fields else path
 
     def of(self, path: str, **fields: object) -> str:

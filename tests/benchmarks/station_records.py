@@ -99,9 +99,9 @@ def measure(folder: Path, runs: int) -> None:
     bench.recipe = make_recipe(folder, HEAD + SERIAL_NUMBER + target_table(BMS))
     fast = bench.store
     fast.close()
-    keeping = KeyLocations(bench.keys)
+    key_locations = KeyLocations(bench.keys)
     with Store.open(
-        str(bench.path), station="line-2", clock=bench.clock, keeping=keeping
+        str(bench.path), station="line-2", clock=bench.clock, key_locations=key_locations
     ) as bench.store:
         bench.store.recover()
         timed("one durable run of 12 commits", lambda: durable(bench))
@@ -111,7 +111,9 @@ def measure(folder: Path, runs: int) -> None:
     fill(bench, runs)
     print(f"  {runs} runs made in {time.perf_counter() - began:.0f} s")
     bench.store.close()
-    with Store.open(str(bench.path), station="report", read_only=True, keeping=keeping) as store:
+    with Store.open(
+        str(bench.path), station="report", read_only=True, key_locations=key_locations
+    ) as store:
         records = store.read
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
@@ -124,7 +126,7 @@ def measure(folder: Path, runs: int) -> None:
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
         for goes_on in (False, True):
             began = time.perf_counter()
-            problems = store.examine(goes_on=goes_on).problems
+            problems = store.examine(incremental=goes_on).problems
             what = "verify, again" if goes_on else "verify --all"
             print(f"  {what}: {len(problems)} problems, {time.perf_counter() - began:.1f} s")
         print(f"  figures: {records.figures()}")

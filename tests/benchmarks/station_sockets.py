@@ -91,9 +91,9 @@ class Measured:
             for at in range(sockets)
         ]
         cpu_before, own_before = _children_cpu_s(), time.process_time()
-        keeping = KeyLocations(folder / "keys")
+        key_locations = KeyLocations(folder / "keys")
         records = str(folder / "records.sqlite")
-        with Store.open(records, station="benchmark", keeping=keeping) as store:
+        with Store.open(records, station="benchmark", key_locations=key_locations) as store:
             options = StationOptions(scans_labels=True)
             station = Station(
                 store, recipe, setups, operator="jo", on_event=self._hear, options=options

@@ -89,7 +89,7 @@ class Plant:
     def open(self, *, read_only: bool = True, clock: FakeClock | None = None) -> Store:
         return Store.open(
             self.url, station="line-2", folder=self.files, read_only=read_only, clock=clock,
-            keeping=KeyLocations(self.folder / "keys"),
+            key_locations=KeyLocations(self.folder / "keys"),
         )  # fmt: skip
 
     @property

@@ -79,7 +79,7 @@ def test_verify_says_what_the_records_were_held_against(
         assert refused.code == ExitCode.USAGE
     named = flasher("station", "verify", *place, "--heads", bench.folder)
     assert named.code == ExitCode.VERIFICATION
-    assert "none of these records is kept" in named.out
+    assert "no head of these records is stored" in named.out
 
 
 def test_a_unit_whose_records_were_changed_gets_no_page(
@@ -230,6 +230,6 @@ def test_rules_that_were_taken_away_hide_nothing_else(
         db.commit()
     run = flasher("station", "verify", *place)
     schema, operator, count = run.out.splitlines()
-    assert schema.endswith(f"and {len(rules) - 2} more: it was taken away")
+    assert schema.endswith(f"and {len(rules) - 2} more: it was removed")
     assert operator == "operator of run 1, 2: changed after it was recorded: the operator's name"
     assert count == f"{len(rules) + 1} problems"

@@ -257,10 +257,10 @@ def test_who_signs_in_at_a_page_is_in_the_audit_trail(
 
 
 def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:
-    keeping = KeyLocations(tmp_path / "keys")
-    first = pages.kept_secret(keeping)
+    key_locations = KeyLocations(tmp_path / "keys")
+    first = pages.kept_secret(key_locations)
     assert len(first) > 30
-    assert pages.kept_secret(keeping) == first
+    assert pages.kept_secret(key_locations) == first
     (path,) = (tmp_path / "keys").iterdir()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
@@ -269,10 +269,10 @@ def test_a_full_disk_leaves_no_half_secret(tmp_path: Path, monkeypatch: pytest.M
     def full(*_words: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    keeping = KeyLocations(tmp_path / "keys")
+    key_locations = KeyLocations(tmp_path / "keys")
     with monkeypatch.context() as patched:
         patched.setattr("secrets.token_urlsafe", full)
         with pytest.raises(UsageError, match="No space left"):
-            pages.kept_secret(keeping)
+            pages.kept_secret(key_locations)
     assert list((tmp_path / "keys").iterdir()) == []
-    assert len(pages.kept_secret(keeping)) > 30
+    assert len(pages.kept_secret(key_locations)) > 30

@@ -65,7 +65,7 @@ def test_a_station_adds_records_and_a_reader_reads_them_and_no_more(
     assert verified.code == ExitCode.OK
     assert verified.err.startswith("Name another place for the heads")
     run = flasher(*words, "--database", reader)
-    assert "this user of the database may not do it" in run.err
+    assert "this user of the database lacks the right" in run.err
     for url, statements in (
         (station, ("DELETE FROM audit", "TRUNCATE audit", "DROP TRIGGER run_update ON run")),
         (station, ("UPDATE unit SET serial = 'X'", "CREATE TABLE x ()", "CREATE TEMP TABLE x ()")),

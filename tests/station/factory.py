@@ -98,7 +98,7 @@ def _begun_records() -> dict[str, bytes]:
         folder = Path(made)
         path, keys = folder / "records.sqlite", folder / "keys"
         with Store.open(
-            str(path), station="line-2", clock=FakeClock(), keeping=KeyLocations(keys)
+            str(path), station="line-2", clock=FakeClock(), key_locations=KeyLocations(keys)
         ) as store:
             store.recover()
         return {
@@ -144,7 +144,7 @@ class Bench:
             station=station,
             clock=self.clock,
             folder=None if self.url is None else self.folder / "files",
-            keeping=self.keeping,
+            key_locations=self.key_locations,
             lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
         )
         if self.url is None:
@@ -154,7 +154,7 @@ class Bench:
         return store
 
     @property
-    def keeping(self) -> KeyLocations:
+    def key_locations(self) -> KeyLocations:
         return KeyLocations(self.keys, tuple(map(str, self.heads)))
 
     @contextmanager

@@ -61,7 +61,7 @@ def backup(output: Output, records: RecordsOptions, file: Path) -> int:
 def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
     look = {"unit": " rows", "desc": "examined", "unit_scale": True}
     with closing(open_to_read(records)) as store, Bar(output, **look) as bar:
-        found = store.examine(goes_on=not is_all, progress=bar.move_to)
+        found = store.examine(incremental=not is_all, progress=bar.move_to)
     for line in _problem_lines(found.problems):
         output.result(printable(line))
     for line in found.unreached:
@@ -169,7 +169,7 @@ def key(
             store.rotate_key(operator_of(operator))
         signer = store.signer
         public, file = signer.public, signer.key_file
-        places = (signer.keeping.beside_key, *signer.keeping.elsewhere)
+        places = (signer.key_locations.beside_key, *signer.key_locations.elsewhere)
         heads = tuple(each.shown for each in places)
     is_there = file.exists()
     output.result(f"{printable(store.station)}: key {fingerprint(public)}")
@@ -213,7 +213,7 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
     done = upgrade_records(
         location,
         choose=lambda names: place.station or the_station(names),
-        keeping=place.keeping,
+        key_locations=place.key_locations,
         now=SystemClock().utc,
         lock_timeout_s=place.lock_timeout_s,
     )

@@ -101,11 +101,11 @@ def operator_page(
     board: Board,
     config: StationConfig,
     *,
-    keeping: KeyLocations | None,
+    key_locations: KeyLocations | None,
     people: Sequence[Person],
 ) -> Iterator[tuple[OperatorView, str]]:
     """Serve the operator page and the supervisor pages while the block runs. Yields the view and
-    the URL. `keeping` and `people`: see `served`. Raises UsageError.
+    the URL. `key_locations` and `people`: see `served`. Raises UsageError.
     """
     tally = ShiftCounts(config.shifts)
     began = tally.began(datetime.now().astimezone())
@@ -127,7 +127,7 @@ def operator_page(
         address,
         routes,
         pages=pages,
-        keeping=keeping,
+        key_locations=key_locations,
         people=people,
         is_supervised=lambda path: path != "/" and not path.startswith(LINE),
         clock=station.clock,
@@ -162,7 +162,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
             address,
             routes,
             pages=pages,
-            keeping=None,
+            key_locations=None,
             people=people,
             is_supervised=lambda _path: True,
             clock=SystemClock(),
@@ -192,7 +192,7 @@ def served(
     routes: Collection[BaseRoute],
     *,
     pages: Pages,
-    keeping: KeyLocations | None,
+    key_locations: KeyLocations | None,
     people: Sequence[Person] = (),
     is_supervised: Callable[[str], bool],
     clock: StationClock,
@@ -201,7 +201,7 @@ def served(
 ) -> Iterator[str]:
     """Serve pages while the block runs; yields their URL. Raises UsageError.
 
-    `keeping`: location of the secret that signs cookies, so that open pages survive a restart;
+    `key_locations`: folder of the secret that signs cookies, so that open pages survive restarts;
     None: the secret is not stored. `people`: the people with a badge; only their supervisors may
     open paths for which `is_supervised` is true. Without people everyone may. `note` records
     sign-ins and sign-outs; `checker` runs the check of PINs.
@@ -224,7 +224,7 @@ def served(
     app = application(
         routes,
         hosts=_hosts(address),
-        secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
+        secret=secrets.token_urlsafe(32) if key_locations is None else kept_secret(key_locations),
         login=login,
         is_tls=tls is not None,
         uploads=upload_limit(BODY_MAX),
@@ -290,11 +290,11 @@ def _password(options: PagesOptions) -> str:
     return text
 
 
-def kept_secret(keeping: KeyLocations) -> str:
+def kept_secret(key_locations: KeyLocations) -> str:
     """Read the secret that signs the cookies of the pages from a file of this user; create the file
     if it is missing. Raises UsageError.
     """
-    path: Path = keeping.keys_folder / "pages.secret"
+    path: Path = key_locations.keys_folder / "pages.secret"
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -28,7 +28,7 @@ class RecordsPlace:
     """A file, or an SQLAlchemy URL."""
     files: Path | None
     lock_timeout_s: float
-    keeping: KeyLocations
+    key_locations: KeyLocations
     station: str | None
     """The station's name, if the options give its file."""
 
@@ -38,7 +38,7 @@ class RecordsPlace:
         *,
         create: bool = True,
         read_only: bool = False,
-        told: Callable[[str], None] = lambda _text: None,
+        report: Callable[[str], None] = lambda _text: None,
     ) -> Store:
         """Open the records as a station. Raises UsageError, RecordError."""
         return Store.open(
@@ -48,8 +48,8 @@ class RecordsPlace:
             lock_timeout_s=self.lock_timeout_s,
             create=create,
             read_only=read_only,
-            keeping=self.keeping,
-            told=told,
+            key_locations=self.key_locations,
+            report=report,
         )
 
 
@@ -67,8 +67,8 @@ def records_of(options: RecordsOptions) -> RecordsPlace:
         )
     if database is None:
         database, files = config.records, files or _path(config.files)
-    keeping = KeyLocations(keys or _path(config.keys), heads or config.heads)
-    return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
+    key_locations = KeyLocations(keys or _path(config.keys), heads or config.heads)
+    return RecordsPlace(database, files, config.lock_timeout_s, key_locations, config.name)
 
 
 def _path(text: str) -> Path | None:

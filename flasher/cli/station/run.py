@@ -173,12 +173,12 @@ def _opened_records(
     Raises UsageError, RecordError.
     """
     if not _is_temporary(options, records):
-        with records_of(records).open(config.name, told=output.progress) as store:
+        with records_of(records).open(config.name, report=output.progress) as store:
             yield store
         return
     with tempfile.TemporaryDirectory(prefix="flasher-station-") as folder:
-        file, keeping = Path(folder) / "records.sqlite", KeyLocations(Path(folder) / "keys")
-        with Store.open(str(file), station=config.name, keeping=keeping) as store:
+        file, key_locations = Path(folder) / "records.sqlite", KeyLocations(Path(folder) / "keys")
+        with Store.open(str(file), station=config.name, key_locations=key_locations) as store:
             yield store
 
 
@@ -246,7 +246,7 @@ class _Session:
             self.station,
             self.view.board,
             self.config,
-            keeping=None if self.is_temporary else self.store.signer.keeping,
+            key_locations=None if self.is_temporary else self.store.signer.key_locations,
             people=() if self.crew is None else self.crew.people,
         )
         self._page, url = stack.enter_context(page)

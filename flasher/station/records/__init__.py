@@ -1,1 +1,1 @@
-"""The records of a station: what was done to which unit, by whom, with which file."""
+"""Database of a station's runs: unit, operator, files, steps, verdict and audit trail."""

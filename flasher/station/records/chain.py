@@ -1,8 +1,7 @@
-"""The audit trail: append-only rows, one chain a station. Each row is hashed together with the hash
-of the row before it, and signed with the station's key.
+"""Audit trail of a station: a hash chain of append-only rows, signed with the station's key.
 
-The row of a finished run holds the digests of the run and its parts, so that a change made past the
-triggers is found and named (`examination`).
+The row of a finished run holds the digests of the run and its parts, so that a change that avoided
+the triggers is detected (`examination`).
 """
 
 from __future__ import annotations
@@ -18,32 +17,32 @@ from sqlalchemy import Connection, Row, Table, select
 from flasher.station.records import schema
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import AuditEvent, utc_text
-from flasher.station.records.rows import beside_index, grouped, named
+from flasher.station.records.rows import beside_index, find_or_insert, grouped
 from flasher.station.records.schema import audit, station
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.triggers import fingerprint_of
 
 GENESIS: Final = "0" * 64
-"""The hash before the first row."""
+"""Previous hash of the first row."""
 BEGUN: Final = "begun"
-"""The first row of a chain: the station, which records, their schema, the public key."""
+"""First row of a chain: station, records id, schema and public key."""
 CLAIMED: Final = "claimed"
 FINISHED: Final = "finished"
 INTERRUPTED: Final = "interrupted"
 MIGRATED: Final = "migrated"
-"""The schema was changed: its problems before, and the new schema."""
+"""The schema was upgraded: problems found in the old one, and the new schema."""
 KEY_ROTATED: Final = "key rotated"
-"""Signed with the key before; the rows that follow with the one that it names."""
+"""A new key, in a row signed with the old key; later rows are signed with the new one."""
 KEY_LOST: Final = "key lost"
-"""Signed with the new key, since the one before is gone."""
+"""A new key, in a row signed with the new key itself, because the old one was lost."""
 CLOCK: Final = "clock"
-"""An operator confirmed the clock, although records of a later time exist."""
+"""An operator confirmed the clock although later times are recorded."""
 RESTORED: Final = "restored"
-"""An operator accepted an older copy of the records; the missing rows are lost."""
+"""An operator accepted an older copy of the records, whose missing rows are lost."""
 RECIPE: Final = "recipe"
 """A recipe was used for the first time."""
 ENDINGS: Final = (FINISHED, INTERRUPTED)
-"""Rows that vouch for a run as it ended."""
+"""Rows that hold the digests of a run that ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
 _CANONICAL: Final = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr
@@ -52,24 +51,24 @@ EVENTS: Final = (
     BEGUN, CLAIMED, FINISHED, INTERRUPTED, RECIPE, *(event.value for event in AuditEvent), CLOCK,
     RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED,
 )  # fmt: skip
-"""All that a row may be about."""
+"""All events of audit rows."""
 
 
 class Trail:
-    """The end of a station's chain, in a transaction that writes."""
+    """Appends rows to a station's chain, inside a write transaction."""
 
     def __init__(self, connection: Connection, station_name: str, key: SigningKey) -> None:
         self.connection = connection
         self.station = station_name
         self.key = key
         self.heads: list[ChainHead] = []
-        """The rows that were added here."""
+        """Heads of the rows that were added."""
 
     def append(
         self, now: datetime, event: str, data: Mapping[str, Any], run_id: int | None = None
     ) -> None:
-        """Add a row, in the transaction that it records."""
-        station_id = named(self.connection, station, name=self.station)
+        """Append a signed row."""
+        station_id = find_or_insert(self.connection, station, name=self.station)
         last = self.connection.execute(
             select(audit.c.number, audit.c.hash)
             .where(audit.c.station_id == station_id)
@@ -94,7 +93,7 @@ class Trail:
         self.heads.append(head)
 
     def begin(self, now: datetime, records_id: str) -> None:
-        """Add the first row of the chain."""
+        """Append the first row of the chain."""
         begun = {
             "key": self.key.public,
             "station": self.station,
@@ -106,17 +105,17 @@ class Trail:
 
 
 def canonical(data: Any) -> str:
-    """JSON in a canonical form: equal data gives the same text."""
+    """Canonical JSON: equal data gives equal text."""
     return _CANONICAL.encode(data)
 
 
 def digest(data: Any) -> str:
-    """The hash of data that JSON can hold."""
+    """SHA-256 of canonical JSON, in hexadecimal digits."""
     return hashlib.sha256(canonical(data).encode("ascii")).hexdigest()
 
 
 def data_of(text: str) -> dict[str, Any]:
-    """Parse the output of `canonical`; empty for anything else."""
+    """Parse an object of `canonical`; returns {} for any other text."""
     try:
         found = json.loads(text)
     except ValueError:
@@ -125,13 +124,13 @@ def data_of(text: str) -> dict[str, Any]:
 
 
 def row_hash(row: Mapping[Any, Any]) -> str:
-    """The hash of an audit row; it covers the chain up to it."""
+    """Hash of an audit row. It includes the previous hash, so it covers the chain so far."""
     columns = ("previous_hash", "number", "at", "event", "run_id", "data")
     return digest([row[name] for name in columns])
 
 
 def key_of(event: str, data: Mapping[str, Any]) -> str | None:
-    """The public key that a row brings into force; None for other rows."""
+    """The public key that a row introduces; None for other rows."""
     found = data.get("key") if event in _KEYS else None
     return found if isinstance(found, str) else None
 
@@ -139,18 +138,21 @@ def key_of(event: str, data: Mapping[str, Any]) -> str | None:
 def key_in_force(
     connection: Connection, station_name: str, before: int | None = None
 ) -> str | None:
-    """The public key that signs row `before`, or the next row; None before the first row."""
+    """The public key that signs row `before`, or else the next row. None for an empty chain."""
     rows = [
         row
-        for row in without_run(connection, station_name, _KEYS)
+        for row in rows_without_run(connection, station_name, _KEYS)
         if before is None or row.number < before
     ]
     return key_of(rows[-1].event, data_of(rows[-1].data)) if rows else None
 
 
-def without_run(connection: Connection, station_name: str, events: Iterable[str]) -> list[Row[Any]]:
-    """The rows of these events, which are about no run, in their order. They are few among
-    millions, and found by the index of the runs.
+def rows_without_run(
+    connection: Connection, station_name: str, events: Iterable[str]
+) -> list[Row[Any]]:
+    """A station's audit rows of these events that belong to no run, in order.
+
+    They are few among millions of rows; the index of `run_id` finds them.
     """
     station_id = select(station.c.id).where(station.c.name == station_name)
     wanted = connection.execute(station_id).scalar_one_or_none()
@@ -160,7 +162,7 @@ def without_run(connection: Connection, station_name: str, events: Iterable[str]
 
 
 def head_of(connection: Connection, run_id: int) -> ChainHead | None:
-    """The audit row of a finished run, as a head; None without one."""
+    """The chain head after a finished run; None without an audit row."""
     row = connection.execute(
         select(audit, station.c.name)
         .join_from(audit, station)
@@ -174,14 +176,14 @@ def head_of(connection: Connection, run_id: int) -> ChainHead | None:
     return ChainHead(row.name, row.number, row.at, row.hash, row.signature, key or "")
 
 
-def given_up(connection: Connection, station_name: str) -> list[range]:
-    """Rows that a person accepted as lost when older records were restored."""
-    rows = without_run(connection, station_name, [RESTORED])
+def accepted_losses(connection: Connection, station_name: str) -> list[range]:
+    """Ranges of rows that operators accepted as lost when they restored older records."""
+    rows = rows_without_run(connection, station_name, [RESTORED])
     return [lost_of(data_of(row.data)) for row in rows]
 
 
 def lost_of(data: Mapping[str, Any]) -> range:
-    """The rows that a RESTORED row accepts as lost."""
+    """Range of rows that a RESTORED row accepts as lost."""
     first, last = data.get("lost_from"), data.get("lost_to")
     if isinstance(first, int) and isinstance(last, int):
         return range(first, last + 1)
@@ -189,21 +191,21 @@ def lost_of(data: Mapping[str, Any]) -> range:
 
 
 def ending_of(connection: Connection, run_id: int) -> dict[str, Any]:
-    """The audit row of a finished run; empty without one."""
+    """Audit row of a finished run; {} without one."""
     query = select(audit).where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
     row = connection.execute(query.order_by(audit.c.id.desc()).limit(1)).mappings().one_or_none()
     return {} if row is None else dict(row)
 
 
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
-    """The hash of a row; None when the chain has no such row."""
+    """Hash of row `number`; None if the chain has no such row."""
     query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)
     return connection.execute(query).scalar_one_or_none()
 
 
 def latest(connection: Connection, station_name: str) -> str | None:
-    """The latest time in the chain since a person last released the clock; None without rows."""
-    released = without_run(connection, station_name, [CLOCK])
+    """The latest time in the chain since the clock was last confirmed; None without rows."""
+    released = rows_without_run(connection, station_name, [CLOCK])
     query = (
         _rows_of(station_name, audit.c.at)
         .where(beside_index(audit.c.number) >= (released[-1].number if released else 0))
@@ -220,7 +222,7 @@ def _rows_of(station_name: str, *columns: Any) -> Any:
 
 
 CLAIM: Final = "claim"
-"""The digest of a run's claim, stored when the run begins."""
+"""Name of a run's digest that is computed when the run begins."""
 NAMED: Final = {
     "unit": "serial number or part",
     "station": "the station's name",
@@ -230,37 +232,38 @@ NAMED: Final = {
     "recipe": "the recipe's name, revision or content",
     "artifacts": "an image's name, version, size or hash",
 }
-"""Rows that several runs name, in words."""
+"""Rows that several runs refer to, as `verify` names them."""
 OWN: Final = {
     "run": "the run itself",
-    CLAIM: "what it was claimed with",
-    "targets": "how far its targets were verified",
+    CLAIM: "its claim",
+    "targets": "the verification of its targets",
     "steps": "its steps",
     "measurements": "its measurements",
-    "writes": "what was written",
+    "writes": "its writes",
     "attachments": "its attachments",
 }
-"""The parts of a run, in words."""
+"""Parts of a run, as `verify` names them."""
 CLAIM_PARTS: Final = (CLAIM, *NAMED)
 _OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
-"""Columns of a run that its end writes."""
+"""Columns of a run that are set when it ends."""
 
 
 def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, str]]:
-    """The digests of runs, by their parts; missing runs are left out. They cover names and
-    contents, not only keys of tables.
+    """Digests of the parts of runs, by run id; missing runs are left out.
+
+    They cover names and contents of the rows that a run refers to, not only their ids.
     """
     return digests_in(contents_of(connection, run_ids))
 
 
 def digests_in(contents: Mapping[int, Mapping[str, Any]]) -> dict[int, dict[str, str]]:
-    """The digests of runs whose rows have been read."""
+    """Digests of runs whose rows are already read."""
     known: dict[int, str] = {}
 
     def digest_of(value: Any) -> str:
-        """A recipe or an operator is one object for all runs that name it."""
+        """Cached by identity: runs share the objects of recipes and operators."""
         if id(value) not in known:
             known[id(value)] = digest(value)
         return known[id(value)]
@@ -272,17 +275,17 @@ def digests_in(contents: Mapping[int, Mapping[str, Any]]) -> dict[int, dict[str,
 
 
 def claim_of(content: Mapping[str, Any]) -> list[Any]:
-    """The content of a claim."""
+    """The part of a run that does not change after its claim."""
     claim = {name: value for name, value in content["run"].items() if name not in _OUTCOME}
     return [claim, [{**each, "reached": None} for each in content["targets"]]]
 
 
 def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, Any]]:
-    """The rows of runs and of all that they name, by what they are."""
+    """Rows of runs, and all rows that they refer to, by run id and part."""
     wanted = list(run_ids)
 
     def named_by(rows: Iterable[Mapping[str, Any]], table: Table) -> dict[Any, dict[str, Any]]:
-        """The rows of a table that others name, by their ids."""
+        """Rows of a table that other rows refer to, by id."""
         keys = dict.fromkeys(row[f"{table.name}_id"] for row in rows)
         found = grouped(connection, select(table), table.c.id, keys)
         return {key: row for key, (row,) in found.items()}

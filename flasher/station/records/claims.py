@@ -1,5 +1,5 @@
-"""Checks whether a unit may be run. All rules are checked in the transaction that starts the run,
-so that two sockets cannot both take the last place of a lot.
+"""Claims a unit for a run: checks every rule in the transaction that starts the run, so that two
+sockets cannot both take the last place of a lot.
 """
 
 from __future__ import annotations
@@ -29,29 +29,31 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.rows import insert, named
+from flasher.station.records.rows import find_or_insert, insert
 from flasher.station.records.schema import recipe, run, socket, station, unit
 from flasher.station.shift_counts import shift_began
 
 CLOCK_TOLERANCE: Final = timedelta(minutes=5)
-"""Network time may set the clock back a little."""
+"""Network time may set the clock back this far."""
 
 
-def checked(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
-    """The order with the lot that its serial number names. Raises ClaimRefusedError, UsageError."""
+def check_order(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
+    """Add the lot of the serial number to an order. Raises ClaimRefusedError for a wrong serial
+    number or a changed recipe, UsageError without an operator or socket.
+    """
     try:
         scan = loaded.scan(order.serial, now.astimezone().date(), order.lot)
     except ValueError as error:
         raise ClaimRefusedError(
             Refusal.WRONG_SERIAL,
-            text("No serial number of this recipe: {why}.", why=str(error)),
+            text("Not a serial number of this recipe: {why}.", why=str(error)),
             remedy=text("Scan the label of the unit again."),
         ) from error
     if not loaded.is_unchanged():
         path = printable(str(loaded.path))
         raise ClaimRefusedError(
             Refusal.RECIPE_CHANGED,
-            text("The recipe {path}, or a file that it names, was changed.", path=path),
+            text("The recipe {path}, or a file that it refers to, was changed.", path=path),
             remedy=text("Check it with `flasher station check`, then start the station again."),
         )
     if not order.operator.strip() or not order.socket.strip():
@@ -60,26 +62,30 @@ def checked(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
 
 
 class Claiming:
-    """The claim of one run, in the transaction of `trail`."""
+    """Claims a unit for one run, in the transaction of `trail`."""
 
     def __init__(self, trail: Trail, order: Order, loaded: LoadedRecipe, now: datetime) -> None:
-        """Raises ClaimRefusedError when the clock is earlier than the records."""
+        """Raises ClaimRefusedError if the clock is earlier than the records."""
         self._trail, self._order, self._loaded, self._now = trail, order, loaded, now
         self._part = loaded.recipe.part
         self._connection = connection = trail.connection
         self._check_clock()
-        station_id = named(connection, schema.station, name=trail.station)
-        self._unit_id = named(connection, schema.unit, part=self._part, serial=order.serial)
-        self._socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
+        station_id = find_or_insert(connection, schema.station, name=trail.station)
+        self._unit_id = find_or_insert(
+            connection, schema.unit, part=self._part, serial=order.serial
+        )
+        self._socket_id = find_or_insert(
+            connection, schema.socket, station_id=station_id, name=order.socket
+        )
         self._lot_id: int | None = None
         if order.lot:
-            self._lot_id = named(connection, schema.lot, part=self._part, name=order.lot)
+            self._lot_id = find_or_insert(connection, schema.lot, part=self._part, name=order.lot)
 
     def begin(self, monotonic_s: float) -> Claim:
-        """Begin the run when every rule allows it. Raises ClaimRefusedError."""
+        """Start the run if every rule allows it. Raises ClaimRefusedError."""
         order, loaded, connection = self._order, self._loaded, self._connection
         self._check_free()
-        self._check_nature()
+        self._check_unit_kind()
         last = connection.execute(
             select(run.c.state)
             .where(run.c.unit_id == self._unit_id)
@@ -95,7 +101,7 @@ class Claiming:
             socket_id=self._socket_id,
             recipe_id=self._recipe_id(),
             lot_id=self._lot_id,
-            operator_id=named(connection, schema.operator, name=order.operator),
+            operator_id=find_or_insert(connection, schema.operator, name=order.operator),
             kind=kind.value,
             is_virtual=order.is_virtual,
             reason=order.reason,
@@ -108,7 +114,7 @@ class Claiming:
             allow_completed_not_read_back=loaded.recipe.allow_completed_not_read_back,
         )
         for position, target in enumerate(loaded.targets, 1):
-            artifact_id = named(
+            artifact_id = find_or_insert(
                 connection,
                 schema.artifact,
                 target=target.name,
@@ -132,7 +138,7 @@ class Claiming:
         return Claim(RunId(run_id), kind, order.serial, self._now.astimezone().date(), order.lot)
 
     def _recipe_id(self) -> int:
-        """The recipe's row; it holds the whole text, so that it can be read years later."""
+        """Row id of the recipe. The row holds the whole text, readable years later."""
         loaded, rule = self._loaded, self._loaded.recipe
         query = select(recipe.c.id).where(recipe.c.sha256 == loaded.sha256)
         found = self._connection.execute(query).scalar_one_or_none()
@@ -153,13 +159,13 @@ class Claiming:
     # -- the rules --------------------------------------------------------------------------------
 
     def _check_clock(self) -> None:
-        """Raises ClaimRefusedError when the run would precede recorded ones."""
+        """Raises ClaimRefusedError if recorded runs are later than the clock."""
         last = chain.latest(self._connection, self._trail.station)
         if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
             raise ClaimRefusedError(
                 Refusal.CLOCK,
                 text(
-                    "The clock says {now} UTC, but {station} has records of {last} UTC.",
+                    "The clock shows {now} UTC, but {station} has records of {last} UTC.",
                     now=utc_text(self._now)[:19],
                     station=self._trail.station,
                     last=last[:19],
@@ -189,7 +195,9 @@ class Claiming:
                     socket=by_unit.socket_name,
                     station=by_unit.name,
                 ),
-                remedy=text("Wait for its end. If it is not there, check the label of this unit."),
+                remedy=text(
+                    "Wait until that run ends. If its unit is not there, check this label."
+                ),
             )
         on_socket = running.where(run.c.socket_id == self._socket_id)
         by_socket: Any = self._connection.execute(on_socket).first()
@@ -201,11 +209,13 @@ class Claiming:
                     socket=self._order.socket,
                     serial=by_socket.serial,
                 ),
-                remedy=text("Wait for its end."),
+                remedy=text("Wait until that run ends."),
             )
 
-    def _check_nature(self) -> None:
-        """Refuse to mix virtual and real units: a PASS of one proves nothing about the other."""
+    def _check_unit_kind(self) -> None:
+        """Raises ClaimRefusedError for a real unit recorded as virtual, or the reverse: a PASS of
+        one proves nothing about the other.
+        """
         is_virtual = self._order.is_virtual
         others = select(run.c.id).where(
             run.c.unit_id == self._unit_id, run.c.is_virtual != is_virtual
@@ -219,11 +229,11 @@ class Claiming:
                     serial=self._order.serial,
                     nature=known,
                 ),
-                remedy=text("Keep records of virtual units apart, in a database of their own."),
+                remedy=text("Use a separate database for virtual units."),
             )
 
     def _kind(self, before: UnitState) -> RunKind:
-        """The kind of the run. Raises ClaimRefusedError."""
+        """Kind of the run, by the unit's state before it. Raises ClaimRefusedError."""
         golden = self._loaded.recipe.golden
         if golden is not None and self._order.serial in golden.serial_numbers:
             return RunKind.GOLDEN
@@ -262,7 +272,7 @@ class Claiming:
             )
 
     def _repeated(self) -> RunKind:
-        """The kind of run for a unit that has passed."""
+        """Kind of run for a unit that has passed before. Raises ClaimRefusedError."""
         order, rule = self._order, self._loaded.recipe.duplicate
         if rule is Duplicate.VERIFY_ONLY:
             return RunKind.VERIFY_ONLY
@@ -276,7 +286,7 @@ class Claiming:
             raise ClaimRefusedError(
                 Refusal.REASON_NEEDED,
                 text(
-                    "{serial} has passed already, and is done again only for a reason.",
+                    "{serial} has passed already; another run needs a reason.",
                     serial=order.serial,
                 ),
                 remedy=text("Give the reason, then scan it again."),
@@ -289,7 +299,7 @@ class Claiming:
             raise ClaimRefusedError(
                 Refusal.LOT_NEEDED,
                 text("The unit has no lot."),
-                remedy=text("Give the station the lot."),
+                remedy=text("Enter the lot at the station."),
             )
         if self._lot_id is None or rule.quantity_max is None:
             return
@@ -310,13 +320,13 @@ class Claiming:
                     used=used,
                     most=rule.quantity_max,
                 ),
-                remedy=text("Begin the next lot."),
+                remedy=text("Start the next lot."),
             )
 
 
 def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
-    """True when a golden unit has to pass first. `last_pass` is the time of its last one on this
-    socket; `now` is in the local time zone, in which the shifts start.
+    """True if a golden unit has to pass before the next run. `last_pass` is the time of the last
+    golden PASS on this socket; `now` is in the local time zone, in which shifts start.
     """
     if last_pass is None:
         return True

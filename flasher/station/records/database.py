@@ -1,7 +1,7 @@
 """Opens the database with durable commits, and checks its settings and schema version.
 
-SQLite's safety is a matter of settings: each is set on every connection, and read back before the
-connection is used. A setting that does not hold (a network disk without WAL) is refused.
+SQLite's safety depends on settings: each is set on every connection and read back. A setting that
+does not take effect (WAL on a network disk) is refused.
 """
 
 from __future__ import annotations
@@ -57,35 +57,33 @@ _SYNCHRONOUS_FULL: Final = 2
 _IMMEDIATE: Final = "flasher_immediate"
 _POSTGRESQL: Final = "postgresql+psycopg"
 _OPENED: Final = "flasher_file"
-"""Which file a connection has open."""
+"""Key of a connection's `info`: identity of the database file that it opened."""
 _CHANGE_LIMIT_S: Final = 3600.0
-"""Time limit of a server for one statement that changes the schema."""
+"""Statement timeout of a server while the schema is changed."""
 _BEFORE_ALEMBIC: Final = 2
-"""The schema of records without a revision; older schemas are not in use."""
+"""Schema version of records that have no Alembic revision."""
 
 
 @dataclass(frozen=True)
 class Location:
-    """Location of records: the database, and the folder of its attachments."""
+    """The URL of a database, and the folder of its attachments."""
 
     url: URL
     folder: Path
     shown: str
-    """For messages; without a password."""
+    """URL or path for messages, without a password."""
 
     @property
     def file(self) -> Path | None:
-        """The database's file; None for a server."""
+        """Path of the SQLite file; None for a server."""
         name = self.url.database
         is_file = self.url.get_backend_name() == "sqlite" and name not in (None, "", ":memory:")
         return Path(str(name)) if is_file else None
 
 
 def locate(url: str, folder: Path | None = None) -> Location:
-    """The records that a setting names: an SQLAlchemy URL, or the path of an SQLite file.
-
-    The attachments of a file lie beside it, in `NAME.files`; `folder` is needed for all else.
-    Raises UsageError for a URL that cannot be.
+    """Parse the records' setting: an SQLAlchemy URL, or the path of an SQLite file. `folder` holds
+    the attachments, by default `NAME.files` beside a file. Raises UsageError for an invalid URL.
     """
     try:
         parsed = make_url(url) if "://" in url else URL.create("sqlite", database=url)
@@ -100,14 +98,14 @@ def locate(url: str, folder: Path | None = None) -> Location:
     shown = printable(parsed.set(query={}).render_as_string(hide_password=True))
     if backend == "sqlite" and parsed.query:
         raise UsageError(
-            f"The database {shown} has options in its name, which records cannot be trusted with.",
-            remedy="Name the plain file.",
+            f"The database {shown} has options in its URL; records use none.",
+            remedy="Name the file without options.",
         )
     location = Location(parsed, folder or Path(), shown)
     if folder is None:
         if location.file is None:
             raise UsageError(
-                f"For the database {shown}, the folder of the attachments has to be named.",
+                f"The database {shown} needs a folder for attachments.",
                 remedy="Give a folder on a disk of this computer.",
             )
         folder = location.file.with_name(location.file.name + ".files")
@@ -115,17 +113,17 @@ def locate(url: str, folder: Path | None = None) -> Location:
 
 
 def _no_database(url: str) -> UsageError:
-    """Shows the beginning only: any part of the text may be a password."""
+    """Shows only the beginning of the text: any part may be a password."""
     begin, scheme, _ = url.partition("://")
     return UsageError(
-        f"{printable(begin + scheme)[:40]}... names no place for records.",
+        f"{printable(begin + scheme)[:40]}... is neither a file nor the URL of a database.",
         remedy="Name an SQLite file, or postgresql+psycopg://user@host/name; in a password, @ is "
         "written %40 and / is written %2F.",
     )
 
 
 class Database:
-    """A database that holds what is committed. Open it with `open_database`."""
+    """A database with durable commits. Open it with `open_database`."""
 
     def __init__(
         self,
@@ -148,10 +146,10 @@ class Database:
 
     @contextmanager
     def writing(self, *locks: str) -> Iterator[Connection]:
-        """One transaction that writes; durable when the block is left without an error. SQLite has
-        one writer at a time; elsewhere those with a lock of the same name wait for each other.
+        """Open a write transaction; it is on disk when the block ends without an error.
 
-        Raises RecordError; nothing of the block was saved then.
+        SQLite has one writer at a time; on a server, transactions with a lock of the same name
+        exclude each other. Raises RecordError: then nothing was saved.
         """
         self._check_station()
         with mapped(self.location.shown, writes=True), self.engine.connect() as bare:
@@ -170,7 +168,7 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """One consistent view. Raises RecordError."""
+        """Open a read transaction with one consistent snapshot. Raises RecordError."""
         with (
             mapped(self.location.shown, writes=False),
             self.engine.connect() as connection,
@@ -183,9 +181,8 @@ class Database:
                 yield connection
 
     def _check_place(self, connection: Connection, *, has_log: bool = False) -> None:
-        """Detects that the open file was moved or deleted: SQLite would go on writing to it.
-
-        Raises RecordsMovedError.
+        """Raises RecordsMovedError for a moved or deleted file: SQLite would go on writing to
+        it.
         """
         file = self.location.file
         if file is None:
@@ -201,9 +198,7 @@ class Database:
             )
 
     def station_lock(self, station: str) -> StationLock | ServerLock:
-        """The lock by which one process is this station: on this computer for a file, on all
-        computers for a server.
-        """
+        """Lock that lets one process run as this station, on all computers that use a server."""
         if self.backend == "postgresql":
             lock: ServerLock = _server().ServerLock(self.engine, station, self.location.shown)
             self._check_station = lock.check
@@ -257,15 +252,15 @@ class Database:
             (found,) = connection.execute(f"PRAGMA {name}").fetchone()
             if found != value:
                 raise RecordError(
-                    f"The database does not take {name} = {value}, but {printable(str(found))}.",
+                    f"The database keeps {name} = {printable(str(found))} instead of {value}.",
                     where=self.location.shown,
-                    cause="it lies on a network disk, or on a disk that cannot be written",
+                    cause="it is on a network disk, or on a disk that cannot be written",
                     remedy="Keep the records on a disk of this computer.",
                 )
 
 
 class StationLock:
-    """One process is the station: held from `acquire` until `release` or the end of the process."""
+    """File lock: one process runs as a station, from `acquire` until `release` or its end."""
 
     def __init__(self, station: str, folder: Path) -> None:
         name = f"station-{re.sub(r'[^A-Za-z0-9_-]', '_', station)}.lock"
@@ -273,7 +268,7 @@ class StationLock:
         self._lock = FileLock(self._path, timeout=0, thread_local=False)
 
     def acquire(self) -> None:
-        """Become the station. Raises StationBusyError while another process is, RecordError."""
+        """Raises StationBusyError while another process holds the lock, RecordError."""
         if self._lock.is_locked:
             return
         shown = printable(str(self._path))
@@ -283,9 +278,9 @@ class StationLock:
                 self._lock.acquire()
             except Timeout as error:
                 raise StationBusyError(
-                    "Another process is this station already.",
+                    "Another process already runs this station.",
                     where=shown,
-                    remedy="Use the station that runs, or end it first.",
+                    remedy="Use the running station, or end it first.",
                 ) from error
 
     def release(self) -> None:
@@ -306,9 +301,7 @@ def _server() -> ModuleType:
 
 
 def read_only_sqlite(file: Path) -> sqlite3.Connection:
-    """A connection that changes neither the file nor its journal, and creates no file beside it
-    where possible.
-    """
+    """Open a file without changing it, its journal or, where possible, its folder."""
     log = file.with_name(file.name + "-wal")
     # Without a log no program writes, and none can be created in a read-only folder.
     is_still = not log.exists() and not os.access(file.parent, os.W_OK)
@@ -317,7 +310,7 @@ def read_only_sqlite(file: Path) -> sqlite3.Connection:
 
 
 def _identity(file: Path) -> tuple[int, int] | None:
-    """Identity of the file with this name now; None without one."""
+    """Device and inode of a file; None if it does not exist."""
     try:
         found = file.stat()
     except FileNotFoundError:
@@ -346,10 +339,9 @@ def open_database(
     create: bool = True,
     read_only: bool = False,
 ) -> Database:
-    """The database, with its tables and of the right version.
+    """Open a database and check its schema. With `create`, make missing tables.
 
-    Without `create` a database that is not there is a UsageError: a report must not make one.
-    Raises RecordError, SchemaVersionError for records of another version.
+    Raises UsageError for a missing database, SchemaVersionError for another schema, RecordError.
     """
     if location.file is not None and not location.file.exists() and not create:
         raise no_records(location)
@@ -363,9 +355,7 @@ def open_database(
 
 
 def check_schema(database: Database, now: datetime, *, create: bool) -> None:
-    """Raises OldSchemaError for records that can be brought up to date, SchemaVersionError for all
-    others that this flasher cannot use, RecordError.
-    """
+    """Raises OldSchemaError for records that can be upgraded, SchemaVersionError, RecordError."""
     where = database.location.shown
     with database.reading() as connection:
         has_tables = inspect(connection).get_table_names()
@@ -373,7 +363,7 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
         _create(database, now)
     elif schema_info.name not in has_tables:
         raise SchemaVersionError(
-            "The database holds something else than records of flasher.",
+            "The database holds other data than records of flasher.",
             where=where,
             remedy="Name another file, or an empty database.",
         )
@@ -385,7 +375,7 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
         raise RecordsDamagedError(
             "The records do not name their schema.",
             where=where,
-            remedy="Stop. Keep the database, and go on with the last backup.",
+            remedy="Stop. Keep the database, and continue with the last backup.",
         )
     what = f"The records have schema {printable(found)}; this flasher has schema {SCHEMA_VERSION}."
     number = int(found) if found.isdecimal() else SCHEMA_VERSION
@@ -410,7 +400,7 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
 
 
 def revision_of(connection: Connection) -> str:
-    """The schema revision of the records; empty when they have none."""
+    """Alembic revision of the records; "" without one."""
     if inspect(connection).has_table(alembic_version.name):
         query = select(alembic_version.c.version_num)
         return str(connection.execute(query).scalar_one_or_none() or "")
@@ -419,14 +409,14 @@ def revision_of(connection: Connection) -> str:
 
 
 def pin_search_path(connection: Connection) -> None:
-    """On a server: the functions of triggers look into temporary tables after the records."""
+    """Make the functions of triggers prefer the records' tables to temporary ones (PostgreSQL)."""
     connection.execute(
         text("SELECT set_config('search_path', quote_ident(current_schema()) || ', pg_temp', true)")
     )
 
 
 def _create(database: Database, now: datetime) -> None:
-    """All tables and triggers in one transaction, unless another process was faster."""
+    """Create all tables and triggers in one transaction, unless another process just did."""
     with database.writing("creation") as connection:
         if database.backend == "postgresql":
             pin_search_path(connection)
@@ -446,16 +436,15 @@ def _create(database: Database, now: datetime) -> None:
 
 
 def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
-    """Copy the database to `path` while others use it, and the attachments that it names to
-    `NAME.files` beside it: these never change once they are there.
+    """Copy a database in use to `path`, and its attachments to `NAME.files` beside it.
 
-    A file that is at `path` is replaced only by a whole copy. Raises RecordError; UsageError for
-    a back end that has tools of its own, or a place that is the database itself.
+    An existing backup is replaced only by a complete one. Raises RecordError, UsageError for a
+    server (which has tools of its own) or a path that is the database itself.
     """
     source = database.location.file
     if source is None:
         raise UsageError(
-            f"{database.backend} records are not copied by flasher.",
+            f"flasher makes no backups of {database.backend} databases.",
             remedy="Use the backup of the database itself (pg_dump), and copy the files folder.",
         )
     if path.resolve() == source.resolve():
@@ -475,9 +464,7 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
 
 
 def copy_checked(source: Path, part: Path) -> None:
-    """A consistent copy of a database that others may be using. Raises RecordsDamagedError for one
-    that does not hold together.
-    """
+    """Copy a database in use and check the copy. Raises RecordsDamagedError for a corrupt one."""
     with (
         contextlib.closing(read_only_sqlite(source)) as original,
         contextlib.closing(sqlite3.connect(part)) as copy,
@@ -488,7 +475,7 @@ def copy_checked(source: Path, part: Path) -> None:
         (found,) = copy.execute("PRAGMA integrity_check").fetchone()
     if found != "ok":
         raise RecordsDamagedError(
-            "The database is damaged: the copy does not hold together.",
+            "The database is damaged: the check of its copy failed.",
             where=printable(str(found)),
             remedy="Keep the last good backup.",
         )

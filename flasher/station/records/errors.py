@@ -1,6 +1,7 @@
-"""Errors of reading and saving records, and the mapping of foreign errors to them.
+"""Errors of reading and writing records, and their mapping from errors of SQLite, PostgreSQL and
+the disk.
 
-After a `RecordError` of an operation that writes, nothing was saved and PASS must not be shown.
+After a `RecordError` of a write, nothing was saved and PASS must not be shown.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ NOT_SAVED: Final = "RECORD NOT SAVED"
 
 
 class RecordError(FlasherError):
-    """The records could not be written or read."""
+    """The records could not be read or written."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.USAGE
-    """Like a file that cannot be written: the user has to make room, or correct the setting."""
+    """As for a file that cannot be written: the user makes room or corrects a setting."""
     default_code: ClassVar[ErrorCode] = ErrorCode.RECORDS
 
 
 class DiskFullError(RecordError):
-    """No room for the record."""
+    """The disk is full."""
 
     default_code = ErrorCode.RECORDS_NO_ROOM
 
 
 class RecordsLockedError(RecordError):
-    """Another program holds the records, longer than the time allowed for it."""
+    """Another program holds a lock on the database, longer than the timeout."""
 
     default_code = ErrorCode.RECORDS_LOCKED
 
 
 class RecordsReadOnlyError(RecordError):
-    """The records, or their folder, cannot be written."""
+    """The database or its folder is read-only."""
 
     default_code = ErrorCode.RECORDS_READ_ONLY
 
 
 class RecordsDamagedError(RecordError):
-    """The database is damaged, or is no database."""
+    """The database is corrupt, or the file is not a database."""
 
     default_code = ErrorCode.RECORDS_DAMAGED
 
@@ -58,11 +59,11 @@ class SchemaVersionError(RecordError):
 
 
 class OldSchemaError(SchemaVersionError):
-    """The records have an older schema, which this flasher can bring up to date."""
+    """The records have an older schema, which this flasher can upgrade."""
 
 
 class RuleBrokenError(RecordError):
-    """The database refused what would have made the records untrue."""
+    """A rule of the database refused a write that contradicts other records."""
 
     default_code = ErrorCode.RECORDS_RULE
 
@@ -74,31 +75,31 @@ class RecordsMovedError(RecordError):
 
 
 class NotFoundError(RecordError):
-    """No such unit or run exists."""
+    """The unit or run does not exist."""
 
     default_code = ErrorCode.RECORDS_NOT_FOUND
 
 
 class StationBusyError(RecordError):
-    """Another process is this station already."""
+    """Another process runs as this station."""
 
     default_code = ErrorCode.STATION_RUNNING
 
 
 class KeyMissingError(RecordError):
-    """The station cannot sign: its key is missing, or is not the one of its audit chain."""
+    """The station cannot sign: its key is missing, or is not the key of its audit chain."""
 
     default_code = ErrorCode.STATION_KEY
 
 
 class RecordsCutError(RecordError):
-    """The records lack what this station has written: they are an older copy, or were cut."""
+    """Audit rows of this station are missing: the records are an older copy, or were truncated."""
 
     default_code = ErrorCode.RECORDS_CUT
 
 
 class UnprovenError(RecordError):
-    """The records were changed, so nothing in them is certified."""
+    """The records were changed, so no certificate is issued."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.VERIFICATION
     default_code = ErrorCode.RECORDS_UNPROVEN
@@ -115,8 +116,7 @@ class Refusal(StrEnum):
     LOT_NEEDED = "LOT_NEEDED"
     GOLDEN_DUE = "GOLDEN_DUE"
     OTHER_NATURE = "OTHER_NATURE"
-    """The records know this serial number as a virtual unit, and it is a real one; or the other way
-    round."""
+    """A real unit whose serial number is recorded as virtual, or the reverse."""
     WRONG_SERIAL = "WRONG_SERIAL"
     RECIPE_CHANGED = "RECIPE_CHANGED"
     CLOCK = "CLOCK"
@@ -124,7 +124,7 @@ class Refusal(StrEnum):
 
 
 class ClaimRefusedError(FlasherError):
-    """The unit must not be run now; nothing was recorded and nothing was done to it."""
+    """The unit may not be run now; nothing was recorded or changed."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.USAGE
     default_code = ErrorCode.CLAIM_REFUSED
@@ -135,18 +135,18 @@ class ClaimRefusedError(FlasherError):
 
 
 _Kind = tuple[type[RecordError], str, str]
-"""The error, why, and what to do."""
+"""Error class, cause and remedy."""
 _MAKE_ROOM: Final = "Make room on the disk, then retry."
 _LET_WRITE: Final = "Let this user write the file and its folder."
-_LAST_BACKUP: Final = "Stop. Keep the {}, and go on with the last backup."
+_LAST_BACKUP: Final = "Stop. Keep the {}, and continue with the last backup."
 _UNKNOWN: Final[_Kind] = (
     RecordError,
-    "the database does not work",
+    "the database failed",
     "Check it, then start the station again.",
 )
 _RULE: Final[_Kind] = (
     RuleBrokenError,
-    "the database refuses it",
+    "a rule of the database forbids it",
     "This is a fault of the station: keep its log, and report it.",
 )
 _SQLITE: Final[dict[int, _Kind]] = {
@@ -174,17 +174,17 @@ _SQLITE: Final[dict[int, _Kind]] = {
     ),
     sqlite3.SQLITE_NOTADB: (
         RecordsDamagedError,
-        "the file is no database",
-        "Name the right file, or go on with the last backup.",
+        "the file is not a database",
+        "Name the right file, or continue with the last backup.",
     ),
     sqlite3.SQLITE_IOERR: (
         RecordError,
-        "the disk does not read or write",
-        "Check the disk; do not go on before it works.",
+        "the disk cannot be read or written",
+        "Check the disk; do not continue before it works.",
     ),
     sqlite3.SQLITE_CONSTRAINT: _RULE,
 }
-"""By the primary error code."""
+"""By the primary error code of SQLite."""
 
 LOCK_NOT_AVAILABLE: Final = "55P03"
 _NO_SERVER: Final[_Kind] = (
@@ -195,7 +195,7 @@ _NO_SERVER: Final[_Kind] = (
 _TOO_SLOW: Final[_Kind] = (
     RecordsLockedError,
     "the database server did not finish in time",
-    "Find what holds it up (pg_stat_activity shows it), then retry.",
+    "Find what delays it (pg_stat_activity shows it), then retry.",
 )
 _POSTGRESQL: Final[dict[str, _Kind]] = {
     "": _NO_SERVER,
@@ -209,10 +209,14 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "40": _TOO_SLOW,
     "42501": (
         RecordsReadOnlyError,
-        "this user of the database may not do it",
+        "this user of the database lacks the right",
         "The owner of the database grants it with `flasher station roles`.",
     ),
-    "53": (DiskFullError, "the database server has no room", "Make room on it, then retry."),
+    "53": (
+        DiskFullError,
+        "the disk of the database server is full",
+        "Make room on it, then retry.",
+    ),
     LOCK_NOT_AVAILABLE: (
         RecordsLockedError,
         "another program holds the database",
@@ -223,7 +227,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "58": (DiskFullError, "the database server cannot write", "Check its disk, then retry."),
     "XX": (RecordsDamagedError, "the database is damaged", _LAST_BACKUP.format("database")),
 }
-"""By SQLSTATE or its class; without one there was no answer."""
+"""By SQLSTATE or its first two digits; "" if the server did not answer."""
 _SYSTEM: Final[dict[int, _Kind]] = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), (DiskFullError, "", _MAKE_ROOM)),
     **dict.fromkeys(
@@ -234,7 +238,7 @@ _SYSTEM: Final[dict[int, _Kind]] = {
 
 @contextmanager
 def mapped(where: str, *, writes: bool) -> Iterator[None]:
-    """Map foreign errors of the block to RecordErrors; `where` names the database for a person."""
+    """Map errors of the block to RecordErrors. `where` names the database in messages."""
     error: Exception
     cause = ""
     try:

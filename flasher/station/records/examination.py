@@ -1,4 +1,4 @@
-"""The examination of records: schema, audit trails, runs, attachments and traces."""
+"""`verify`: examines schema, audit trails, runs, attachments and traces of the records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from flasher.station.records.model import (
     RunState,
     utc_text,
 )
-from flasher.station.records.places import PATIENCE_S, Place, patiently
+from flasher.station.records.places import PATIENCE_S, Place, call_all
 from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of_content, is_whole
 from flasher.station.records.rows import batches, grouped
@@ -45,7 +45,7 @@ _RUNS_NAMED: Final = 5
 _HASH_BYTES: Final = 32
 _CACHE_KB: Final = 256 * 1024
 _BRIEFLY_S: Final = 0.5
-"""A page waits no longer for a place of heads."""
+"""Time limit for places of heads when a page examines one run."""
 _USED: Final = {
     schema.unit: schema.run.c.unit_id,
     schema.lot: schema.run.c.lot_id,
@@ -54,32 +54,32 @@ _USED: Final = {
     schema.socket: schema.run.c.socket_id,
     schema.artifact: schema.run_target.c.artifact_id,
 }
-"""Rows that exist only for a run, and the columns that refer to them."""
+"""Tables whose rows only runs add, and the columns that refer to them."""
 Progress = Callable[[int, int], None]
-"""Is called with how much is done, and how much there is to do."""
+"""Callback with the amount done and the total."""
 
 
 @dataclass
 class _Trail:
-    """Findings along the chain of one station."""
+    """One station's chain while it is examined."""
 
     station: str
     begin: int = 0
-    """The rows up to this one were examined before."""
+    """Last row that an earlier examination covered."""
     hashes: bytearray = field(default_factory=bytearray)
-    """Of the rows after that; as bytes, since a plant has millions."""
+    """Hashes of later rows, packed as bytes: a plant has millions."""
     restored: dict[int, range] = field(default_factory=dict)
-    """Rows that give up others, and which."""
+    """Ranges of lost rows, by the number of the RESTORED row that accepts them."""
     keys: list[str] = field(default_factory=list)
-    """The last one signs the next row."""
+    """Public keys so far; the last one signs the next row."""
     stated: tuple[int | None, Mapping[str, str]] = (None, {})
-    """The schema that the chain stated last, with its version."""
+    """Schema version and schema that the chain last recorded."""
     first: dict[str, int] = field(default_factory=dict)
-    """The first row of which a place keeps the head."""
+    """First row whose head is stored in a place, by place."""
 
     @property
     def end(self) -> int:
-        """The number of the last row."""
+        """Number of the last row."""
         return self.begin + len(self.hashes) // _HASH_BYTES
 
     def add(self, row_hash: str) -> None:
@@ -90,7 +90,7 @@ class _Trail:
         self.hashes += found if len(found) == _HASH_BYTES else bytes(_HASH_BYTES)
 
     def hash_of(self, number: int) -> str | None:
-        """The hash of a row; None when it was not examined now."""
+        """Hash of a row; None if this examination did not read it."""
         at = number - self.begin
         if not 1 <= at <= self.end - self.begin:
             return None
@@ -98,30 +98,30 @@ class _Trail:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """A place of heads, as it was before the records were read."""
+class _PlaceHeads:
+    """Chain heads of a place, read before the records."""
 
     place: Place
     is_elsewhere: bool
     lasts: Mapping[str, ChainHead]
-    """The last head of each station."""
+    """Last head of each station."""
 
 
 class Examiner:
-    """One examination of the records."""
+    """Examines the records once."""
 
     def __init__(
         self,
         database: Database,
         files: FileStore,
-        keeping: KeyLocations,
+        key_locations: KeyLocations,
         progress: Progress = lambda _done, _total: None,
         since: Examined | None = None,
     ) -> None:
-        """`since`: examine only what came after that, as long as that is still there."""
+        """`since`: an earlier examination to continue, unless its records have changed."""
         self._database = database
         self._files = files
-        self._keeping = keeping
+        self._keeping = key_locations
         self._progress = progress
         self._done = self._total = 0
         self._remarks: list[str] = []
@@ -131,12 +131,12 @@ class Examiner:
         self._since = since
         self._trails_found: list[_Trail] = []
         self.examined: Examined | None = None
-        """The state that was found good; None before, and after any finding."""
+        """For the next examination; None until this one is done, or if it found a problem."""
         self._traces = 0
         self._nameless = 0
 
     def examine(self, now: datetime) -> Examination:
-        """Examine everything, or what came after the last time. Raises RecordError."""
+        """Examine all records, or those after `since`. Raises RecordError."""
         with self._database.reading() as connection:
             records_id = _records_id(connection)
             names = list(connection.execute(select(schema.station.c.name)).scalars())
@@ -151,7 +151,7 @@ class Examiner:
                 self._since = None
             problems = tuple(self._problems(connection, records_id, kept))
             if not problems:
-                self.examined = self._found_good(connection, records_id, now)
+                self.examined = self._examined_part(connection, records_id, now)
         if self._nameless:
             self._remarks.append(
                 f"{self._nameless} PASS of devices that report no serial number: their traces do"
@@ -171,7 +171,7 @@ class Examiner:
         self,
         connection: Connection,
         records_id: str,
-        kept: list[_Kept],
+        kept: list[_PlaceHeads],
     ) -> Iterator[Problem]:
         since = self._since
         run, audit = schema.run.c, schema.audit.c
@@ -182,7 +182,9 @@ class Examiner:
         rows = connection.execute(select(func.count()).select_from(schema.audit)).scalar_one()
         before = 0 if since is None else sum(each.rows for each in since.chains.values())
         self._total = rows - before + len(chosen)
-        self._did(0)  # shows the bar: what comes first takes minutes where there are many runs
+        self._add_progress(
+            0
+        )  # shows the bar: what comes first takes minutes where there are many runs
         if self._database.backend == "sqlite" and since is None:
             yield from _sqlite_problems(connection)
         yield from self._trails(connection, records_id, kept)
@@ -191,16 +193,16 @@ class Examiner:
         if since is not None:
             gone = gone.where(audit.run_id > since.run)
         for run_id in connection.execute(gone).scalars():
-            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
+            yield Problem(f"run {run_id}", "it is missing, but the audit trail has it", (run_id,))
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
         for some in batches(chosen):
-            stated, contents = _stated(connection, some), contents_of(connection, some)
+            stated, contents = _run_digests(connection, some), contents_of(connection, some)
             yield from self._contents(contents, stated, changed)
         yield from _shared(changed)
         yield from _unused(connection)
         yield from _same_traces(connection)
 
-    def _found_good(self, connection: Connection, records_id: str, now: datetime) -> Examined:
+    def _examined_part(self, connection: Connection, records_id: str, now: datetime) -> Examined:
         run = schema.run.c
         last, count = connection.execute(select(func.max(run.id), func.count(run.id))).one()
         running = select(run.id).where(run.state == RunState.RUNNING.value)
@@ -228,7 +230,7 @@ class Examiner:
             tuple(self._remarks),
         )
 
-    def _did(self, count: int) -> None:
+    def _add_progress(self, count: int) -> None:
         self._done += count
         self._progress(self._done, self._total)
 
@@ -241,9 +243,9 @@ class Examiner:
         limit_s: float = PATIENCE_S,
         *,
         is_all: bool = True,
-    ) -> Iterator[_Kept]:
-        """The places of heads that can be reached; with those of other stations too when `is_all`.
-        Raises RecordError, UsageError for the place beside the key.
+    ) -> Iterator[_PlaceHeads]:
+        """Read the last heads of all places that can be reached; with `is_all`, those of unknown
+        stations too. Raises RecordError, UsageError for the place beside the key.
         """
 
         def lasts(place: Place) -> dict[str, ChainHead]:
@@ -254,24 +256,24 @@ class Examiner:
 
         beside = self._keeping.beside_key
         if beside.folder.is_dir():
-            yield _Kept(beside, is_elsewhere=False, lasts=lasts(beside))
+            yield _PlaceHeads(beside, is_elsewhere=False, lasts=lasts(beside))
         places = self._keeping.elsewhere
         asked = [lambda place=place: lasts(place) for place in places]
-        for place, found in zip(places, patiently(asked, limit_s), strict=True):
+        for place, found in zip(places, call_all(asked, limit_s), strict=True):
             if isinstance(found, FlasherError):
                 self._unreached.append(f"{place.shown}: {found.cause or found.what}")
             else:
-                yield _Kept(place, is_elsewhere=True, lasts=found)
+                yield _PlaceHeads(place, is_elsewhere=True, lasts=found)
 
     def _compare(
-        self, connection: Connection, trail: _Trail, each: _Kept, records_id: str
+        self, connection: Connection, trail: _Trail, each: _PlaceHeads, records_id: str
     ) -> Iterator[Problem]:
-        """Compare a chain with the heads that a place keeps of it."""
+        """Compare a chain with the heads that a place stores of it."""
         shown, place = printable(trail.station), each.place.shown
         last = each.lasts.get(trail.station)
         if last is None:
             if each.is_elsewhere and trail.end:
-                yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
+                yield Problem(f"heads of {shown}", f"no head of these records is stored in {place}")
             return
         first, end = trail.first.get(place, 0), 0
         wrong: list[tuple[int, ChainHead]] = []
@@ -284,20 +286,20 @@ class Examiner:
                     first, end = first or head.number, max(end, head.number)
                 else:
                     wrong.append((0, head))
-        given_up_at: dict[int, int] = {}
+        accepted_at: dict[int, int] = {}
         is_younger = False
-        """True after the last head that was there before the records were read."""
+        """True after the last head that existed before the records were read."""
         for index, entry in enumerate(heads.entries(after=trail.begin)):
             if not isinstance(entry, ChainHead):
-                yield from _segment_wrong(trail, place, entry)
+                yield from _segment_faults(trail, place, entry)
             elif trail.hash_of(entry.number) == entry.hash:
                 first, end = first or entry.number, max(end, entry.number)
                 if entry.number in trail.restored:
-                    given_up_at[entry.number] = index
+                    accepted_at[entry.number] = index
             elif entry.number > trail.begin and not is_younger:
                 wrong.append((index, entry))
             is_younger = is_younger or entry == last
-        held = _not_given_up(trail, wrong, given_up_at)
+        held = _without_accepted(trail, wrong, accepted_at)
         yield from _differences(trail, place, held)
         numbers = [*([first] if first else []), *(head.number for head in held)]
         if numbers:
@@ -310,14 +312,14 @@ class Examiner:
     # -- audit trails -----------------------------------------------------------------------------
 
     def _trails(
-        self, connection: Connection, records_id: str, kept: list[_Kept]
+        self, connection: Connection, records_id: str, kept: list[_PlaceHeads]
     ) -> Iterator[Problem]:
-        """Go through all audit trails, and compare them with the heads that are kept of them."""
+        """Check all audit trails, and compare them with their stored heads."""
         found = fingerprint_of(connection)
         names = list(connection.execute(select(schema.station.c.name)).scalars())
         others = [name for each in kept for name in each.lasts]
         for name in dict.fromkeys([*names, *others]):
-            trail = _begun(name, self._since)
+            trail = _continued_trail(name, self._since)
             query = (
                 select(schema.audit)
                 .join_from(schema.audit, schema.station)
@@ -344,7 +346,7 @@ class Examiner:
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
     ) -> Iterator[Problem]:
-        """Check the rows of one chain in order; yields problems and fills in `trail`."""
+        """Check the rows of one chain in order. Yields problems and fills in `trail`."""
         before = chain.GENESIS
         if self._since is not None and trail.begin:
             before = self._since.chains[trail.station].hash
@@ -354,7 +356,7 @@ class Examiner:
             where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
             if row["previous_hash"] != before or row["number"] != expected:
-                yield Problem(where, "the chain is broken: the row before it is missing or changed")
+                yield Problem(where, "the chain is broken: the previous row is missing or changed")
             is_whole = row["hash"] == chain.row_hash(row)
             if not is_whole:
                 yield Problem(where, "it was changed after it was written")
@@ -368,23 +370,21 @@ class Examiner:
                 trail.keys.append(key)
             before = row["hash"]
             trail.add(before)
-            self._did(1)
+            self._add_progress(1)
             if not is_whole:
                 continue  # what it says counts for nothing
             if _table(data.get("schema")):
                 trail.stated = data.get("version"), _table(data.get("schema"))
             if row["event"] == chain.RESTORED:
                 trail.restored[expected] = chain.lost_of(data)
-            self._take_row(shown, row, data)
+            self._add_remarks(shown, row, data)
             for what in _contradictions(trail.station, records_id, row["event"], data):
                 yield Problem(where, what)
 
     # -- one run ----------------------------------------------------------------------------------
 
     def examine_run(self, run_id: RunId) -> RunExamination:
-        """Examine one run with its audit rows and their stored heads, without reading all records.
-        Raises RecordError.
-        """
+        """Examine one run and its audit rows without reading all records. Raises RecordError."""
         with self._database.reading() as connection:
             records_id = _records_id(connection)
             names = connection.execute(
@@ -405,10 +405,10 @@ class Examiner:
             problems: list[Problem] = []
             for row in rows.mappings().all():
                 where = f"audit row {row['number']} of {printable(row['name'])}"
-                problems += (Problem(where, what) for what in _wrong_with(connection, row))
+                problems += (Problem(where, what) for what in _row_faults(connection, row))
                 if row["event"] in chain.ENDINGS:
                     ending = row
-            stated = _stated(connection, [run_id])
+            stated = _run_digests(connection, [run_id])
             changed: dict[tuple[str, str], list[int]] = defaultdict(list)
             contents = contents_of(connection, [run_id])
             problems += self._contents(contents, stated, changed)
@@ -417,7 +417,7 @@ class Examiner:
             if ending is not None:
                 problems += _schema_of(connection, ending["name"])
                 for each in kept:
-                    found = list(_kept_wrong(connection, each, ending, records_id))
+                    found = list(_head_faults(connection, each, ending, records_id))
                     problems += (Problem(*what) for what in found if what)
                     if not found:
                         places.append(each)
@@ -435,8 +435,8 @@ class Examiner:
             since.at if since is not None and is_examined else None,
         )
 
-    def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        """Note what a person should know of an intact row."""
+    def _add_remarks(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
+        """Add remarks about decisions of operators that an intact row records."""
         decision = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
         match row["event"]:
             case chain.KEY_LOST:
@@ -456,13 +456,13 @@ class Examiner:
         self,
         run_id: int,
         digests: Mapping[str, str],
-        stated: _Stated,
+        stated: _RunDigests,
         changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
-        """Compare a run with what the trails vouch for; `changed` collects what several share."""
+        """Compare a run with its digests in the audit trail. `changed` collects shared rows."""
         where = f"run {run_id}"
         if not stated.is_known:
-            yield Problem(where, "the audit trail does not know it", (run_id,))
+            yield Problem(where, "the audit trail does not have it", (run_id,))
         wrong = {
             part: digests.get(part, "")
             for each in (stated.claim, stated.ending)
@@ -479,10 +479,10 @@ class Examiner:
     def _contents(
         self,
         contents: Mapping[int, Mapping[str, Any]],
-        stated: Mapping[int, _Stated],
+        stated: Mapping[int, _RunDigests],
         changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
-        """Check runs by their rows, which are read once."""
+        """Check runs whose rows are already read."""
         for run_id, digests in chain.digests_in(contents).items():
             yield from self._digests(run_id, digests, stated[run_id], changed)
         for run_id, content in contents.items():
@@ -495,11 +495,12 @@ class Examiner:
                 value = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
                 yield Problem(f"run {run_id}", f"it cannot be read: {value}", (run_id,))
                 continue
-            self._did(1)
+            self._add_progress(1)
             is_over = details.run.state is not RunState.RUNNING
             if stated[run_id].is_known and is_over != bool(stated[run_id].ending):
-                what = "it is finished" if is_over else "it goes on"
-                what += ", but the audit trail says otherwise"
+                what = "it is finished, but active in the audit trail"
+                if not is_over:
+                    what = "it is active, but finished in the audit trail"
                 yield Problem(f"run {run_id}", what, (run_id,))
             yield from self._attachments(details)
 
@@ -521,14 +522,14 @@ class Examiner:
             yield from self._trace(details, traces)
 
     def _trace(self, details: RunDetails, traces: list[AttachmentFile]) -> Iterator[Problem]:
-        """Check a PASS against its own trace."""
+        """Compare a PASS with its own bus trace."""
         run = details.run
         where = f"run {run.run_id}, PASS of {printable(run.serial)}"
         if not traces:
-            yield Problem(where, "there is no trace to hold it against", (run.run_id,))
+            yield Problem(where, "it has no trace to compare it with", (run.run_id,))
             return
         try:
-            with self._files.named(traces[0]) as path:
+            with self._files.temporary_copy(traces[0]) as path:
                 heard = traces_of_targets(
                     (target.target for target in details.targets), read_trace(path)
                 )
@@ -539,7 +540,7 @@ class Examiner:
         self._traces += 1
         self._nameless += not any(each.serial for each in heard.values())
         for what in contradictions(details, heard):
-            yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
+            yield Problem(where, f"its trace contradicts it: {what}", (run.run_id,))
 
 
 def _records_id(connection: Connection) -> str:
@@ -547,7 +548,7 @@ def _records_id(connection: Connection) -> str:
 
 
 def _is_as_examined(connection: Connection, since: Examined) -> bool:
-    """True when the examined part is still there, judging by its ends and numbers."""
+    """True if the examined rows still exist, by their number and the last hash of each chain."""
     if _records_id(connection) != since.records:
         return False
     audit, run = schema.audit.c, schema.run.c
@@ -565,8 +566,8 @@ def _is_as_examined(connection: Connection, since: Examined) -> bool:
     return bool(connection.execute(runs).scalar_one() == since.runs)
 
 
-def _begun(name: str, since: Examined | None) -> _Trail:
-    """The chain of a station, from the end of the last examination."""
+def _continued_trail(name: str, since: Examined | None) -> _Trail:
+    """The state of a station's chain at the end of the last examination."""
     each = None if since is None else since.chains.get(name)
     if each is None:
         return _Trail(name)
@@ -578,12 +579,12 @@ def _begun(name: str, since: Examined | None) -> _Trail:
     )  # fmt: skip
 
 
-def _wrong_with(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
-    """The faults of one audit row."""
+def _row_faults(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
+    """Faults of one audit row."""
     number, name = row["number"], row["name"]
     before = chain.GENESIS if number == 1 else chain.hash_at(connection, name, number - 1)
     if row["previous_hash"] != before:
-        yield "the chain is broken: the row before it is missing or changed"
+        yield "the chain is broken: the previous row is missing or changed"
     if row["hash"] != chain.row_hash(row):
         yield "it was changed after it was written"
     key = chain.key_in_force(connection, name, number)
@@ -592,8 +593,8 @@ def _wrong_with(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]
 
 
 def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
-    """Differences between the schema and the last statement of a station's chain."""
-    rows = chain.without_run(connection, name, (chain.BEGUN, chain.MIGRATED))
+    """Compare the schema with the last one that a station's chain records."""
+    rows = chain.rows_without_run(connection, name, (chain.BEGUN, chain.MIGRATED))
     data = chain.data_of(rows[-1].data) if rows else {}
     if data.get("version") == schema.SCHEMA_VERSION:
         stated = [(data.get("version"), _table(data.get("schema")))]
@@ -601,11 +602,11 @@ def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
             yield Problem(f"schema, {printable(thing)}", what)
 
 
-def _kept_wrong(
-    connection: Connection, each: _Kept, row: Mapping[Any, Any], records_id: str
+def _head_faults(
+    connection: Connection, each: _PlaceHeads, row: Mapping[Any, Any], records_id: str
 ) -> Iterator[tuple[str, str] | None]:
-    """The evidence of a place against an audit row and the end of its chain; empty when it holds
-    the same head, None when it does not hold one.
+    """Compare an audit row and the end of its chain with the heads of a place. Yields problems, and
+    None if the place lacks this head; nothing if it has it.
     """
     name, number, place = row["name"], row["number"], each.place.shown
     last = each.lasts.get(name)
@@ -614,19 +615,22 @@ def _kept_wrong(
         return
     where = f"audit trail of {printable(name)}"
     if chain.hash_at(connection, name, last.number) != last.hash:
-        lost = chain.given_up(connection, name)
+        lost = chain.accepted_losses(connection, name)
         if not any(last.number in some for some in lost):
-            yield where, f"row {last.number} of {last.at} is kept in {place}, but is not there"
+            yield (
+                where,
+                f"row {last.number} of {last.at} is stored in {place}, but missing here",
+            )
     heads = each.place.of(name, records_id).of_row(number)
     if any(head.hash == row["hash"] for head in heads):
         return
     yield None
-    if heads and not any(number in some for some in chain.given_up(connection, name)):
-        yield where, f"row {number} is not the one that is kept in {place}"
+    if heads and not any(number in some for some in chain.accepted_losses(connection, name)):
+        yield where, f"row {number} is not the one that is stored in {place}"
 
 
 def _shared(changed: Mapping[tuple[str, str], list[int]]) -> Iterator[Problem]:
-    """Changed rows that several runs refer to."""
+    """Problems of changed rows that several runs refer to."""
     for (part, _), run_ids in changed.items():
         shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
         more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
@@ -642,26 +646,26 @@ def _same_traces(connection: Connection) -> Iterator[Problem]:
         with_it = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
         same = tuple(connection.execute(with_it).scalars())
         shown = ", ".join(map(str, same[:_RUNS_NAMED]))
-        yield Problem(f"runs {shown}", "they have one and the same trace", same)
+        yield Problem(f"runs {shown}", "they have the same trace", same)
 
 
 @dataclass
-class _Stated:
-    """The digests that the audit trails state for a run."""
+class _RunDigests:
+    """Digests of a run that the audit trail records."""
 
     claim: Mapping[str, str] = field(default_factory=dict)
-    """At its claim."""
+    """Digests at the claim."""
     ending: Mapping[str, str] = field(default_factory=dict)
-    """And at its end."""
+    """Digests at the end."""
 
     @property
     def is_known(self) -> bool:
         return bool(self.claim or self.ending)
 
 
-def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
-    """Statements of intact audit rows for these runs."""
-    found: dict[int, _Stated] = defaultdict(_Stated)
+def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, _RunDigests]:
+    """Digests in the intact audit rows of these runs."""
+    found: dict[int, _RunDigests] = defaultdict(_RunDigests)
     query = select(schema.audit).order_by(schema.audit.c.id)
     for run_id, rows in grouped(connection, query, schema.audit.c.run_id, run_ids).items():
         for row in rows:
@@ -675,7 +679,7 @@ def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
     return found
 
 
-def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
+def _segment_faults(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
     shown = printable(trail.station)
     if isinstance(entry, HeadsFault):
         yield Problem(f"heads of {shown}, {entry.where}", entry.what)
@@ -684,22 +688,22 @@ def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) ->
         yield Problem(where, "it is not signed with a key of the station")
 
 
-def _not_given_up(
-    trail: _Trail, wrong: list[tuple[int, ChainHead]], given_up_at: Mapping[int, int]
+def _without_accepted(
+    trail: _Trail, wrong: list[tuple[int, ChainHead]], accepted_at: Mapping[int, int]
 ) -> list[ChainHead]:
-    """The heads except those of rows that a person accepted as lost."""
+    """Differing heads without those of rows that an operator accepted as lost."""
     return [
         head
         for index, head in wrong
         if not any(
-            head.number in lost and index < given_up_at.get(number, index + 1)
+            head.number in lost and index < accepted_at.get(number, index + 1)
             for number, lost in trail.restored.items()
         )
     ]
 
 
 def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
-    """Heads that differ from the chain."""
+    """Problems of heads that differ from the chain."""
     where = f"audit trail of {printable(trail.station)}"
     missing = [head for head in held if head.number > trail.end]
     other = [head for head in held if head.number <= trail.end]
@@ -714,25 +718,27 @@ def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[P
         first = min(other, key=lambda head: head.number)
         yield Problem(
             where,
-            f"row {first.number} of {first.at} is not the one that is kept in {place}: the"
+            f"row {first.number} of {first.at} is not the one that is stored in {place}: the"
             " chain was made anew",
         )
 
 
 def _unused(connection: Connection) -> Iterator[Problem]:
-    """Rows that no station adds without a run."""
+    """Rows that no run refers to, although stations add them only for a run."""
     for table, naming in _USED.items():
         # A join: of NOT IN (...), a server makes a list that it walks through for each row.
         query = select(table).outerjoin(naming.table, naming == table.c.id).where(naming.is_(None))
         for row in connection.execute(query.order_by(table.c.id).limit(_RUNS_NAMED)).mappings():
             name = row.get("serial") or row.get("name")
-            yield Problem(f"{table.name} {printable(str(name))}", "it was added: no run names it")
+            yield Problem(
+                f"{table.name} {printable(str(name))}", "no run refers to it: it was added"
+            )
 
 
 def _contradictions(
     name: str, records_id: str, event: str, data: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Contradictions between an intact row and these records."""
+    """Contradictions between an intact audit row and these records."""
     if event == chain.BEGUN and data.get("records") != records_id:
         yield "the chain is that of other records"
     if event == chain.BEGUN and data.get("station") != name:
@@ -740,7 +746,7 @@ def _contradictions(
     if event == chain.MIGRATED:
         found = data.get("problems")
         for what in found if isinstance(found, list) else ():
-            yield f"found at the migration: {printable(str(what))}"
+            yield f"found at the upgrade: {printable(str(what))}"
 
 
 def _table(value: Any) -> Mapping[str, str]:
@@ -758,4 +764,4 @@ def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
         if found != "ok":
             yield Problem("database", printable(str(found)))
     for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
-        yield Problem(f"table {row[0]}, row {row[1]}", f"it names a missing row of {row[2]}")
+        yield Problem(f"table {row[0]}, row {row[1]}", f"it refers to a missing row of {row[2]}")

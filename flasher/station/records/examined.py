@@ -1,4 +1,4 @@
-"""The examined part of records: the next examination continues after it.
+"""State of the last examination, so that the next one continues after it.
 
 It is stored in a file beside the examiner's keys, signed with a key of the examiner.
 """
@@ -23,38 +23,38 @@ _MAX_SIZE: Final = 6 * 1024 * 1024
 
 @dataclass(frozen=True)
 class ExaminedChain:
-    """The chain of one station, up to the last row that was examined."""
+    """One station's chain up to the last row that was examined."""
 
     rows: int
     hash: str
-    """Of that row."""
+    """Hash of the last row."""
     key: str
-    """That signs the next row."""
+    """Public key with which the next row is signed."""
     keys: tuple[str, ...]
-    """All that signed so far."""
+    """All public keys of the rows."""
     restored: dict[int, tuple[int, int]]
-    """Rows that give up others, with the first and the last of these."""
+    """First and last lost row, by the RESTORED row that accepts them."""
     version: int | None
     schema: dict[str, str]
-    """The schema as the chain states it last."""
+    """The schema that the chain recorded last."""
     first: dict[str, int]
-    """The first row of which a place keeps the head."""
+    """First row whose head is stored in a place, by place."""
 
 
 @dataclass(frozen=True)
 class Examined:
-    """All that was examined."""
+    """The examined part of the records."""
 
     at: str
     records: str
-    """The id of the records."""
+    """Id of the records."""
     chains: dict[str, ExaminedChain]
     run: int
-    """The last run."""
+    """Id of the last run."""
     runs: int
-    """How many runs there were up to it."""
+    """Number of runs up to the last one."""
     unfinished: tuple[int, ...]
-    """Runs that went on."""
+    """Ids of runs that had not ended."""
     remarks: tuple[str, ...] = field(default=())
 
 
@@ -62,7 +62,7 @@ _TYPE: Final = TypeAdapter(Examined)
 
 
 def load_examined(path: Path, key_path: Path) -> Examined | None:
-    """The examined part; None without a file. Raises RecordError for a changed one."""
+    """Load the last examination; None without a file. Raises RecordError if it was changed."""
     key = SigningKey.load(key_path)
     if key is None or not path.exists():
         return None
@@ -72,11 +72,11 @@ def load_examined(path: Path, key_path: Path) -> Examined | None:
             return _TYPE.validate_python(found["examined"])
     except (ValueError, TypeError, KeyError, ValidationError):
         pass
-    raise RecordError("The note of the last examination was changed.", where=str(path))
+    raise RecordError("The file of the last examination was changed.", where=str(path))
 
 
 def save_examined(path: Path, key_path: Path, examined: Examined) -> None:
-    """Save the examined part, and make the key when there is none. Raises RecordError."""
+    """Save the state, and create the examiner's key if there is none. Raises RecordError."""
     key = SigningKey.load(key_path) or SigningKey.make(key_path)
     body = _TYPE.dump_python(examined, mode="json")
     with mapped(str(path), writes=True), whole_file(path) as part:

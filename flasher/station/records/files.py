@@ -1,7 +1,6 @@
-"""Files that belong to records: beside the database, named by their hash, complete or absent.
+"""Stores attachments beside the database, named by their SHA-256, complete or absent.
 
-A file is on disk under its name before a row refers to it. Files without a row are left over from a
-crash and do no harm.
+A file is on disk before a row refers to it. A file without a row is harmless: a crash left it.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _CHUNK_BYTES: Final = 1 << 20
 _PART: Final = ".part-"
 _SUFFIX: Final = re.compile(r"(?:\.[a-z0-9]{1,4}){1,2}$")
 _PART_AGE_S: Final = 86_400.0
-"""Another station may be writing into the same folder just now."""
+"""Younger partial files may belong to another station that uses the folder."""
 
 
 class FileStore:
@@ -35,7 +34,7 @@ class FileStore:
         self.folder = folder
 
     def add(self, kind: str, source: Path) -> AttachmentFile:
-        """Copy a file in; it is on disk on return. Raises RecordError."""
+        """Copy a file into the folder; it is on disk on return. Raises RecordError."""
         with (
             mapped(printable(str(source)), writes=True),
             source.open("rb") as stream,
@@ -68,11 +67,11 @@ class FileStore:
 
     @property
     def spool(self) -> Path:
-        """The folder for traces of active runs."""
+        """Folder for the traces of active runs."""
         return self.folder / "open"
 
     def add_spooled(self, run_id: int) -> list[AttachmentFile]:
-        """Store the trace that a run of a dead station left. Raises RecordError."""
+        """Store the trace of an interrupted run. Raises RecordError."""
         plain, packed = self._spooled(run_id)
         # A process that died while it packed the trace has left both, and the plain one is whole.
         for path, kind in ((plain, TORN_TRACE), (packed, TRACE)):
@@ -81,13 +80,13 @@ class FileStore:
         return []
 
     def forget_spooled(self, run_id: int) -> None:
-        """Take away the trace of a run that is stored by its hash now."""
+        """Delete the spooled trace of a run whose trace is stored."""
         for path in self._spooled(run_id):
             with contextlib.suppress(OSError):  # one that stays harms nothing
                 path.unlink(missing_ok=True)
 
     def spooled(self, run_id: int) -> Path:
-        """The path of an active run's trace."""
+        """Path of the trace of an active run."""
         return self.spool / f"run-{run_id}.log"
 
     def _spooled(self, run_id: int) -> tuple[Path, Path]:
@@ -95,9 +94,10 @@ class FileStore:
         return plain, plain.with_name(plain.name + ".gz")
 
     @contextmanager
-    def named(self, file: AttachmentFile) -> Iterator[Path]:
-        """The bytes of an attachment under a name of our own with its suffix, for readers that go
-        by the suffix: names in the records are not used as paths. Raises RecordError.
+    def temporary_copy(self, file: AttachmentFile) -> Iterator[Path]:
+        """Copy an attachment to a temporary file that has its suffix, for readers that need one.
+
+        Names in the records are not used as paths. Raises RecordError.
         """
         suffix = _SUFFIX.search(file.name)
         data = self.read(file.sha256)
@@ -107,7 +107,7 @@ class FileStore:
             yield path
 
     def sweep(self, now: datetime) -> None:
-        """Take away what a crash left half written, a day later."""
+        """Delete partial files that a crash left, after a day."""
         oldest = now.timestamp() - _PART_AGE_S
         with mapped(printable(str(self.folder)), writes=True):
             for part in self.folder.glob(_PART + "*"):
@@ -119,7 +119,7 @@ class FileStore:
         return self.folder / sha256[:2] / sha256
 
     def read(self, sha256: str) -> bytes:
-        """The bytes of a file. Raises RecordsDamagedError when it is missing or changed."""
+        """Read a file and check its hash. Raises RecordsDamagedError."""
         path = self.path(sha256)
         shown, remedy = printable(str(path)), "Fetch it from a backup."
         with mapped(shown, writes=False):
@@ -134,7 +134,7 @@ class FileStore:
         return data
 
     def check(self, sha256: str) -> str:
-        """The fault of a file, in words; empty without one."""
+        """Fault of a file, in words; "" if it is intact."""
         try:
             self.read(sha256)
         except RecordError as error:
@@ -143,7 +143,7 @@ class FileStore:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush new names in a folder to disk, where the system can."""
+    """Flush names of new files in a folder to disk, if the system can."""
     if os.name == "nt":  # Windows has no handle for it, and journals names by itself
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -155,7 +155,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary file that takes its own name, on disk, when the block ends without an error."""
+    """Yields a temporary path; renames it to `path`, on disk, after a block without an error."""
     part = path.with_name(f".{path.name}.part")
     try:
         yield part

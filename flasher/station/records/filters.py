@@ -1,4 +1,4 @@
-"""Conditions of a query for the runs of a filter."""
+"""WHERE conditions of a `RunFilter`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.rows import beside_index
 
 JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
-"""Runs with a verdict on the unit; the others are about the station."""
+"""Runs with a verdict on the unit; other ends are faults of the station."""
 
 
 def counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
-    """Columns of the runs of a filter that count in figures."""
+    """Select columns of the runs that figures count: without golden units."""
     query = filtered(select(*columns).select_from(schema.run), chosen)
     return query.where(beside_index(schema.run.c.kind) != RunKind.GOLDEN.value)
 
 
 def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
-    """A query about runs, for those of a filter."""
+    """Restrict a query of runs to a filter."""
     run = schema.run.c
     # Runs of a time lie together; a lot has few. All else would lead through runs of all years.
     by_time = chosen.since is not None and chosen.lot is None
@@ -38,7 +38,7 @@ def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
 
 
 def begun_in(chosen: RunFilter, begun_at: ColumnElement[str]) -> list[ColumnElement[bool]]:
-    """The bounds of time of a filter."""
+    """Conditions on the start time of runs."""
     found = []
     if chosen.since is not None:
         found.append(begun_at >= utc_text(chosen.since))
@@ -48,7 +48,7 @@ def begun_in(chosen: RunFilter, begun_at: ColumnElement[str]) -> list[ColumnElem
 
 
 def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any]]]:
-    """For each name in a filter, the column of the run and a query of the ids that it allows."""
+    """For each name in a filter: the column of the run, and a query for the ids with that name."""
     lot, recipe, socket, run = schema.lot.c, schema.recipe.c, schema.socket.c, schema.run.c
     if chosen.lot is not None:
         yield run.lot_id, select(lot.id).where(lot.name == chosen.lot)
@@ -61,7 +61,7 @@ def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any
 
 
 def units_of(chosen: RunFilter) -> Select[Any] | None:
-    """The ids of the units of a filter; None: it names no serial number."""
+    """Query for the ids of units whose serial number matches; None if the filter has none."""
     unit = schema.unit.c
     query = select(unit.id)
     if chosen.serial is not None:

@@ -1,8 +1,8 @@
-"""The kept heads of a station's audit chain: files that only grow.
+"""Append-only files with the heads of a station's audit chain.
 
-A file that has become large is closed by a signed checkpoint, and another one begins with a copy of
-it: `NAME.heads`, `NAME.heads.000002`, and so on. Whoever starts a station or adds a head reads the
-end of the last one only.
+A large file is closed by a signed checkpoint, and the next one begins with a copy of it:
+`NAME.heads`, `NAME.heads.000002`, and so on. Starting a station reads only the end of the last
+one.
 """
 
 from __future__ import annotations
@@ -25,46 +25,46 @@ from flasher.station.records.files import sync_folder
 from flasher.station.records.signatures import SEGMENT, SigningKey, is_signed
 
 SEGMENT_MAX_BYTES: Final = 4 * 1024 * 1024
-"""A larger segment is closed before the next head is added: some 12,000 audit rows."""
+"""Size at which a segment is closed: some 12,000 audit rows."""
 _TAIL_BYTES: Final = 64 * 1024
 _NO_SEGMENT: Final = "0" * 64
-"""In place of the hash of the checkpoint before the first one."""
+"""Previous hash of the first checkpoint."""
 _NUMBER: Final = re.compile(r"[0-9]{6,}")
 
 
 @dataclass(frozen=True)
 class ChainHead:
-    """The end of a station's chain at some moment, signed."""
+    """The signed last row of a station's chain at some moment."""
 
     station: str
     number: int
-    """Of the audit row in the station's chain, from 1."""
+    """Number of the audit row in the station's chain, from 1."""
     at: str
     hash: str
     signature: str
     key: str
-    """The public key, in hexadecimal digits."""
+    """Public key in hexadecimal digits."""
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The signed end of a closed segment."""
+    """Signed last line of a closed segment."""
 
     segment: int
-    """From 1."""
+    """Number of the segment, from 1."""
     head: ChainHead
-    """The last one in it."""
+    """Last head in the segment."""
     sha256: str
-    """Of all bytes of the segment before the checkpoint."""
+    """Hash of all bytes of the segment before the checkpoint."""
     previous: str
-    """SHA-256 of the checkpoint before it, so that no segment can be left out."""
+    """SHA-256 of the previous checkpoint, so that no segment can be left out."""
     key: str
     signature: str
 
 
 @dataclass(frozen=True)
 class HeadsFault:
-    """A fault of kept heads, with its place."""
+    """A fault in the files, with file and line."""
 
     where: str
     what: str
@@ -72,26 +72,26 @@ class HeadsFault:
 
 @dataclass(frozen=True)
 class Position:
-    """A position to continue reading from."""
+    """Position in the files from which to continue reading."""
 
     segment: int = 1
     offset: int = 0
 
 
 class HeadsFile:
-    """The kept heads of one station; `append` is the only change that is ever made. `path` is the
-    first segment, which may be a file of any size that an older flasher wrote.
+    """The heads of one station in a folder; files only grow, by `append`. `path` is the first
+    segment, which may have any size in records of an older flasher.
     """
 
     def __init__(self, path: Path, segment_max_bytes: int = SEGMENT_MAX_BYTES) -> None:
         self.path = path
         self._max_bytes = segment_max_bytes
         self._last = 0
-        """The last segment that was seen."""
+        """Number of the last segment found."""
 
     def append(self, heads: Iterable[ChainHead], key: SigningKey) -> None:
-        """Add a line for each; on disk when this returns. The key signs the checkpoint of a segment
-        that is full. Raises RecordError.
+        """Append heads, on disk. `key` signs the checkpoint of a full segment. Raises
+        RecordError.
         """
         lines = [json.dumps(asdict(head), sort_keys=True) for head in heads]
         with mapped(printable(str(self.path)), writes=True):
@@ -110,7 +110,7 @@ class HeadsFile:
             self._last = number
 
     def last(self) -> ChainHead | None:
-        """The last head; None without any. Raises RecordError, UsageError."""
+        """The last head; None if there is none. Raises RecordError, UsageError."""
         for number in range(self._last_segment(), 0, -1):
             found = self._last_entry(number)
             if found is not None:
@@ -118,11 +118,11 @@ class HeadsFile:
         return None
 
     def first(self) -> ChainHead | None:
-        """The head that was kept first. Raises as `last`."""
+        """The oldest head. Raises as `last`."""
         return next((each for each in self.entries() if isinstance(each, ChainHead)), None)
 
     def entries(self, after: int = 0) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
-        """All entries in order, without closed segments up to the audit row `after`, and without an
+        """All entries in order. Closed segments up to audit row `after` are skipped, and so is an
         incomplete last line, which a station may be writing. Raises as `last`.
         """
         previous = _NO_SEGMENT
@@ -144,8 +144,8 @@ class HeadsFile:
                 yield entry
 
     def of_row(self, number: int) -> tuple[ChainHead, ...]:
-        """The heads of one audit row: several where older records were restored. Reads one segment,
-        found by the checkpoints at the start of segments. Raises as `last`.
+        """The heads of one audit row: several if older records were restored. Checkpoints at the
+        start of segments lead to the one segment to read. Raises as `last`.
         """
         count = self._last_segment()
         at = bisect_left(range(1, count + 1), number, key=self._begins_after)
@@ -156,7 +156,7 @@ class HeadsFile:
         return tuple(head for head in heads if head.number == number)
 
     def since(self, position: Position) -> Iterator[tuple[ChainHead, Position]]:
-        """The heads from a position on, each with the position after it. Raises as `last`."""
+        """The heads after a position, each with the position after it. Raises as `last`."""
         for after, line in self._lines(position):
             entry = _parsed(line)
             if isinstance(entry, ChainHead):
@@ -187,7 +187,7 @@ class HeadsFile:
         return self._last
 
     def _closed(self, number: int, key: SigningKey) -> str | None:
-        """Close a segment unless it is closed; returns its checkpoint, None without a head."""
+        """Close a segment if needed; returns its checkpoint line, None without a head."""
         end = self._last_entry(number)
         if isinstance(end, Checkpoint):
             return _checkpoint_line(end)
@@ -212,7 +212,7 @@ class HeadsFile:
         return line
 
     def _begins_after(self, number: int) -> int:
-        """The last audit row before a segment."""
+        """Last audit row before a segment."""
         line = next((line for _, line in self._lines(Position(number), is_one=True)), b"")
         entry = _parsed(line)
         return entry.head.number if isinstance(entry, Checkpoint) else 0
@@ -236,18 +236,18 @@ class HeadsFile:
     def _checked(
         self, number: int, previous: str, *, is_closed: bool
     ) -> Iterator[ChainHead | Checkpoint | HeadsFault]:
-        """The entries of a segment, and its faults."""
+        """Entries and faults of one segment."""
         digest, last, entry, is_first = hashlib.sha256(), None, None, True
         where = self._shown(number)
         for count, (_, line) in enumerate(self._lines(Position(number), is_one=True), 1):
             entry = _parsed(line)
             if entry is None:
-                yield HeadsFault(where, f"line {count} is no head")
+                yield HeadsFault(where, f"line {count} is not a head")
             elif is_first and number > 1:
                 is_first = False
                 if _hash_of(line.decode("ascii", "replace")) != previous:
                     yield HeadsFault(
-                        where, "it does not begin with the checkpoint of the one before it"
+                        where, "it does not begin with the checkpoint of the previous one"
                     )
                 if isinstance(entry, ChainHead):
                     yield entry
@@ -267,7 +267,9 @@ class HeadsFile:
     def _lines(
         self, position: Position, *, is_one: bool = False
     ) -> Iterator[tuple[Position, bytes]]:
-        """Whole lines, each with the position after it; of this segment, or of all from it on."""
+        """Complete lines with the position after each, of this segment (`is_one`) or all from it
+        on.
+        """
         for number in range(position.segment, self._last_segment() + 1):
             path = self._segment(number)
             if path.exists():
@@ -308,7 +310,7 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 def _parsed(line: bytes) -> ChainHead | Checkpoint | None:
-    """The entry of a line; None for anything else."""
+    """Parse a line; None if it is not an entry."""
     try:
         found = parse_json(line)
         if "checkpoint" in found:
@@ -320,10 +322,10 @@ def _parsed(line: bytes) -> ChainHead | Checkpoint | None:
 
 
 def _head(found: Any) -> ChainHead:
-    """Raises TypeError, ValueError."""
+    """Raises TypeError, ValueError for an invalid head."""
     head = ChainHead(**found)
     if type(head.number) is not int:
-        raise ValueError("the number of a head is no number")
+        raise ValueError("the number of a head is not a number")
     return head
 
 

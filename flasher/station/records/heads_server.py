@@ -1,6 +1,6 @@
-"""A PostgreSQL server as a place of kept heads: a table that only grows.
+"""Stores chain heads in an append-only table of a PostgreSQL server.
 
-It needs the extra `postgres`; the rest of the records does not import it without a need.
+Needs the extra `postgres`; imported only when a server is configured.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ FOR EACH STATEMENT EXECUTE FUNCTION kept_head_stays();
 
 
 class ServerPlace:
-    """A database of a server."""
+    """A database of a PostgreSQL server in which chain heads are stored."""
 
     def __init__(self, location: Location) -> None:
         self.location = location
@@ -79,9 +79,7 @@ class ServerPlace:
 
     @contextmanager
     def connected(self, *, writes: bool = False) -> Iterator[Connection]:
-        """A transaction in a connection of its own: between two of them hours may pass. Raises
-        RecordError.
-        """
+        """A transaction in a new connection, as hours may pass between two. Raises RecordError."""
         try:
             with mapped(self.shown, writes=writes), self._engine.begin() as connection:
                 yield connection
@@ -90,14 +88,14 @@ class ServerPlace:
 
 
 class ServerHeads:
-    """The heads of one station on a server; rows are only added."""
+    """Chain heads of one station in an append-only table."""
 
     def __init__(self, place: ServerPlace, station: str, records_id: str) -> None:
         self._place = place
         self._own = {"station": station, "records_id": records_id}
 
     def append(self, heads: Iterable[ChainHead], _key: SigningKey) -> None:
-        """Add heads; creates the table when needed. Raises RecordError."""
+        """Insert heads; creates the table if needed. Raises RecordError."""
         with self._place.connected(writes=True) as connection:
             if not _is_there(connection):
                 # Two stations may find that at once.

@@ -1,8 +1,8 @@
-"""Locations of a station's signing key and of the heads of its audit chain, outside the records.
+"""Paths of a station's signing key and of the heads of its audit chain, outside the records.
 
-Whoever can write the database but has no key cannot make a chain that verifies. The chain alone
+Whoever can write the database but lacks the key cannot make a chain that verifies. The chain alone
 cannot show that its end was cut off, or that it is an older copy; heads in another, append-only
-place can. Heads beside the key show it only while no other person can write there.
+place can. Heads beside the key show it only if no other user can write there.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from flasher.station.records.places import FolderPlace, Place, file_name, place_
 
 @dataclass(frozen=True)
 class KeyLocations:
-    """Folder of a station's signing key (None: the default of this user), and further places for
-    the heads of its chain: folders, and URLs of PostgreSQL servers.
+    """Folder of a station's signing key (None: the user's default), and further places for the
+    heads of its chain: folders and URLs of PostgreSQL servers.
     """
 
     keys: Path | None = None
     heads: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[type[KeyLocations], tuple[Path | None, tuple[str, ...]]]:
-        """Sent to another process without the connections of this one."""
+        """Pickled for another process without open connections."""
         return KeyLocations, (self.keys, self.heads)
 
     @property
@@ -42,7 +42,7 @@ class KeyLocations:
 
     @cached_property
     def elsewhere(self) -> tuple[Place, ...]:
-        """The further places. Raises UsageError for an invalid URL."""
+        """The places apart from the key's folder. Raises UsageError for an invalid URL."""
         here = self.keys_folder.resolve()
         places = (place_of(text) for text in dict.fromkeys(self.heads))
         return tuple(
@@ -55,16 +55,16 @@ class KeyLocations:
         return self.keys_folder / file_name(station, records_id, ".key")
 
     def heads_file(self, station: str, records_id: str) -> HeadsFile:
-        """The heads beside the key."""
+        """The heads in the key's folder."""
         return self.beside_key.of(station, records_id)
 
     def examined_files(self, records_id: str) -> tuple[Path, Path]:
-        """The files for the examined part of these records, and the examiner's key."""
+        """Paths of the examined part of these records and of the examiner's key."""
         note = self.keys_folder / file_name("examined", records_id, ".examined")
         return note, note.with_suffix(".verifier")
 
     def check(self, location: Location) -> None:
-        """Raises UsageError for heads in the database of the records themselves."""
+        """Raises UsageError for heads in the same database as the records."""
         for each in self.elsewhere:
             if each.holds(location):
                 raise UsageError(

@@ -1,4 +1,4 @@
-"""Types of the station's records: claims, outcomes, runs with their steps, and filters."""
+"""Types of the station's records: claims, ends of runs, runs with their steps, and filters."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from flasher.validation import LowerCaseInJson, json_keys
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
 DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
-"""How long a write waits for another program that holds the database."""
+"""Time that a write waits for another program's lock on the database."""
 
 
 class StationClock(Protocol):
-    """The records' source of time; tests pass their own."""
+    """Source of time for the records; tests pass their own."""
 
     def utc(self) -> datetime:
-        """Returns the current time, with the time zone UTC."""
+        """The current time in UTC."""
 
     def monotonic_s(self) -> float:
-        """Returns seconds that never go backward; comparable until the computer restarts."""
+        """Seconds that never go backward; comparable until the computer restarts."""
 
 
 def utc_text(moment: datetime) -> str:
-    """Formats a moment for the records: UTC, always the same length, so that texts sort by time.
+    """Format a time for the records: UTC with a constant length, so that texts sort by time.
 
-    Raises ValueError for a moment without a time zone.
+    Raises ValueError for a time without a time zone.
     """
     if moment.tzinfo is None:
         raise ValueError("the time has no time zone")
@@ -39,23 +39,23 @@ def utc_text(moment: datetime) -> str:
 
 
 def utc_moment(text: str) -> datetime:
-    """Parses the text of `utc_text`."""
+    """Parse a text of `utc_text`."""
     return datetime.fromisoformat(text)
 
 
 class RunState(LowerCaseInJson, StrEnum):
-    """Where a run is, or how it ended."""
+    """State of a run: RUNNING, or how it ended."""
 
     RUNNING = "RUNNING"
     PASS = "PASS"  # noqa: S105  the word is no password
     FAIL = "FAIL"
-    """The unit is bad."""
+    """A test failed: the unit is bad."""
     ERROR = "ERROR"
     """No verdict on the unit: its adapter, power or files failed."""
     ABORTED = "ABORTED"
     """A person stopped it."""
     INTERRUPTED = "INTERRUPTED"
-    """The station died during the run; `recover` marked it."""
+    """The station's process ended during the run; `recover` set this state."""
 
 
 OUTCOMES: Final = (RunState.PASS, RunState.FAIL, RunState.ERROR, RunState.ABORTED)
@@ -63,21 +63,21 @@ OUTCOMES: Final = (RunState.PASS, RunState.FAIL, RunState.ERROR, RunState.ABORTE
 
 
 class RunKind(StrEnum):
-    """Why a run is made."""
+    """Reason for a run."""
 
     PRODUCTION = "production"
     RECHECK = "recheck"
     """The unit's last run ended without a verdict: the run asks the device which steps remain."""
     VERIFY_ONLY = "verify-only"
-    """The unit passed before: nothing is flashed or written."""
+    """A unit that passed before; nothing is flashed or written."""
     REFLASH = "reflash"
-    """The unit passed before, and is flashed again for the reason given."""
+    """A unit that passed before is flashed again, for the reason given."""
     GOLDEN = "golden"
-    """A known good unit tests the station; figures exclude it."""
+    """A known good unit that tests the station; figures exclude it."""
 
 
 class AuditEvent(StrEnum):
-    """Acts of people at the station, which `Store.note` writes to the audit trail."""
+    """Actions of people at the station, which `Store.note` appends to the audit trail."""
 
     OPERATOR = "operator"
     """The operator changed."""
@@ -91,12 +91,12 @@ class AuditEvent(StrEnum):
     """The label of a unit was printed again."""
     REFUSED_SCAN = "refused scan"
     SIGN_IN = "sign-in"
-    """A person signed in at a page."""
+    """A person signed in on a page."""
     SIGN_IN_REFUSED = "refused sign-in"
-    """A wrong badge, PIN or password was given at a page."""
+    """A wrong badge, PIN or password was entered on a page."""
     SIGN_OUT = "sign-out"
     SIGN_IN_ENDED = "ended sign-in"
-    """A supervisor ended it, its own person did in another browser, or it expired."""
+    """Ended by a supervisor, by the same person in another browser, or by a timeout."""
 
 
 class UnitState(LowerCaseInJson, StrEnum):
@@ -107,11 +107,11 @@ class UnitState(LowerCaseInJson, StrEnum):
     PASS = "PASS"  # noqa: S105
     FAIL = "FAIL"
     RECHECK = "RECHECK"
-    """The last run ended without a verdict: the device has to be asked."""
+    """The last run ended without a verdict: ask the device for its state."""
 
     @classmethod
     def after(cls, last: RunState | None) -> UnitState:
-        """The state of a unit whose last run has the state `last`; None: it has no run."""
+        """State of a unit after a last run with the state `last`; None: no run yet."""
         if last is None:
             return cls.NEW
         if last in (RunState.RUNNING, RunState.PASS, RunState.FAIL):
@@ -120,7 +120,7 @@ class UnitState(LowerCaseInJson, StrEnum):
 
 
 class StepName(StrEnum):
-    """The steps of a run, in their order."""
+    """Steps of a run, in order."""
 
     CONNECT = "connect"
     IDENTIFY = "identify"
@@ -133,34 +133,34 @@ class StepName(StrEnum):
 
 
 class Verified(IntEnum):
-    """How far a target was verified; ordered, the strictest is the greatest."""
+    """Verification level of a target; a stricter level is greater."""
 
     COMPLETED = 0
     """The device confirmed the complete image; nothing was read back."""
     VERSION = 1
-    """The new application runs and names the version of the image."""
+    """The new application runs and reports the version of the image."""
     MEMORY = 2
-    """Version, and every byte of the image read back."""
+    """Version, and every byte of the image, read back."""
 
     @property
     def words(self) -> str:
-        """The level in words."""
+        """Name of the level for people."""
         return ("completed, not read back", "version read back", "memory read back")[self]
 
 
 class StepState(LowerCaseInJson, StrEnum):
-    """How one try of a step ended."""
+    """State of a step, or how one try of it ended."""
 
     PASS = "PASS"  # noqa: S105
     FAIL = "FAIL"
     ERROR = "ERROR"
     SKIPPED = "SKIPPED"
-    """Not needed, as in a run that only verifies."""
+    """Not needed, for example in a verify-only run."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """A request for a run: the argument of `Store.claim`."""
+    """Request for a run: the argument of `Store.claim`."""
 
     serial: str
     socket: str
@@ -172,7 +172,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Claim:
-    """A run that has begun and is on disk; it is sent to the process of its socket."""
+    """A started run, on disk; it is sent to the process of its socket."""
 
     run_id: RunId
     kind: RunKind
@@ -181,25 +181,23 @@ class Claim:
     lot: str = ""
     # The station adds the following for the process of the socket.
     known_before: Mapping[str, str] = field(default_factory=dict)
-    """Values that must not change, as earlier runs first read them, by measurement."""
+    """Values that must not change, by measurement, as earlier runs first read them."""
     flashed_before: frozenset[str] = frozenset()
-    """Targets whose last flash was of this same image, and was read back."""
+    """Targets whose last flash wrote this same image and was read back."""
     written_before: Mapping[str, str] = field(default_factory=dict)
     """Values that the unit's last PASS wrote, by target and item ("bms serial-number")."""
     trace: Path = Path()
-    """The file to record the trace in."""
+    """File in which the bus trace is recorded."""
     presence: int = 0
-    """`PresenceChanged.number` of the unit that the label was assigned to: the run ends when
-    another unit is in the socket.
-    """
+    """`PresenceChanged.number` of the labelled unit: another unit in the socket ends the run."""
     has_card: bool = True
-    """The card of the socket was scanned with the label, or the unit is virtual: one that cannot
-    identify itself may be flashed."""
+    """The socket's card was scanned with the label, or the unit is virtual. Only then a unit that
+    cannot identify itself may be flashed."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A measured number with its limits, or a text with the expected one; exactly one of both."""
+    """A measured number with limits, or a text with the expected one; exactly one of both."""
 
     name: str
     value: float | None = None
@@ -211,7 +209,7 @@ class Measurement:
 
     @property
     def is_within(self) -> bool:
-        """True when the value is within its limits, or the text is the expected one."""
+        """True if the value is within its limits, or the text equals the expected one."""
         if self.value is None:
             return self.expected is None or self.text == self.expected
         return (self.low is None or self.value >= self.low) and (
@@ -220,24 +218,24 @@ class Measurement:
 
 
 FLASH: Final = "flash"
-"""`WriteRecord.what` of the transfer of an image."""
+"""`WriteRecord.what` of an image transfer."""
 SERIAL_NUMBER: Final = "serial-number"
-"""`WriteRecord.what` of the serial number: the name of its item."""
+"""`WriteRecord.what` of a serial number: the name of its item."""
 BY_POWER: Final = "by power"
-"""`StepRecord.text` of a restart by switching the unit's power."""
+"""`StepRecord.text` of a restart by switching the unit's power off and on."""
 AFTER_RESTART: Final = "after restart"
-"""Measurement of a run that went on after a restart that it did not cause."""
+"""Measurement of a run that continued after a restart of the unit that it did not cause."""
 POWER_CYCLES: Final = "power cycles"
-"""Measurement that counts the run's own power cycles."""
+"""Measurement: number of power cycles that the run made."""
 TRACE: Final = "trace"
-"""Kind of attachment: the complete trace of the bus."""
+"""Kind of attachment: the complete bus trace."""
 TORN_TRACE: Final = "torn-trace"
-"""Kind of attachment: the trace of a process that died; its end is missing."""
+"""Kind of attachment: the bus trace of a process that died, without its end."""
 
 
 @dataclass(frozen=True)
 class AttachmentFile:
-    """A file of a run, already stored under its hash."""
+    """A file of a run, stored under its hash."""
 
     kind: str
     name: str
@@ -247,17 +245,17 @@ class AttachmentFile:
 
 @dataclass(frozen=True)
 class RunEnd:
-    """The end of a run: everything that `Store.finish` saves in one transaction."""
+    """End of a run: everything that `Store.finish` saves in one transaction."""
 
     state: RunState
     code: str
-    """Stable code of the cause, such as "NO_ANSWER"; "OK" for a PASS."""
+    """Stable code of the cause, for example "NO_ANSWER"; "OK" for a PASS."""
     text: str
-    """What happened and what to do, for people."""
+    """Message for people: what happened and what to do."""
     verified: Mapping[str, Verified] = field(default_factory=dict)
-    """How far each target was verified, by the target's name."""
+    """Verification level reached, by target name."""
     log_sha256: str | None = None
-    """SHA-256 of the bus trace, which is one of the attachments."""
+    """SHA-256 of the bus trace, which is also an attachment."""
     attachments: Sequence[AttachmentFile] = ()
 
 
@@ -278,7 +276,7 @@ class StepRecord:
 
 @dataclass(frozen=True)
 class WriteRecord:
-    """A write to a device: recorded as intended before it, and as verified after it."""
+    """A write to a device, recorded before it (intended) and after it (verified)."""
 
     write_id: WriteId
     target: str
@@ -287,12 +285,12 @@ class WriteRecord:
     intended_at: datetime
     verified_at: datetime | None
     read_back: str | None
-    """The value read back; None when none was, or when it cannot be read."""
+    """Value read back; None if it was not or cannot be read."""
 
 
 @dataclass(frozen=True)
 class TargetRecord:
-    """A target of a run: its image, the required verification and the one reached."""
+    """A target of a run: its image, and the verification level required and reached."""
 
     target: str
     image: str
@@ -304,7 +302,7 @@ class TargetRecord:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run as recorded, without its targets, steps, writes and attachments."""
+    """A recorded run, without its targets, steps, writes and attachments."""
 
     run_id: RunId
     serial: str
@@ -312,7 +310,7 @@ class RunRecord:
     lot: str | None
     kind: RunKind
     is_virtual: bool
-    """The unit was virtual: no product."""
+    """True for a run of a virtual unit."""
     reason: str
     state: RunState
     code: str
@@ -320,7 +318,7 @@ class RunRecord:
     begun_at: datetime
     ended_at: datetime | None
     duration_s: float | None
-    """None while the run is active, and for an interrupted one: its end is not known."""
+    """None for an active run, and for an interrupted one, whose end is unknown."""
     station: str
     socket: str
     operator: str
@@ -328,7 +326,7 @@ class RunRecord:
     recipe_revision: str
     recipe_sha256: str
     verified: Verified | None
-    """The lowest level among its targets; None when not known."""
+    """Lowest level of its targets; None if unknown."""
     log_sha256: str | None
 
 
@@ -374,7 +372,7 @@ class RunDetails:
 
 @dataclass(frozen=True)
 class UnitLife:
-    """A unit with all of its runs, the oldest first."""
+    """A unit with all its runs, oldest first."""
 
     serial: str
     part: str
@@ -383,29 +381,29 @@ class UnitLife:
 
     @property
     def is_virtual(self) -> bool:
-        """True for a virtual unit; a serial number is never used for both kinds."""
+        """True for a virtual unit; a serial number belongs to units of one kind."""
         return any(details.run.is_virtual for details in self.runs)
 
     @property
     def last(self) -> RunDetails | None:
-        """The last run; None for a unit without any."""
+        """The last run; None without runs."""
         return self.runs[-1] if self.runs else None
 
 
 @dataclass(frozen=True)
 class RunFilter:
-    """Selects the runs of a report; None does not restrict."""
+    """Selects runs by their properties; None means any."""
 
     lot: str | None = None
     recipe: str | None = None
     since: datetime | None = None
-    """Begun at this moment or later."""
+    """Earliest start of a run."""
     until: datetime | None = None
-    """Begun before this moment."""
+    """Runs start before this time."""
     serial: str | None = None
     part: str | None = None
     search: str | None = None
-    """Part of the serial number; case is ignored."""
+    """Part of the serial number; ignores case."""
     state: RunState | None = None
     code: str | None = None
     socket: str | None = None
@@ -413,32 +411,32 @@ class RunFilter:
 
 @dataclass(frozen=True)
 class Figures:
-    """The figures of a report. They exclude golden units."""
+    """Figures of a report, without golden units."""
 
     runs: int
     units: int
-    """Units with at least one run that ended in PASS or FAIL."""
+    """Number of units with a run that ended in PASS or FAIL."""
     passed: int
-    """Units whose last such run is a PASS."""
+    """Number of units whose last such run is a PASS."""
     first_passed: int
-    """Units whose first such run is a PASS."""
+    """Number of units whose first such run is a PASS."""
     by_state: Mapping[str, int]
     failures: Mapping[str, int]
-    """Runs that ended in another state than PASS, by code; the most frequent first."""
+    """Number of runs that ended without PASS, by code, most frequent first."""
     duration_median_s: float | None
-    """Of runs that passed."""
+    """Median over runs that passed."""
     duration_longest_s: float | None
     virtual_runs: int = 0
-    """Runs of virtual units, which are counted above too; none of them made a product."""
+    """Number of runs of virtual units, included in the counts above."""
 
     @property
     def yield_share(self) -> float | None:
-        """`passed` divided by `units`, from 0 to 1; None without units."""
+        """Yield: `passed` divided by `units`, from 0 to 1; None without units."""
         return self.passed / self.units if self.units else None
 
     @property
     def first_pass_share(self) -> float | None:
-        """`first_passed` divided by `units`, from 0 to 1; None without units."""
+        """First-pass yield: `first_passed` divided by `units`, from 0 to 1; None without units."""
         return self.first_passed / self.units if self.units else None
 
 
@@ -469,7 +467,7 @@ class KeptHeads:
 
     @property
     def is_whole(self) -> bool:
-        """True when it covers every audit row."""
+        """True if it covers every audit row."""
         return self.first == 1 and self.last >= self.rows
 
 
@@ -494,9 +492,7 @@ class Examination:
 
     @property
     def is_checked_elsewhere(self) -> bool:
-        """True when every audit trail was compared as a whole with heads that are stored in
-        another place than beside the key.
-        """
+        """True if every audit trail was compared completely with heads apart from its key."""
         stations = {each.station for each in self.kept}
         return (
             not self.unkept
@@ -527,7 +523,7 @@ class RunExamination:
 
 @dataclass(frozen=True)
 class Backup:
-    """A backup of the records, as it was written."""
+    """A completed backup of the records."""
 
     path: Path
     sha256: str

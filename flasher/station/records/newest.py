@@ -1,7 +1,7 @@
-"""Finds the newest runs of a filter: an index leads to them, however many other runs there are.
+"""Finds the newest runs of a filter quickly, however many runs are recorded, by choosing an index.
 
-The database would choose among indexes by statistics that are missing or wrong (a lot lies
-somewhere in the middle of all runs), and then go through all of them.
+The database would choose by statistics that are missing or wrong (runs of a lot are close
+together), and then read all runs.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from flasher.station.records.model import RunFilter
 from flasher.station.records.rows import beside_index
 
 _LEAD_MAX: Final = 50
-"""Values of one column that are looked up one by one."""
+"""Number of values of a column that are looked up one by one."""
 _UNITS_MAX: Final = 5000
-"""Units of which all runs are looked at. A text that more of them contain is soon found."""
+"""Number of units whose runs are all read. A text that more units contain is soon found."""
 _SHORT: Final = 20_000
-"""Runs that are gone through one by one."""
+"""Number of runs that are read one by one."""
 
 
 @dataclass(frozen=True)
 class PageCursor:
-    """Start of a page: below or above the row with an id; neither: the newest rows."""
+    """Start of a page of rows: before or after the row with an id, or the newest rows."""
 
     before: int | None = None
     after: int | None = None
 
     def of(self, query: Select[Any], row_id: ColumnElement[int]) -> Select[Any]:
-        """The rows of a query from the cut on, those next to it first."""
+        """Restrict and order a query, so that the rows next to the cursor come first."""
         if self.after is not None:
             return query.where(row_id > self.after).order_by(row_id)
         if self.before is not None:
@@ -42,8 +42,10 @@ class PageCursor:
         return query.order_by(row_id.desc())
 
 
-def newest_runs(connection: Connection, chosen: RunFilter, cut: PageCursor, size: int) -> list[int]:
-    """The ids of at most `size` runs of a filter, those next to the cut first."""
+def newest_runs(
+    connection: Connection, chosen: RunFilter, cursor: PageCursor, size: int
+) -> list[int]:
+    """Ids of at most `size` runs of a filter, those next to the cursor first."""
     run, run_id = schema.run.c, schema.run.c.id
     conditions: list[ColumnElement[bool]] = []
     is_short = False
@@ -76,20 +78,22 @@ def newest_runs(connection: Connection, chosen: RunFilter, cut: PageCursor, size
             if lead is not None:
                 conditions.append(beside_index(lead[0]).in_(lead[1]))
             of_units = select(run_id).where(run.unit_id.in_(unit_ids), *conditions)
-            found = cut.of(of_units, beside_index(run_id)).limit(size)
+            found = cursor.of(of_units, beside_index(run_id)).limit(size)
             return list(connection.execute(found).scalars())
         conditions.append(exists(units.where(schema.unit.c.id == run.unit_id)))
     everything = select(run_id).where(*conditions)
     if lead is None:
-        return list(connection.execute(cut.of(everything, run_id).limit(size)).scalars())
+        return list(connection.execute(cursor.of(everything, run_id).limit(size)).scalars())
     column, values = lead
-    parts = (cut.of(everything.where(column == value), run_id).limit(size) for value in values)
+    parts = (cursor.of(everything.where(column == value), run_id).limit(size) for value in values)
     some = union_all(*(select(part.subquery()) for part in parts)).subquery()
-    return list(connection.execute(cut.of(select(some.c.id), some.c.id).limit(size)).scalars())
+    return list(connection.execute(cursor.of(select(some.c.id), some.c.id).limit(size)).scalars())
 
 
 def _allowed(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any]]]:
-    """The columns that a filter is about with the values that it allows, the fewest runs first."""
+    """Columns that a filter restricts, with queries for their values; the lot, with the fewest
+    runs, comes first.
+    """
     run = schema.run.c
     named = list(named_in(chosen))
     yield from ((column, ids) for column, ids in named if column is run.lot_id)

@@ -1,7 +1,6 @@
-"""Queries of the supervisor's pages: runs, audit trail, units that hold an image, figures over
-time.
+"""Queries for the supervisor's pages: runs, audit trail, units with an image, yield over time.
 
-The database counts; the fetched rows are bounded, however many runs there are.
+The database counts, and the number of fetched rows is limited, however many runs exist.
 """
 
 from __future__ import annotations
@@ -51,15 +50,15 @@ PAGE_SIZE: Final = 50
 LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
 HOLDERS_COUNTED: Final = 300
-"""Limit of counting: the units of an image are scattered, and each costs a read of the disk."""
+"""Count units of an image up to this number: they are scattered, and each costs a disk read."""
 _SPANS_AT_ONCE: Final = 400
-"""Spans in one query: SQLite takes 500 parts."""
+"""Number of time spans in one query; SQLite takes 500."""
 _Row = TypeVar("_Row")
 
 
 @dataclass(frozen=True)
 class Page(Generic[_Row]):
-    """Some rows, newest first, with the cursors of the adjacent pages."""
+    """Rows of a page, newest first, with the cursors of the pages before and after."""
 
     rows: tuple[_Row, ...]
     older: PageCursor | None
@@ -68,7 +67,7 @@ class Page(Generic[_Row]):
 
 @dataclass(frozen=True)
 class ImageRecord:
-    """An image that some run was to flash."""
+    """An image that a run had to flash."""
 
     target: str
     name: str
@@ -79,23 +78,23 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class InstalledUnit:
-    """A unit whose last transfer to the target was that of an image."""
+    """A unit whose last transfer to a target was of a certain image."""
 
     serial: str
     part: str
     is_virtual: bool
     run_id: RunId
     state: RunState
-    """How that run ended."""
+    """State of the run with that transfer."""
     begun_at: datetime
     target: str
     is_confirmed: bool
-    """The device confirmed the transfer; else it holds the image, a part of it, or none."""
+    """The device confirmed the transfer; otherwise it may hold a part of the image, or none."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of time."""
+    """A period of time, without its end."""
 
     begin: datetime
     end: datetime
@@ -103,27 +102,27 @@ class Span:
 
 @dataclass(frozen=True)
 class SpanYield:
-    """Units that got a verdict in a span. Golden units are not counted."""
+    """Yield of a period: units with a verdict, without golden units."""
 
     span: Span
     units: int = 0
     passed: int = 0
-    """Units whose last such run is a PASS."""
+    """Number of units whose last run with a verdict is a PASS."""
     first_passed: int = 0
 
     @property
     def share(self) -> float | None:
-        """Units passed in the end, as a share of 1; None without units."""
+        """Yield: units that passed in their last run, from 0 to 1; None without units."""
         return self.passed / self.units if self.units else None
 
     @property
     def first_share(self) -> float | None:
-        """Units passed at their first run."""
+        """First-pass yield, from 0 to 1; None without units."""
         return self.first_passed / self.units if self.units else None
 
 
 class By(StrEnum):
-    """Grouping of causes."""
+    """Grouping of failures."""
 
     SOCKET = "socket"
     RECIPE = "recipe"
@@ -151,26 +150,26 @@ _AUDIT: Final = TypeAdapter(tuple[AuditRow, ...])
 
 
 class Overview:
-    """Every method raises RecordError when the records cannot be read."""
+    """Queries of the pages. Every method raises RecordError if the records cannot be read."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._rollup = Rollup(database)
 
-    def runs(self, chosen: RunFilter, cut: PageCursor, size: int = PAGE_SIZE) -> Page[RunRecord]:
+    def runs(self, chosen: RunFilter, cursor: PageCursor, size: int = PAGE_SIZE) -> Page[RunRecord]:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
-            found = newest_runs(connection, chosen, cut, size + 1)
+            found = newest_runs(connection, chosen, cursor, size + 1)
         query = run_query(schema.run.c.verification_reached.label("verified"))
         # What no station writes is shown nowhere else: reports and `verify` name it.
-        return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cut, size)
+        return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cursor, size)
 
-    def rows(self, chosen: RunFilter, cut: PageCursor, size: int) -> Page[dict[str, Any]]:
-        """The same as a report has them (`Records.table`)."""
+    def rows(self, chosen: RunFilter, cursor: PageCursor, size: int) -> Page[dict[str, Any]]:
+        """A page of runs in the format of reports (`Records.table`)."""
         with self._database.reading() as connection:
-            found = newest_runs(connection, chosen, cut, size + 1)
+            found = newest_runs(connection, chosen, cursor, size + 1)
         run_id = schema.run.c.id
-        return self._page(_ROWS, run_query(VERIFIED).where(run_id.in_(found)), run_id, cut, size)
+        return self._page(_ROWS, run_query(VERIFIED).where(run_id.in_(found)), run_id, cursor, size)
 
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
@@ -179,12 +178,12 @@ class Overview:
             return tuple(connection.execute(query).scalars())
 
     def life(
-        self, serial: str, part: str, cut: PageCursor, size: int = LIFE_SIZE
+        self, serial: str, part: str, cursor: PageCursor, size: int = LIFE_SIZE
     ) -> Page[RunDetails]:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
-            last = newest_runs(connection, RunFilter(serial=serial, part=part), cut, size + 1)
-        page = self._page(_ROWS, select(run_id).where(run_id.in_(last)), run_id, cut, size)
+            last = newest_runs(connection, RunFilter(serial=serial, part=part), cursor, size + 1)
+        page = self._page(_ROWS, select(run_id).where(run_id.in_(last)), run_id, cursor, size)
         with self._database.reading() as connection:
             found = tuple(details_of(connection, run_id.in_([row["id"] for row in page.rows])))
         return Page(found[::-1], page.older, page.newer)
@@ -201,7 +200,7 @@ class Overview:
             return tuple(connection.execute(select(name).distinct().order_by(name)).scalars())
 
     def last_begin(self, chosen: RunFilter) -> datetime | None:
-        """Start of the last run of a filter; None without runs."""
+        """Start time of the last run of a filter; None without runs."""
         run = schema.run.c
         with self._database.reading() as connection:
             last = newest_runs(connection, chosen, PageCursor(), 1)
@@ -212,9 +211,7 @@ class Overview:
     # -- images -----------------------------------------------------------------------------------
 
     def images(self, wanted: str = "") -> tuple[ImageRecord, ...]:
-        """The images with this text in their names or at the beginning of their hashes, the newest
-        first.
-        """
+        """Images whose name contains `wanted` or whose SHA-256 begins with it, newest first."""
         artifact = schema.artifact.c
         query = (
             select(
@@ -237,13 +234,15 @@ class Overview:
         with self._database.reading() as connection:
             return tuple(ImageRecord(**row) for row in connection.execute(query).mappings())
 
-    def holders(self, sha256: str, cut: PageCursor, size: int = PAGE_SIZE) -> Page[InstalledUnit]:
-        """A page of the units whose last transfer was that of the image with this hash."""
+    def holders(
+        self, sha256: str, cursor: PageCursor, size: int = PAGE_SIZE
+    ) -> Page[InstalledUnit]:
+        """A page of the units whose last transfer to a target was of this image."""
         query = _holders(self._artifacts(sha256))
-        return self._page(_HOLDERS, query, schema.run_target.c.id, cut, size)
+        return self._page(_HOLDERS, query, schema.run_target.c.id, cursor, size)
 
     def holder_count(self, sha256: str) -> int:
-        """Number of those units, counted up to `HOLDERS_COUNTED` plus one."""
+        """Number of these units, counted up to `HOLDERS_COUNTED` plus one."""
         target_id = schema.run_target.c.id
         # In the order of the index of the image, or a server would go through the runs of all.
         some = (
@@ -256,7 +255,7 @@ class Overview:
             return int(connection.execute(query).scalar_one())
 
     def _artifacts(self, sha256: str) -> list[int]:
-        """Looked up first: the index of one image is in the order of a page."""
+        """A query of its own: so the index of an image gives its runs in the order of a page."""
         query = select(schema.artifact.c.id).where(schema.artifact.c.sha256 == sha256)
         with self._database.reading() as connection:
             return list(connection.execute(query).scalars())
@@ -264,7 +263,7 @@ class Overview:
     # -- figures over time ------------------------------------------------------------------------
 
     def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> tuple[list[SpanYield], SpanYield]:
-        """Of each of some spans, one right after the other, and of all of them as one."""
+        """Yield of each of these consecutive spans, and of the whole period."""
         whole = Span(spans[0].begin, spans[-1].end)
         found: dict[int, Units] | None = None
         with self._rollup.rolled(chosen) as rolled:
@@ -309,9 +308,7 @@ class Overview:
     def causes(
         self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]] = ()
     ) -> dict[str, Counter[str]]:
-        """Number of runs that each code ended without PASS, in each group; for BY.SHIFT `shifts`
-        are the named spans, in order.
-        """
+        """Number of runs without PASS, by code and group. `shifts` are for BY.SHIFT, in order."""
         run = schema.run.c
         found: dict[str, Counter[str]] = defaultdict(Counter)
         rest = Rest(chosen, [])
@@ -334,8 +331,8 @@ class Overview:
         return dict(found)
 
     def step_times(self, chosen: RunFilter) -> StepTimes:
-        """Number of passed steps by duration in seconds, by the step's name. Durations are rounded
-        to three digits, no finer than a millisecond.
+        """Number of passed steps by name and duration (seconds with three digits, no finer than
+        0.001).
         """
         step = schema.step.c
         rounded = rounded_s()
@@ -361,14 +358,14 @@ class Overview:
 
     def audit(
         self,
-        cut: PageCursor,
+        cursor: PageCursor,
         *,
         event: str | None = None,
         since: datetime | None = None,
         until: datetime | None = None,
         size: int = PAGE_SIZE,
     ) -> Page[AuditRow]:
-        """A page of the audit trails of all stations."""
+        """A page of the audit rows of all stations."""
         audit = schema.audit.c
         query = select(schema.audit, schema.station.c.name.label("station")).join_from(
             schema.audit, schema.station
@@ -388,24 +385,24 @@ class Overview:
             with self._database.reading() as connection:
                 low, high = connection.execute(bounds).one()
             query = query.where(audit.id >= low, audit.id <= high, *within)
-        return self._page(_AUDIT, query, audit.id, cut, size)
+        return self._page(_AUDIT, query, audit.id, cursor, size)
 
     def _page(
         self,
         rows_of: TypeAdapter[tuple[_Row, ...]],
         query: Select[Any],
         row_id: Any,
-        cut: PageCursor,
+        cursor: PageCursor,
         size: int,
     ) -> Page[_Row]:
-        query = cut.of(query.add_columns(row_id.label("cut_id")), row_id)
+        query = cursor.of(query.add_columns(row_id.label("cursor_id")), row_id)
         with self._database.reading() as connection:
             rows = [dict(row) for row in connection.execute(query.limit(size + 1)).mappings()]
         has_more = len(rows) > size
         rows = rows[:size]
-        ids = [row.pop("cut_id") for row in rows]
-        has_older, has_newer = has_more, cut.before is not None
-        if cut.after is not None:
+        ids = [row.pop("cursor_id") for row in rows]
+        has_older, has_newer = has_more, cursor.before is not None
+        if cursor.after is not None:
             rows, ids = rows[::-1], ids[::-1]
             has_older, has_newer = True, has_more
         return Page(
@@ -418,7 +415,7 @@ class Overview:
 def _group_of(
     connection: Connection, by: By, shifts: Sequence[tuple[Span, str]]
 ) -> tuple[ColumnElement[Any], Callable[[Any], str | None]]:
-    """The group's column of a run, and the name of a value; None for no group."""
+    """Column to group runs by, and a function for the name of its values (None: no group)."""
     run = schema.run.c
     if by is By.SHIFT:
         begins = [utc_text(span.begin) for span, _ in shifts]
@@ -441,7 +438,7 @@ def _group_of(
 
 
 def _table(spans: Sequence[Span], first: int) -> Any:
-    """Spans as a table: `number` from `first` on, `begin` and `end`."""
+    """Time spans as a table with the columns `number` (from `first` on), `begin` and `end`."""
     return union_all(
         *(
             select(
@@ -460,7 +457,7 @@ def _within(span: Any) -> ColumnElement[bool]:
 
 
 def _holders(artifacts: Sequence[int]) -> Select[Any]:
-    """The runs that made the last transfer to a target of their unit, with one of these images."""
+    """Runs that made the last transfer to a target of their unit, with one of these images."""
     run, target = schema.run.c, schema.run_target
     write, later_write = schema.device_write.c, schema.device_write.alias()
     later = schema.run.alias()

@@ -1,5 +1,5 @@
-"""Places for heads: beside the station's key, in other folders, on PostgreSQL servers. Copies from
-the first place to the others in the background; no commit waits for them.
+"""Stores chain heads in folders and on PostgreSQL servers; a background thread copies them
+there.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault, Hea
 from flasher.station.records.signatures import SigningKey
 
 RETRY_S: Final = 10.0
-"""After this time a place that could not be reached is tried again, or with the next audit row."""
+"""Interval of attempts to reach a place; a new audit row causes one at once."""
 PATIENCE_S: Final = 5.0
-"""Time limit for a place to return its last head; a lost share may hang for ever."""
+"""Time limit for a place to return its last head; a lost network share may hang forever."""
 _END_S: Final = 2.0
 _SOME: Final = 500
 _RECENT: Final = 100_000
-"""In so many rows before the last one, the row is looked for up to which two places agree."""
+"""Number of rows before the last one in which the common part of two places is searched."""
 _Found = TypeVar("_Found")
 
 
 class Heads(Protocol):
-    """The heads of one station that a place keeps."""
+    """The chain heads of one station that a place stores."""
 
     def append(self, heads: Iterable[ChainHead], key: SigningKey) -> None: ...
 
@@ -42,23 +42,23 @@ class Heads(Protocol):
 
 
 class Place(Protocol):
-    """A place for heads. All methods raise FlasherError when it cannot be reached."""
+    """A folder or server that stores chain heads. Methods raise FlasherError."""
 
     @property
     def shown(self) -> str:
-        """For messages; without a password."""
+        """Name for messages, without a password."""
 
     def of(self, station: str, records_id: str) -> Heads: ...
 
     def stations(self, records_id: str) -> Iterable[str]:
-        """The stations of which heads of these records are kept."""
+        """Stations with heads of these records in this place."""
 
     def holds(self, location: Location) -> bool:
-        """True when the place is in the records themselves."""
+        """True if the place is the database of the records."""
 
 
 class FolderPlace:
-    """A folder of this computer, or a share of another one."""
+    """A folder of this computer, or a network share."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -81,13 +81,13 @@ class FolderPlace:
 
 
 def place_of(text: str) -> Place:
-    """The place of a setting: a folder, or a PostgreSQL URL. Raises UsageError."""
+    """Parse a setting: a folder, or a PostgreSQL URL. Raises UsageError."""
     if "://" not in text:
         return FolderPlace(Path(text))
     location = locate(text, Path())
     if location.url.get_backend_name() != "postgresql":
         raise UsageError(
-            f"{location.shown} is no place for heads.",
+            f"{location.shown} is neither a folder nor a PostgreSQL server.",
             remedy="Name a folder, or postgresql://USER@HOST/NAME.",
         )
     try:
@@ -103,16 +103,16 @@ def place_of(text: str) -> Place:
 
 
 def file_name(station: str, records_id: str, suffix: str) -> str:
-    """The name of a station's file for these records: unlike for unlike stations."""
+    """File name for a station and its records; different names never collide."""
     plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
     mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
     return f"{plain}-{mark}{suffix}"
 
 
-def patiently(
+def call_all(
     works: Sequence[Callable[[], _Found]], limit_s: float = PATIENCE_S
 ) -> list[_Found | FlasherError]:
-    """The result or error of each call; they run side by side, for `limit_s` at most."""
+    """Make calls in parallel threads; returns their results or errors after at most `limit_s`."""
     found: dict[int, _Found | FlasherError] = {}
 
     def run(at: int, work: Callable[[], _Found]) -> None:
@@ -136,8 +136,8 @@ def patiently(
 
 
 class Copying:
-    """Copies the heads beside the key to one other place, in a thread of its own. Heads that could
-    not be copied are copied when the place can be reached again.
+    """Copies heads from the key's folder to another place in a background thread, and tries again
+    while the place cannot be reached.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Copying:
         self._idle = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="heads")
         self.fault = ""
-        """Why the place has not the last heads; empty while it has."""
+        """Reason why the place lacks the last heads; "" if it has them."""
 
     @property
     def shown(self) -> str:
@@ -171,16 +171,16 @@ class Copying:
         self.wake()
 
     def wake(self) -> None:
-        """There are more heads."""
+        """Start copying: there are new heads."""
         self._idle.clear()
         self._wake.set()
 
     def wait(self, limit_s: float = _END_S) -> bool:
-        """Wait until the place has all heads, or cannot be reached; False when it takes longer."""
+        """Wait until all heads are copied or the place cannot be reached. False after `limit_s`."""
         return self._idle.wait(limit_s)
 
     def end(self) -> None:
-        """Copy what there is, unless it takes long."""
+        """Copy the remaining heads within a time limit, and stop."""
         self._is_ending = True
         self.wake()
         self._thread.join(_END_S)
@@ -221,7 +221,7 @@ class Copying:
         self._note_known()
 
     def _note_known(self) -> None:
-        """Remember that heads are kept there from now on."""
+        """Remember that the place has heads, so that their loss is noticed."""
         known = self._known_places()
         if self.shown not in known:
             self._known.write_text("".join(f"{each}\n" for each in [*known, self.shown]), "utf-8")
@@ -230,13 +230,13 @@ class Copying:
         return self._known.read_text("utf-8").splitlines() if self._known.exists() else []
 
     def _find(self) -> Position:
-        """The position to continue from. Raises RecordError for a place that lost its heads."""
+        """Position from which to copy. Raises RecordError if the place lost its heads."""
         last = self._target.last()
         if last is None and self.shown in self._known_places():
             raise RecordError(
-                f"The heads that were kept in {self.shown} are gone.",
-                cause="the heads that were kept there are gone: is it the right share?",
-                remedy=f"Mount the share. To begin anew there, delete {self._known}.",
+                f"The heads that were stored in {self.shown} are missing.",
+                cause="the heads that were stored there are missing; another share may be mounted",
+                remedy=f"Mount the share. To start again there, delete {self._known}.",
             )
         if last is None:
             return Position()
@@ -260,9 +260,9 @@ class Copying:
 def lasts(
     places: Sequence[Place], station: str, records_id: str
 ) -> list[tuple[Place, ChainHead | FlasherError | None]]:
-    """The last head of each place, or its error."""
+    """The last head of each place (None without one), or its error."""
 
     def asked(place: Place) -> Callable[[], Any]:
         return lambda: place.of(station, records_id).last()
 
-    return list(zip(places, patiently([asked(each) for each in places]), strict=True))
+    return list(zip(places, call_all([asked(each) for each in places]), strict=True))

@@ -1,8 +1,6 @@
-"""Checks a PASS against its own bus trace: requests, answers, and the identity of one unit from
-first answer to last.
+"""Checks a PASS against its own bus trace: requests, answers, and that one unit answered all along.
 
-Another process than the records' writes the trace, frame by frame; this check reads its bytes with
-code that took no part in the run.
+Another process wrote the trace, frame by frame; this check reads its bytes independently.
 """
 
 from __future__ import annotations
@@ -37,39 +35,37 @@ from flasher.station.records.model import (
 )
 
 _BURST_QUIET_S: Final = 0.3
-"""Silence after which an announcement begins another burst."""
+"""Silence after which an announcement begins a new burst."""
 _LEFTOVER_S: Final = 0.25
-"""Time after a transfer request in which announcements may still arrive."""
+"""Time after a transfer request in which delayed announcements may arrive."""
 _STALL_S: Final = 3.0
-"""The same where nothing came between, as frames that waited in a stalled computer bear the time at
-which they were read."""
+"""Silence of a new burst if the target has not answered since the last one: after a stall of the
+computer, frames have the time at which they were read."""
 _IDENTITY: Final = ("model", "serial_number", "hardware_version")
 
 
 @dataclass
 class Restarts:
-    """Finds announcements of one target's bootloader that nothing in the trace has caused. Times
-    are seconds on the trace's clock.
-    """
+    """Finds bootloader announcements of one target that nothing in the trace caused."""
 
     uncaused: list[float] = field(default_factory=list)
     is_identified: bool = False
-    """It has answered, or got an update command: from now on it has to stay."""
+    """True after an answer or an update command: the same unit must remain from then on."""
     _has_acted: bool = False
-    """The tool has sent something after which it may restart."""
+    """The tool has sent a message that may cause a restart."""
     _is_running: bool = False
-    """It has answered since the last announcement."""
+    """The application has answered since the last announcement."""
     _is_due: bool = False
-    """A burst follows what was sent, at any time."""
+    """A message was sent that causes a restart, at any time."""
     _has_update_command: bool = False
-    """An update command was sent, and no application has answered since."""
+    """An update command was sent, and the application has not answered since."""
     _requested_at: float | None = None
     _announced_at: float | None = None
     _is_noted: bool = False
-    """The burst that goes on is among them."""
+    """The present burst is already in `uncaused`."""
 
     def sent(self, message: Message, row: object) -> None:
-        """The tool sent something to it."""
+        """Process a message from the tool to the target."""
         self._has_acted = self._has_acted or message.mode == Mode.WRITE
         if isinstance(row, messages.UpdateCommand):
             self.is_identified = self._has_update_command = True
@@ -80,19 +76,19 @@ class Restarts:
             self._requested_at = None
 
     def powered_up(self, at_s: float) -> None:
-        """It was heard before it is identified, and its bootloader announces itself: it has to be
-        the unit of the label from the beginning on.
+        """Process a bootloader announcement before the unit was identified: the unit of the label
+        should have been there from the beginning.
         """
         if not self._has_acted:
             self.uncaused.append(at_s)
 
     def answered(self) -> None:
-        """Its application named its version."""
+        """Process an answer of the application with its version."""
         self.is_identified = self._is_running = True
         self._is_due = self._has_update_command = False
 
     def take(self, row: object, at_s: float) -> None:
-        """Its bootloader sent something."""
+        """Process a message from the bootloader."""
         if isinstance(row, messages.RequestTransfer) and self._has_update_command:
             self._requested_at = at_s
         if not isinstance(row, messages.BootVersion):
@@ -117,7 +113,7 @@ class Restarts:
 
 
 class _Usual(NamedTuple):
-    """A target without settings of a product: the records hold none."""
+    """A target without product settings: the records do not store them."""
 
     target: Target
     profile: Profile
@@ -125,7 +121,7 @@ class _Usual(NamedTuple):
 
 @dataclass
 class TraceOfTarget:
-    """The events of one target in a trace."""
+    """Requests and answers of one target in a trace."""
 
     target: Target
     packets: dict[int, bytes] = field(default_factory=dict)
@@ -135,26 +131,26 @@ class TraceOfTarget:
     is_complete: bool = False
     """The device confirmed that image."""
     version: str | None = None
-    """Version in its last answer."""
+    """Firmware version in the last answer."""
     serial: str = ""
-    """Serial number in its last answer; empty without one."""
+    """Serial number in the last answer; "" without one."""
     written_serial: str | None = None
     answers: list[bytes] = field(default_factory=list)
     """Data of all unknown answers: products may have queries of their own."""
     restarts: Restarts = field(default_factory=Restarts)
     changes: list[str] = field(default_factory=list)
-    """Identity fields that changed to a value that the tool had not written."""
+    """Identity fields that changed although the tool did not write them."""
     _identity: dict[str, str] = field(default_factory=dict)
-    """Identity fields of its last answer."""
+    """Identity fields of the last answer."""
     _written: dict[str, set[str]] = field(default_factory=dict)
-    """Values that the tool has written to these fields."""
+    """Values that the tool wrote to identity fields."""
 
     def __post_init__(self) -> None:
         self._watcher = TargetWatcher(_Usual(self.target, Profile(self.target)))
 
     def watch(self, frame: Frame, at_s: float, gap_s: float) -> None:
-        """Any frame before it is identified, `gap_s` after the last one; the computer may have
-        stood still meanwhile.
+        """Process any frame before the unit is identified. `gap_s` is the time since the last
+        frame: the computer may have stalled.
         """
         watcher = self._watcher
         if BLIND_S < gap_s < _STALL_S:
@@ -167,7 +163,7 @@ class TraceOfTarget:
             self.restarts.powered_up(at_s)
 
     def take(self, message: Message, at_s: float) -> None:
-        """One intact message, of the tool or of the device."""
+        """Process a complete message of the tool or the device."""
         decoded = catalogue.decode(message)
         row = messages.decode(message)
         if message.can_id == self.target.request_id:
@@ -218,8 +214,8 @@ class TraceOfTarget:
         self.is_complete = False
 
     def names(self, version: str) -> bool:
-        """True when the device answered this version last; or at all, where no row of the
-        documents says how it answers.
+        """True if the last answer has this version; without one (a product with queries of its
+        own), if any unknown answer contains it.
         """
         if self.version is not None:
             return self.version == version
@@ -229,7 +225,7 @@ class TraceOfTarget:
 def traces_of_targets(
     targets: Iterable[str], frames: Iterable[tuple[float, Frame]]
 ) -> dict[str, TraceOfTarget]:
-    """Read the events of these targets from the frames of a trace."""
+    """Collect requests and answers of these targets from the frames of a trace."""
     traces = {name: TraceOfTarget(TARGETS[name]) for name in targets if name in TARGETS}
     # The CAN ids on which a node speaks.
     ids_of = {
@@ -262,7 +258,7 @@ def traces_of_targets(
 
 
 def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator[str]:
-    """Where the trace of a PASS contradicts the records."""
+    """Contradictions between the trace of a PASS and the records, as sentences."""
     run = details.run
     flashed = {write.target for write in details.writes if write.what == FLASH}
     for target in details.targets:
@@ -277,21 +273,21 @@ def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Ite
             answered = printable(trace.version or "none")
             yield f"the {target.target} answers version {answered}, not {target.version}"
         if trace.serial and trace.serial != run.serial:
-            yield f"it is of the unit {printable(trace.serial)}, not of {printable(run.serial)}"
+            yield f"it is the trace of {printable(trace.serial)}, not of {printable(run.serial)}"
         for name in dict.fromkeys(trace.changes):
-            yield f"the {name} of the {target.target} changed: it is of two units"
+            yield f"the {name} of the {target.target} changed: it is the trace of two units"
     yield from _restarts(details, traces)
     for write in details.writes:
         trace = traces.get(write.target)
         if write.what == SERIAL_NUMBER and trace is not None:
             if trace.written_serial != run.serial:
-                yield f"the serial number {printable(run.serial)} is not written in it"
+                yield f"the serial number {printable(run.serial)} is not written in the trace"
             if not trace.serial:
-                yield f"the serial number {printable(run.serial)} is not read back in it"
+                yield f"the serial number {printable(run.serial)} is not read back in the trace"
 
 
 def _restarts(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator[str]:
-    """Where a bootloader announced itself without a cause that trace or records hold."""
+    """Announcements of a bootloader without a cause in trace or records."""
     measured = {each.name: each for step in details.steps for each in step.measurements}
     is_switched = any(
         step.name == StepName.RESTART.value and step.text == BY_POWER for step in details.steps
@@ -313,8 +309,8 @@ def _restarts(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator
 
 def _image(target: TargetRecord, trace: TraceOfTarget) -> Iterator[str]:
     if trace.sent_sha256 is None:
-        yield f"it holds no whole transfer to the {target.target}"
+        yield f"it holds no complete transfer to the {target.target}"
     elif trace.sent_sha256 != target.image_sha256:
-        yield f"it carries another image for the {target.target}, of SHA-256 {trace.sent_sha256}"
+        yield f"it holds another image for the {target.target}, of SHA-256 {trace.sent_sha256}"
     elif not (trace.is_complete or (target.version and trace.names(target.version))):
         yield f"the {target.target} neither says complete nor names its version"

@@ -1,4 +1,4 @@
-"""Reading the records: units, runs with their parts, tables and figures for reports."""
+"""Reads the records: units, runs with their parts, tables and figures for reports."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
 
 
 class Records:
-    """Queries of the records. Every method raises RecordError when they cannot be read."""
+    """Queries of the records. Every method raises RecordError if they cannot be read."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._rollup = Rollup(database)
 
     def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
-        """The runs of a filter, for reports over many of them."""
+        """The runs of a filter, for reports."""
         query = filtered(run_query(VERIFIED), chosen).order_by(schema.run.c.id)
         with self._database.reading() as connection:
             return [
@@ -67,7 +67,7 @@ class Records:
         raise NotFoundError(f"There is no run {run_id}.")
 
     def units(self, serial: str) -> tuple[UnitLife, ...]:
-        """The units with this serial number, one a part: the whole life of each."""
+        """All units with this serial number, one per part number, each with all its runs."""
         unit = schema.unit.c
         query = select(unit.id, unit.part).where(unit.serial == serial).order_by(unit.id)
         with self._database.reading() as connection:
@@ -79,7 +79,7 @@ class Records:
             return tuple(lives)
 
     def known(self, part: str, serials: Collection[str]) -> set[str]:
-        """Those of some serial numbers that units of a part have."""
+        """Those of `serials` that belong to recorded units of a part."""
         unit = schema.unit.c
         query = select(unit.serial).where(unit.part == part)
         with self._database.reading() as connection:
@@ -90,7 +90,7 @@ class Records:
             return {serial for some in found for serial in some}
 
     def unit(self, serial: str, part: str | None = None) -> UnitLife:
-        """The one unit with this serial number. Raises NotFoundError, also for several parts."""
+        """The unit with this serial number. Raises NotFoundError, also if several parts have it."""
         found = [life for life in self.units(serial) if part in (None, life.part)]
         shown = printable(serial)
         if not found:
@@ -114,7 +114,7 @@ class Records:
             if rolled is not None:
                 units = rolled.all_units()
                 if units is not None:
-                    rests = rolled.ended(ended)
+                    rests = rolled.add_ends(ended)
         first: dict[int, str] = {}
         last: dict[int, str] = {}
         for rest in rests:
@@ -148,27 +148,23 @@ class Records:
             return tuple(connection.execute(query).scalars())
 
     def head_of(self, run_id: RunId) -> ChainHead | None:
-        """The signed audit row that vouches for a finished run; None where there is none."""
+        """The signed audit row of a finished run; None without one."""
         with self._database.reading() as connection:
             return chain.head_of(connection, run_id)
 
     def record_sha256(self, run_id: RunId) -> str:
-        """The hash of a run with all that belongs to it: over the digests that its audit row has.
-        Raises KeyError for a run that is not there.
-        """
+        """SHA-256 over the digests of all parts of a run. Raises KeyError for an unknown run."""
         with self._database.reading() as connection:
             return chain.digest(chain.digests_of(connection, [run_id])[run_id])
 
     def content_of(self, run_id: RunId) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The rows of a finished run by what they are, and the audit row that vouches for them.
-        Raises KeyError for a run that is not there.
-        """
+        """The rows of a finished run by part, and its audit row. Raises KeyError."""
         with self._database.reading() as connection:
             content = chain.contents_of(connection, [run_id])[run_id]
             return content, chain.ending_of(connection, run_id)
 
     def unit_kinds(self) -> frozenset[bool]:
-        """Whose runs there are: True for virtual units, False for real ones."""
+        """Kinds of units with runs: True for virtual units, False for real ones."""
         is_virtual = schema.run.c.is_virtual
         with self._database.reading() as connection:
             return frozenset(
@@ -181,8 +177,8 @@ class Records:
 
 
 def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
-    """The runs of a condition with their parts, in the order of their ids, without runs that refer
-    to missing rows. Raises ValidationError for values that no station writes.
+    """Runs that meet an SQL condition, with their parts, in order of ids; runs that refer to
+    missing rows are left out. Raises ValidationError for values that no station writes.
     """
     run_ids = connection.execute(select(schema.run.c.id).where(chosen).order_by(schema.run.c.id))
     for some in batches(run_ids.scalars().all()):
@@ -192,12 +188,12 @@ def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
 
 
 def is_whole(content: Mapping[str, Any]) -> bool:
-    """True where what the run names is there."""
+    """True if all rows that the run refers to exist."""
     return all(content[name] is not None for name in _NAMED)
 
 
 def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) -> RunDetails:
-    """A run of its rows. Raises ValidationError; KeyError, TypeError for rows that are none."""
+    """Build a run from its rows. Raises ValidationError, KeyError or TypeError for invalid rows."""
     run, unit = content["run"], content["unit"]
     begun_s, ended_s = run["begun_monotonic_s"], run["ended_monotonic_s"]
     images = {each["id"]: each for each in content["artifacts"] if each is not None}
@@ -240,7 +236,7 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
 
 
 def run_query(verified: Any) -> Select[Any]:
-    """Runs with the columns of `RunRecord`."""
+    """Query of runs with the columns of `RunRecord`."""
     run = schema.run.c
     return (
         select(

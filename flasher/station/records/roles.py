@@ -1,7 +1,8 @@
 # ruff: noqa: S608  names are quoted by the dialect, all else is written here
-"""Who may do what to records on a PostgreSQL server. A station adds records and ends its runs, a
-reader reads; neither can delete, or change a table, a trigger or a right. The owner of the tables
-can, so no station is to be the owner.
+"""Grants the rights of stations and readers on a PostgreSQL server.
+
+A station adds records and ends its runs, a reader reads; neither can delete, or change a table, a
+trigger or a right. The owner of the tables can, so no station should be the owner.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from flasher.station.records.schema import (
 )
 
 _ENDED_LATER: Final = (run, run_target, device_write)
-"""Their rows are completed while a run goes on; triggers hold what may change in them."""
+"""Tables whose rows change during a run; triggers limit the changes."""
 _FORBIDDEN: Final = ("DELETE", "TRUNCATE", "TRIGGER")
 
 
 def check_roles(location: Location, station: str, reader: str) -> None:
-    """Raises UsageError for records in a file, or one role for both."""
+    """Raises UsageError for records in a file, or the same role for both."""
     if location.url.get_backend_name() != "postgresql":
         raise UsageError(
-            "Roles are for records on a PostgreSQL server.",
+            "Only records on a PostgreSQL server have roles.",
             where=location.shown,
-            remedy="Who may read or write a file is a matter of its folder's rights.",
+            remedy="For a file, set the rights of its folder.",
         )
     if station == reader:
         raise UsageError(
@@ -43,11 +44,10 @@ def check_roles(location: Location, station: str, reader: str) -> None:
 
 
 def grant_roles(database: Database, station: str, reader: str) -> tuple[str, ...]:
-    """Make the two roles where they are not there, and give each exactly its rights; the names of
-    those that were made, which have no password yet.
+    """Create missing roles, grant each exactly its rights; returns created ones (no password yet).
 
-    Raises UsageError for a role that could get around the rights; RecordError where the user of the
-    URL may not do it.
+    Raises UsageError for a role with too many rights, RecordError if the user may not grant
+    them.
     """
     with database.writing() as connection:
         made = tuple(name for name in (station, reader) if _make(connection, name))
@@ -71,7 +71,7 @@ def grant_roles(database: Database, station: str, reader: str) -> tuple[str, ...
 
 
 def grant_again(connection: Connection) -> None:
-    """Give the roles of stations and readers their rights on tables that were added since."""
+    """Grant existing roles their rights on tables that an upgrade added."""
     quoted = connection.dialect.identifier_preparer.quote
     schema = quoted(connection.execute(text("SELECT current_schema()")).scalar_one())
 
@@ -90,7 +90,7 @@ def grant_again(connection: Connection) -> None:
 
 
 def _grants(schema: str, *, readers: str, stations: str) -> Iterator[str]:
-    """Grants for `readers` (stations too) and for `stations`; both may be empty."""
+    """GRANT statements for `readers` (stations included) and `stations`; both may be empty."""
     if readers:
         yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {readers}"
     if stations:
@@ -105,7 +105,7 @@ def _names(tables: Iterable[object]) -> str:
 
 
 def _make(connection: Connection, role: str) -> bool:
-    """Make a role that may log in; False when it is there already."""
+    """Create a role that may log in; False if it exists."""
     known = text("SELECT 1 FROM pg_roles WHERE rolname = :role")
     if connection.execute(known, {"role": role}).first() is not None:
         return False
@@ -115,7 +115,7 @@ def _make(connection: Connection, role: str) -> bool:
 
 
 def _check(connection: Connection, role: str) -> None:
-    """A right may come by another way: a superuser, an owner, a role that it is a member of."""
+    """Raises UsageError for a role with rights by another way: as superuser, owner, or member."""
     rights = " OR ".join(f"has_table_privilege(:role, oid, '{right}')" for right in _FORBIDDEN)
     query = text(
         f"SELECT has_schema_privilege(:role, current_schema(), 'CREATE') OR EXISTS (SELECT 1"

@@ -1,9 +1,8 @@
-"""Adds up the runs of each day, so that pages of figures do not read all runs of all years.
+"""Stores daily sums of runs, so that pages with figures need not read the runs of all years.
 
-The sums are in a file of their own beside the attachments, up to one run (`Rolled.run`); what a
-page asks for besides, later runs and days that its period cuts, is read from the records. The file
-is derived from the records: it is made anew where it does not fit them, nothing that is signed or
-verified depends on it, and it may be deleted at any time.
+The sums are in a file beside the attachments and cover runs up to `Rolled.run`. Later runs, and
+days that a period covers partly, are read from the records. The file is rebuilt if it does not fit
+the records; nothing that is signed or verified depends on it, and it may be deleted.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ _LOG: Final = logging.getLogger(__name__)
 _LAYOUT: Final = 2
 _RUNS_AT_ONCE: Final = 5000
 _PAUSE_S: Final = 0.2
-"""Pause that leaves the computer to others."""
+"""Pause between batches, for other programs."""
 _UNTIL_NEXT_S: Final = 600.0
 _SETTLED: Final = timedelta(hours=1)
-"""Younger runs are not added: on a server, one with a lower id may still be on its way."""
+"""Younger runs are not added: on a server, a run with a lower id may not be committed yet."""
 WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
 _TABLES: Final = """
 CREATE TABLE state (content TEXT);
@@ -69,19 +68,18 @@ CREATE TABLE times (
     PRIMARY KEY (period, recipe, socket)
 ) WITHOUT ROWID;
 """
-"""`history`: how many units have the same judged runs, one after the other: the first one, and the
-others as text. `bad`: runs that ended without PASS. `passed`: how long runs with PASS took, in
-order. `times`: how often each time of a step came in a day (its number) or month.
-"""
+"""`history`: number of units with the same runs with a verdict: the first run, and the others as
+text. `bad`: runs that ended without PASS. `passed`: durations of runs with PASS, in order. `times`:
+number of each duration of a step, by day (its number) or month."""
 
 
 _NOWHERE: Final = -1
-"""The place of a run outside every span."""
+"""Index of a run outside every span."""
 ALL_SPANS: Final = -2
 
 
 class Judged(NamedTuple):
-    """A run with a verdict, in its day."""
+    """A run with a verdict, and the number of its day."""
 
     day: int
     recipe: int
@@ -90,11 +88,11 @@ class Judged(NamedTuple):
 
 
 History = tuple[Judged, ...]
-"""The judged runs of a unit, in their order. Golden ones are left out."""
+"""Runs of a unit with a verdict, in order, without golden ones."""
 
 
 class Day(NamedTuple):
-    """A day of the local clock, in UTC."""
+    """A day in local time; begin and end in UTC."""
 
     number: int
     begin: str
@@ -103,15 +101,15 @@ class Day(NamedTuple):
 
 
 StepTimes = dict[str, Counter[float]]
-"""By the name of a step: how often each of its times came."""
+"""Number of each duration in seconds, by step name."""
 _Times = dict[str, Counter[str]]
-"""The same, with the times as JSON has them."""
+"""The same with durations as text, for JSON."""
 _ALL: Final = (0, 0)
-"""Replaces recipe and socket: the times of all."""
+"""Recipe and socket 0: the times of all."""
 
 
 def rounded_s() -> ColumnElement[float]:
-    """Duration of a step, to three digits and no finer than a millisecond."""
+    """Duration of a step, rounded to three digits and at most to a millisecond."""
     duration_s = schema.step.c.duration_s
     return case(
         (duration_s < 1, func.round(duration_s * 1000) / 1000),
@@ -122,7 +120,7 @@ def rounded_s() -> ColumnElement[float]:
 
 @dataclass(frozen=True)
 class Rest:
-    """Runs that the sums do not include: those of a filter, with further conditions."""
+    """Runs that the sums do not include: those of a filter and further conditions."""
 
     chosen: RunFilter
     conditions: list[ColumnElement[bool]]
@@ -130,11 +128,11 @@ class Rest:
 
 @dataclass
 class EndCounts:
-    """Counts of how runs ended."""
+    """Counts of runs by how they ended."""
 
     by_state: Counter[str] = field(default_factory=Counter)
     failures: Counter[str] = field(default_factory=Counter)
-    """By their codes."""
+    """Number of runs by code."""
     virtual_runs: int = 0
     durations_s: list[float] = field(default_factory=list)
     """Durations of runs with PASS."""
@@ -142,7 +140,7 @@ class EndCounts:
     def add(
         self, state: str, code: str, is_virtual: int, duration_s: float | None, runs: int = 1
     ) -> None:
-        """Count so many runs without PASS, or one with it."""
+        """Count `runs` runs without PASS, or one with it."""
         self.by_state[state] += runs
         self.virtual_runs += bool(is_virtual) * runs
         if state == RunState.PASS.value:
@@ -153,7 +151,7 @@ class EndCounts:
 
 @dataclass
 class Units:
-    """Numbers of units: judged, passed at the last run, passed at the first run."""
+    """Number of units: with a verdict, passed in the last run, passed in the first run."""
 
     units: int = 0
     passed: int = 0
@@ -161,7 +159,7 @@ class Units:
 
 
 class Rollup:
-    """The file with the sums of the records in a database."""
+    """File with the daily sums of a database of records."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -170,8 +168,9 @@ class Rollup:
     # -- adding up --------------------------------------------------------------------------------
 
     def add(self, now: datetime) -> bool:
-        """Add some of the runs that are missing; True where more are. Another process may do the
-        same. Raises RecordError when the records cannot be read, sqlite3.Error, OSError.
+        """Add a batch of missing runs; True if more are missing. Another process may do the same.
+
+        Raises RecordError if the records cannot be read, sqlite3.Error, OSError.
         """
         self._file.touch(0o600)
         try:
@@ -190,7 +189,7 @@ class Rollup:
             sums.execute("PRAGMA synchronous = NORMAL")
             sums.execute("BEGIN IMMEDIATE")
             with self._database.reading() as connection:
-                begun = _begun(sums, connection)
+                begun = _last_added(sums, connection)
                 if begun is None:
                     _begin_anew(sums)
                     begun = 0
@@ -204,7 +203,7 @@ class Rollup:
         return last == begun + _RUNS_AT_ONCE
 
     def keep_up(self, now: Callable[[], datetime], wait: Callable[[float], object]) -> None:
-        """Add missing runs, and again after each day; never returns."""
+        """Add missing runs forever, at intervals."""
         while True:
             has_more = False
             try:
@@ -218,7 +217,7 @@ class Rollup:
 
     @contextmanager
     def rolled(self, chosen: RunFilter) -> Iterator[Rolled | None]:
-        """The sums for a filter; None without any. Raises RecordError."""
+        """The sums for a filter; None if it selects more than they hold. Raises RecordError."""
         is_counted = (chosen.lot, chosen.serial, chosen.search, chosen.state, chosen.code)
         if any(each is not None for each in is_counted) or not self._file.exists():
             yield None
@@ -234,17 +233,17 @@ class Rollup:
                     yield _rolled(sums, connection, chosen)
                 except (sqlite3.Error, zlib.error, ValueError) as error:
                     raise RecordError(
-                        "The sums of days are damaged.",
+                        "The file with the daily sums is damaged.",
                         where=printable(str(self._file)),
                         cause=printable(str(error)),
-                        remedy="Delete this file: it is made anew from the records.",
+                        remedy="Delete the file: it is made again from the records.",
                     ) from error
 
 
 def _rolled(sums: sqlite3.Connection, connection: Connection, chosen: RunFilter) -> Rolled | None:
     try:
         sums.execute("BEGIN")
-        run = _begun(sums, connection)
+        run = _last_added(sums, connection)
         days = _Days(Day(*row) for row in sums.execute("SELECT * FROM day"))
     except sqlite3.Error:  # not whole, or not for this user: the records themselves are read
         return None
@@ -260,8 +259,8 @@ def _rolled(sums: sqlite3.Connection, connection: Connection, chosen: RunFilter)
 
 
 def _state(connection: Connection, run: int) -> dict[str, Any]:
-    """Tells the records and the last run that was added; the newest audit row changes in records
-    that were restored, and go on from there.
+    """Identifies the records and the last added run. The newest audit row differs in a restored
+    copy of the records that continued from there.
     """
     audit = schema.audit.c
     newest = select(audit.id, audit.hash).order_by(audit.id.desc()).limit(1)
@@ -272,8 +271,8 @@ def _state(connection: Connection, run: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _begun(sums: sqlite3.Connection, connection: Connection) -> int | None:
-    """The last run that was added; None where the sums are not those of these records."""
+def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
+    """Id of the last added run; None if the sums belong to other records."""
     if not sums.execute("SELECT 1 FROM sqlite_master WHERE name = 'state'").fetchone():
         return None
     row = sums.execute("SELECT content FROM state").fetchone()
@@ -298,7 +297,7 @@ def _begin_anew(sums: sqlite3.Connection) -> None:
 
 
 def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
-    """The last run that may be added: its day is over and every run before it has ended."""
+    """Id of the last run that may be added: its day is over and every earlier run has ended."""
     run = schema.run.c
     today = datetime.combine(now.astimezone(), time()).astimezone()
     over = utc_text(min(today, now - _SETTLED))
@@ -317,7 +316,7 @@ def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
 
 
 class _Addition:
-    """Adds the runs after `first`, up to `last`."""
+    """Adds runs after `first`, up to `last`."""
 
     def __init__(
         self, sums: sqlite3.Connection, connection: Connection, first: int, last: int
@@ -429,7 +428,7 @@ class _Addition:
 
 
 class _Days:
-    """The days that have runs, in order; they do not overlap."""
+    """Days with runs, in order, without overlap."""
 
     def __init__(self, days: Iterable[Day]) -> None:
         self._days = sorted(days, key=lambda day: day.begin)
@@ -448,9 +447,7 @@ class _Days:
         return day
 
     def make(self, begun_at: str) -> Day:
-        """The day of a moment, on the clock of this computer; where that was set to another time
-        zone, what other days leave of it.
-        """
+        """Add the local day of a time; after a change of the time zone, what other days leave."""
         date = utc_moment(begun_at).astimezone().date()
         begin, end = (
             utc_text(datetime.combine(each, time()).astimezone())
@@ -474,7 +471,7 @@ class _Days:
 def _judged_runs(
     connection: Connection, units: Iterable[int], *conditions: ColumnElement[bool]
 ) -> Iterator[Any]:
-    """The judged runs of some units, those of each in their order."""
+    """Runs with a verdict of some units, in order for each unit."""
     run = schema.run.c
     query = (
         select(run.id, run.unit_id, run.recipe_id, run.socket_id, run.state, run.begun_at)
@@ -509,7 +506,7 @@ def _merge(into: _Times, times: Mapping[str, Mapping[str, int]]) -> None:
 
 @dataclass(frozen=True)
 class Rolled:
-    """The sums for a filter, up to the run `run`."""
+    """The sums for a filter, up to the run with the id `run`."""
 
     _sums: sqlite3.Connection
     _connection: Connection
@@ -517,7 +514,7 @@ class Rolled:
     run: int
     _days: _Days
     _recipes: set[int] | None
-    """The ids that the filter allows; None: it allows all."""
+    """Recipe ids that the filter allows; None: all."""
     _sockets: set[int] | None
     _since: str = field(init=False)
     _until: str = field(init=False)
@@ -533,7 +530,7 @@ class Rolled:
         )
 
     def _whole(self, cuts: Sequence[str] = ()) -> list[Day]:
-        """The days of the period that neither it nor these moments cut; they are in order."""
+        """Days entirely inside the period, not cut by these times; in order."""
         return [
             day
             for day in self._days
@@ -543,13 +540,13 @@ class Rolled:
 
     @property
     def tail(self) -> Rest:
-        """The runs that are not added yet."""
+        """Runs that were added to the records later."""
         within = begun_in(self.chosen, beside_index(schema.run.c.begun_at))
         chosen = replace(self.chosen, since=None, until=None)
         return Rest(chosen, [schema.run.c.id > self.run, *within])
 
     def _cut(self, whole: Collection[Day]) -> Iterator[Rest]:
-        """The runs of days that are in part in the period, or that something cuts."""
+        """Runs of days that are partly in the period, or cut."""
         kept = {day.number for day in whole}
         condition = beside_index(schema.run.c.id) <= self.run
         for day in self._days:
@@ -560,7 +557,7 @@ class Rolled:
             yield Rest(replace(self.chosen, since=since, until=until), [condition])
 
     def bad(self, *columns: str) -> Iterator[Any]:
-        """How often runs ended without PASS, by columns of these runs, but for the `tail`."""
+        """Numbers of runs without PASS, by columns of the table `bad`, without the `tail`."""
         allowed = (
             None if ids is None else json.dumps(sorted(ids))
             for ids in (self._recipes, self._sockets)
@@ -576,7 +573,7 @@ class Rolled:
         )
 
     def _periods(self, whole: Sequence[Day]) -> Iterator[str]:
-        """Months and days that make up these days."""
+        """Months and days that make up whole days."""
         in_all = Counter(day.month for day in self._days)
         months = {
             month for month, days in Counter(day.month for day in whole).items()
@@ -585,11 +582,11 @@ class Rolled:
         yield from months
         yield from (str(day.number) for day in whole if day.month not in months)
 
-    def ended(self, ended: EndCounts) -> list[Rest]:
-        """Add how runs ended; what the sums are without."""
+    def add_ends(self, counts: EndCounts) -> list[Rest]:
+        """Add counts of how runs ended; returns the runs that are not included."""
         whole = self._whole()
         for state, code, is_virtual, runs in self.bad("state", "code", "is_virtual"):
-            ended.add(state, code, is_virtual, None, runs)
+            counts.add(state, code, is_virtual, None, runs)
         for some in batches(self._periods(whole)):
             for *place, is_virtual, packed in self._sums.execute(
                 "SELECT recipe, socket, is_virtual, durations_s FROM passed"
@@ -598,9 +595,9 @@ class Rolled:
             ):
                 if self._allows(*place):
                     durations_s = _seconds(packed)
-                    ended.durations_s.extend(durations_s)
-                    ended.by_state[RunState.PASS.value] += len(durations_s)
-                    ended.virtual_runs += is_virtual * len(durations_s)
+                    counts.durations_s.extend(durations_s)
+                    counts.by_state[RunState.PASS.value] += len(durations_s)
+                    counts.virtual_runs += is_virtual * len(durations_s)
         only_passed = beside_index(schema.run.c.state) == RunState.PASS.value
         cut = [
             replace(rest, conditions=[*rest.conditions, only_passed]) for rest in self._cut(whole)
@@ -608,7 +605,7 @@ class Rolled:
         return [self.tail, *cut]
 
     def step_times(self) -> tuple[StepTimes, list[Rest]]:
-        """The times of steps that passed, and what they are without."""
+        """Number of each duration of passed steps, and the runs that are not included."""
         whole = self._whole()
         summed: _Times = defaultdict(Counter)
         is_all = self._recipes is None and self._sockets is None
@@ -626,13 +623,14 @@ class Rolled:
         return found, [self.tail, *self._cut(whole)]
 
     def all_units(self) -> Units | None:
-        """The units of the period as one; None where the sums have no whole day of it."""
+        """Units of the whole period; None if the sums cover no whole day."""
         found = self.units([("", "~")])
         return None if found is None else found.get(ALL_SPANS, Units())
 
     def units(self, spans: Sequence[tuple[str, str]]) -> dict[int, Units] | None:
-        """The units of the spans that have any, by the place of the span, and of `ALL_SPANS`. These
-        are in order and do not overlap. None where the sums have no whole day of these spans.
+        """Units of each span, by its index, and of `ALL_SPANS`; spans without units are left out.
+
+        Spans are in order and do not overlap. None if the sums cover no whole day of them.
         """
         whole = self._whole(sorted({each for span in spans for each in span}))
         if not whole:
@@ -670,13 +668,13 @@ class Rolled:
         return found
 
     def _judged(self, rest: Rest) -> Iterable[int]:
-        """The units of runs that the sums are without."""
+        """Ids of units with runs that the sums do not include."""
         run = schema.run.c
         query = counting(rest.chosen, run.unit_id).where(*rest.conditions)
         return self._connection.execute(query.where(beside_index(run.state).in_(JUDGED))).scalars()
 
     def _count(self, found: dict[int, Units], runs: Iterable[Judged], units: int) -> None:
-        """Count so many units with these runs; the `day` of each is the place of its span."""
+        """Count units that all have these runs; the `day` of each run is the index of its span."""
         first: dict[int, int] = {}
         last: dict[int, int] = {}
         for at, recipe, socket, passed in runs:

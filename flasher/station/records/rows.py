@@ -12,24 +12,24 @@ from sqlalchemy.sql.expression import ColumnElement
 
 _Key = TypeVar("_Key")
 _BATCH: Final = 500
-"""Keys in one IN (...): every back end takes so many."""
+"""Keys in one IN (...); every database allows this number."""
 
 
 def insert(connection: Connection, table: Table, **values: Any) -> int:
-    """Add a row; its id."""
+    """Insert a row; returns its id."""
     key = connection.execute(table.insert().values(**values)).inserted_primary_key
     assert key is not None  # noqa: S101  every table here has a key of one column
     return int(key[0])
 
 
-def named(connection: Connection, table: Table, **key: Any) -> int:
-    """The id of the row with these values, made if there is none."""
+def find_or_insert(connection: Connection, table: Table, **key: Any) -> int:
+    """Find the row with these values, or insert it; returns its id."""
     found = connection.execute(select(table.c.id).filter_by(**key)).scalar_one_or_none()
     return insert(connection, table, **key) if found is None else int(found)
 
 
 def batches(keys: Iterable[_Key]) -> Iterator[list[_Key]]:
-    """The keys in parts that fit into one IN (...)."""
+    """Split keys into batches for IN (...)."""
     rest = iter(keys)
     while some := list(islice(rest, _BATCH)):
         yield some
@@ -38,7 +38,7 @@ def batches(keys: Iterable[_Key]) -> Iterator[list[_Key]]:
 def grouped(
     connection: Connection, query: Select[Any], column: Any, keys: Iterable[int]
 ) -> dict[int, list[dict[str, Any]]]:
-    """The rows of an ordered query by the value that they have in `column`, for these values."""
+    """Rows of an ordered query, grouped by the value of `column`, for these keys."""
     found = defaultdict(list)
     for some in batches(keys):
         rows = connection.execute(query.where(column.in_(some)))
@@ -50,5 +50,5 @@ def grouped(
 
 
 def beside_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
-    """The value of a column, as a database finds it in no index: another one is to lead."""
+    """A column in an expression, so that the database does not use its index."""
     return column + 0 if isinstance(column.type, Integer) else column.concat("")

@@ -1,8 +1,7 @@
-"""The tables of the records, with the rules that hold inside one row or one index.
+"""Tables of the records, with the rules for one row or one index; `triggers` has the others.
 
-Rules over several rows are triggers (`triggers`). A change here is a new `SCHEMA_VERSION` and a
-module in `migrations.versions`, which brings older records to it.
-Times are texts in UTC of one length (`model.utc_text`); durations come from the monotonic clock.
+A change needs a new `SCHEMA_VERSION` and a module in `migrations.versions`. Times are UTC texts of
+constant length (`model.utc_text`); durations come from the monotonic clock.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _LEVELS: Final = f"BETWEEN {min(Verified)} AND {max(Verified)}"
 _UTC_SIZE: Final = 27
 _SHA256_SIZE: Final = 64
 _SIGNATURE_SIZE: Final = 88
-"""64 bytes in base64."""
+"""Characters: 64 bytes in base64."""
 
 
 def _key() -> Column[int]:
@@ -46,7 +45,7 @@ def _key() -> Column[int]:
     return Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True)
 
 
-def _to(table: str, *, nullable: bool = False, index: bool = False) -> Column[int]:
+def _foreign_key(table: str, *, nullable: bool = False, index: bool = False) -> Column[int]:
     return Column(
         f"{table}_id",
         BigInteger().with_variant(Integer, "sqlite"),
@@ -84,9 +83,8 @@ schema_info: Final = Table(
     _utc("created_at"),
     _text("records_id", 32),
 )
-"""`records_id` tells these records, and every copy of them, from all others. `version` is there for
-a flasher before Alembic, which refuses these records by it.
-"""
+"""`records_id` identifies these records and their copies. `version` makes a flasher older than
+Alembic refuse them."""
 
 alembic_version: Final = Table(
     "alembic_version",
@@ -94,12 +92,12 @@ alembic_version: Final = Table(
     Column("version_num", String(32), nullable=False),
     PrimaryKeyConstraint("version_num", name="alembic_version_pkc"),
 )
-"""The schema of these records: the last change of `migrations.versions`, as Alembic keeps it."""
+"""Revision of the schema in `migrations.versions`, as Alembic stores it."""
 
 station: Final = _table("station", _text("name"), UniqueConstraint("name"))
 
 socket: Final = _table(
-    "socket", _to("station"), _text("name"), UniqueConstraint("station_id", "name")
+    "socket", _foreign_key("station"), _text("name"), UniqueConstraint("station_id", "name")
 )
 
 operator: Final = _table("operator", _text("name"), UniqueConstraint("name"))
@@ -142,11 +140,11 @@ unit: Final = _table(
 
 run: Final = _table(
     "run",
-    _to("unit"),
-    _to("socket"),
-    _to("recipe"),
-    _to("lot", nullable=True),
-    _to("operator"),
+    _foreign_key("unit"),
+    _foreign_key("socket"),
+    _foreign_key("recipe"),
+    _foreign_key("lot", nullable=True),
+    _foreign_key("operator"),
     _text("kind", 16),
     Column("is_virtual", Boolean, nullable=False),
     Column("reason", Text, nullable=False),
@@ -157,13 +155,13 @@ run: Final = _table(
     Column("begun_monotonic_s", Float, nullable=False),
     _utc("ended_at", nullable=True),
     Column("ended_monotonic_s", Float, nullable=True),
-    # Copied from the recipe, so that one row can be held against it.
+    # Copied from the recipe, so that a CHECK of one row can use it.
     Column("verification_required", SmallInteger, nullable=False),
     Column("allow_completed_not_read_back", Boolean, nullable=False),
     Column("verification_reached", SmallInteger, nullable=True),
     _sha256("log_sha256", nullable=True),
     Index("run_of_unit", "unit_id", "id"),
-    # Each leads to its newest runs (`newest`).
+    # Each index gives its newest runs (`newest`).
     Index("run_of_socket", "socket_id", "id"),
     Index("run_of_recipe", "recipe_id", "id"),
     Index("run_of_lot", "lot_id", "id"),
@@ -214,8 +212,8 @@ for _name, _column in (
 
 run_target: Final = _table(
     "run_target",
-    _to("run"),
-    _to("artifact"),
+    _foreign_key("run"),
+    _foreign_key("artifact"),
     Column("position", SmallInteger, nullable=False),
     _text("target", 16),
     Column("required", SmallInteger, nullable=False),
@@ -227,7 +225,7 @@ run_target: Final = _table(
 
 step: Final = _table(
     "step",
-    _to("run"),
+    _foreign_key("run"),
     Column("position", Integer, nullable=False),
     _text("name", 32),
     Column("try_number", Integer, nullable=False),
@@ -244,7 +242,7 @@ step: Final = _table(
 
 measurement: Final = _table(
     "measurement",
-    _to("step", index=True),
+    _foreign_key("step", index=True),
     _text("name"),
     Column("value", Float, nullable=True),
     _text("unit", 16),
@@ -257,7 +255,7 @@ measurement: Final = _table(
 
 device_write: Final = _table(
     "device_write",
-    _to("run", index=True),
+    _foreign_key("run", index=True),
     _text("target", 16),
     _text("what", 64),
     Column("value", Text, nullable=False),
@@ -270,7 +268,7 @@ device_write: Final = _table(
 
 attachment: Final = _table(
     "attachment",
-    _to("run", index=True),
+    _foreign_key("run", index=True),
     _text("kind", 32),
     _text("name"),
     _sha256("sha256"),
@@ -281,11 +279,11 @@ attachment: Final = _table(
 
 audit: Final = _table(
     "audit",
-    _to("station"),
+    _foreign_key("station"),
     Column("number", BigInteger, nullable=False),
     _utc("at"),
     _text("event", 32),
-    _to("run", nullable=True, index=True),
+    _foreign_key("run", nullable=True, index=True),
     Column("data", Text, nullable=False),
     _sha256("previous_hash"),
     _sha256("hash"),
@@ -296,5 +294,5 @@ audit: Final = _table(
     Index("audit_by_time", "station_id", "at"),
     Index("audit_by_event", "event", "id"),
 )
-"""Append-only, one chain a station; each row's hash covers the row and the hash before it, and is
-signed with the station's key (`chain`)."""
+"""Append-only, one hash chain per station: each row's hash covers the row and the previous hash,
+and is signed with the station's key (`chain`)."""

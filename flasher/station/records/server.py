@@ -1,7 +1,7 @@
-"""A PostgreSQL server as the place of the records: connections that wait for nothing without end,
-and the lock by which one process in the whole plant is a station.
+"""Connects to records on a PostgreSQL server, with timeouts, and locks a station in the whole
+plant.
 
-It needs the extra `postgres`; the rest of the records does not import it without a need.
+Needs the extra `postgres`; imported only when a server is configured.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from flasher.station.records.errors import LOCK_NOT_AVAILABLE, StationBusyError,
 STATEMENT_LIMIT_S: Final = 30.0
 """Time limit of the server for one statement, not counting waits for locks."""
 SILENCE_LIMIT_S: Final = STATEMENT_LIMIT_S + 5.0
-"""A server that has sent nothing for this time hangs: its own limits no longer work."""
+"""Silence after which a server is regarded as hung: its own limits have not worked."""
 _DEAD_AFTER_S: Final = 25.0
-"""A computer that lost its power or its network is noticed, and its locks are free, after so long:
-the first probe after 10 s, then two more, 5 s apart, and the time for the answer to the last."""
+"""Time after which a computer that lost power or network is detected and its locks are free: the
+first probe after 10 s, two more, 5 s apart, and the timeout of the last."""
 _PROBES: Final = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3}
 
 
 class _Connection(psycopg.Connection[Any]):
-    """Gives up a server that hangs. The limits that the server keeps itself end before."""
+    """A connection that is closed if the server hangs. The server's own limits are shorter."""
 
     silence_limit_s = SILENCE_LIMIT_S
 
@@ -46,7 +46,7 @@ class _Connection(psycopg.Connection[Any]):
 
 
 def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None = None) -> Engine:
-    """The engine of a server. Who sets a limit in the URL gets that one."""
+    """Create the engine of a server. Limits in the URL take precedence."""
     work_s = STATEMENT_LIMIT_S if statement_limit_s is None else statement_limit_s
     silence_s = SILENCE_LIMIT_S if statement_limit_s is None else statement_limit_s + 5.0
     limits = {
@@ -75,8 +75,8 @@ def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None
 
 
 class ServerLock:
-    """One process is the station: held by a session of the server, from `acquire` until `release`
-    or the end of the process, on whichever computer.
+    """Lock that lets one process in the plant run as a station: held by a session of the server
+    from `acquire` until `release` or the end of the process.
     """
 
     def __init__(self, engine: Engine, station: str, where: str) -> None:
@@ -85,14 +85,14 @@ class ServerLock:
         self._where = where
         self._session: Connection | None = None
         self.is_held = False
-        """True when this process became the station."""
+        """True if this process holds the lock."""
         self._mutex = threading.Lock()
         digest = hashlib.sha256(f"flasher station {station}".encode()).digest()
         self._key = int.from_bytes(digest[:8], "big", signed=True)
 
     def acquire(self) -> None:
-        """Become the station. A process that was just killed is waited for, as long as for any
-        other lock. Raises StationBusyError when another process is it; RecordError.
+        """Raises StationBusyError while another process holds the lock, RecordError. Waits for a
+        process that was just killed, up to the lock timeout.
         """
         with self._mutex, mapped(self._where, writes=True):
             if not self.is_held:
@@ -100,8 +100,8 @@ class ServerLock:
                 self.is_held = True
 
     def check(self) -> None:
-        """Still be the station: a session that the server ended is replaced, unless another process
-        became the station meanwhile. Raises StationBusyError, RecordError.
+        """Check the lock, and acquire it again if the server ended the session. Raises
+        StationBusyError if another process has it now, RecordError.
         """
         with self._mutex, mapped(self._where, writes=True):
             if self.is_held and not self._is_alive():
@@ -137,10 +137,10 @@ class ServerLock:
             if getattr(error.orig, "sqlstate", None) != LOCK_NOT_AVAILABLE:
                 raise
             raise StationBusyError(
-                f"Another process is the station {printable(self._station)} already{holder}.",
+                f"Another process already runs the station {printable(self._station)}{holder}.",
                 where=self._where,
-                remedy="End that one, or give this station another name. A computer that lost its "
-                f"power is let go after {_DEAD_AFTER_S:g} s.",
+                remedy="End that one, or give this station another name. The lock of a "
+                f"computer that lost power is free after {_DEAD_AFTER_S:g} s.",
             ) from error
         except BaseException:
             session.close()
@@ -148,7 +148,7 @@ class ServerLock:
         return session
 
     def _holder(self, session: Connection) -> str:
-        """The client of the other process; empty when the server hides it from this user."""
+        """Address of the client that holds the lock; "" if the server hides it from this user."""
         query = text(
             "SELECT host(client_addr) FROM pg_stat_activity JOIN pg_locks USING (pid)"
             " WHERE locktype = 'advisory' AND granted AND objsubid = 1"

@@ -26,29 +26,29 @@ KEY_MAX_SIZE: Final = 64 * 1024
 """In bytes."""
 _MODE: Final = 0o600
 AUDIT_ROW: Final = "audit row"
-"""The signed text names its purpose, so that a signature cannot be used for anything else."""
+"""The signed text begins with its purpose, so that a signature cannot be used for another."""
 SEGMENT: Final = "heads"
 EXAMINED: Final = "examined records"
 
 
 def fingerprint(public: str) -> str:
-    """Fingerprint for people: the first 16 digits of the hash of a public key, in groups."""
+    """Fingerprint for people: the first 16 digits of a public key's hash, in groups."""
     digits = hashlib.sha256(bytes.fromhex(public)).hexdigest()[:16]
     return "-".join(digits[at : at + 4] for at in range(0, 16, 4))
 
 
-def is_signed(text: str, signature: str, public: str, what: str = AUDIT_ROW) -> bool:
-    """True when the holder of the key signed this text as `what`."""
+def is_signed(text: str, signature: str, public: str, purpose: str = AUDIT_ROW) -> bool:
+    """True if the owner of the key signed this text for this purpose."""
     try:
         key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
-        key.verify(base64.b64decode(signature, validate=True), _signed_bytes(what, text))
+        key.verify(base64.b64decode(signature, validate=True), _signed_bytes(purpose, text))
     except (InvalidSignature, ValueError):
         return False
     return True
 
 
 class SigningKey:
-    """A private key. `public` is the public one, 64 hexadecimal digits."""
+    """A private key. `public` is the public key in 64 hexadecimal digits."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
@@ -56,7 +56,7 @@ class SigningKey:
 
     @classmethod
     def make(cls, path: Path) -> SigningKey:
-        """Make a key for this user alone; it is on disk on return. Raises RecordError."""
+        """Create a key file that only this user can read; on disk on return. Raises RecordError."""
         key = Ed25519PrivateKey.generate()
         text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         with mapped(printable(str(path)), writes=True):
@@ -71,9 +71,8 @@ class SigningKey:
 
     @classmethod
     def load(cls, path: Path) -> SigningKey | None:
-        """Load the key of a file; None without a file. Raises KeyMissingError for a file that is
-        not a key or that others may read, RecordError for an unreadable one, UsageError for a path
-        that is not a file.
+        """Load a key file; None without one. Raises KeyMissingError for a file that is not a key or
+        that others may read, RecordError, UsageError for a path that is not a file.
         """
         shown = printable(str(path))
         if not path.exists():
@@ -98,10 +97,10 @@ class SigningKey:
             )
         return cls(key)
 
-    def sign(self, text: str, what: str = AUDIT_ROW) -> str:
-        """The signature in base64."""
-        return base64.b64encode(self._key.sign(_signed_bytes(what, text))).decode("ascii")
+    def sign(self, text: str, purpose: str = AUDIT_ROW) -> str:
+        """Sign a text; returns the signature in base64."""
+        return base64.b64encode(self._key.sign(_signed_bytes(purpose, text))).decode("ascii")
 
 
-def _signed_bytes(what: str, text: str) -> bytes:
-    return f"flasher station {what} {text}".encode()
+def _signed_bytes(purpose: str, text: str) -> bytes:
+    return f"flasher station {purpose} {text}".encode()

@@ -1,4 +1,4 @@
-"""Transactions with signed entries in the audit chain."""
+"""Write transactions whose audit rows are signed, and management of the station's key."""
 
 from __future__ import annotations
 
@@ -29,76 +29,76 @@ from flasher.station.records.signatures import SigningKey, fingerprint
 
 
 class Signer:
-    """The key and the kept heads of one station. `begin` reads or makes them."""
+    """Signing key and chain heads of one station. `begin` loads or creates them."""
 
     def __init__(
         self,
         database: Database,
         station: str,
         now: Callable[[], datetime],
-        keeping: KeyLocations,
+        key_locations: KeyLocations,
     ) -> None:
         self._database = database
         self._station = station
         self._now = now
-        self.keeping = keeping
+        self.key_locations = key_locations
         self._key: SigningKey | None = None
         self._unkept: list[ChainHead] = []
         self._heads_lock = Lock()
         self.copies: list[Copying] = []
-        """Copies to the other places, while this process is the station."""
+        """Background copies to the other places, while this process runs as the station."""
 
     @cached_property
     def records_id(self) -> str:
-        """Identifies these records and every copy of them."""
+        """Id of these records and every copy of them."""
         with self._database.reading() as connection:
             return str(connection.execute(select(schema_info.c.records_id)).scalar_one())
 
     @property
     def key_file(self) -> Path:
-        return self.keeping.key_file(self._station, self.records_id)
+        return self.key_locations.key_file(self._station, self.records_id)
 
     @property
     def public(self) -> str:
-        """The public key that is in force. Raises NotFoundError before the chain has begun."""
+        """The current public key. Raises NotFoundError before the chain has begun."""
         with self._database.reading() as connection:
             found = chain.key_in_force(connection, self._station)
         if found is None:
             raise NotFoundError(
-                f"{printable(self._station)} has signed nothing in these records.",
+                f"{printable(self._station)} has not signed anything in these records.",
                 remedy="Its key is made when the station first runs. Name its file with --sockets.",
             )
         return found
 
     def begin(self) -> None:
-        """Have the key ready; where the chain has not begun, make the key and begin it.
+        """Load the key; for a new chain, create the key and the first row.
 
-        Raises KeyMissingError; RecordsCutError for records that lack rows of which the heads are
-        kept; RecordError.
+        Raises KeyMissingError, RecordsCutError if rows with stored heads are missing,
+        RecordError.
         """
         for place, last in self._lasts():
             if self._is_missing(last):
                 raise RecordsCutError(
-                    f"These records lack what {self._station} wrote up to {last.at}: they are an"
+                    f"These records lack rows that {self._station} wrote until {last.at}: an"
                     " older copy, or their end was cut off.",
                     where=self._database.location.shown,
-                    cause=f"audit row {last.number} is kept in {place.shown}",
+                    cause=f"audit row {last.number} is stored in {place.shown}",
                     remedy="Put the right records back (flasher station verify names what is"
                     " missing); if they are lost: flasher station accept restored.",
                 )
         self._load()
         if not self.copies:
-            self.copies = [self._copying(place) for place in self.keeping.elsewhere]
+            self.copies = [self._copying(place) for place in self.key_locations.elsewhere]
             for each in self.copies:
                 each.begin()
 
     def wait_for_copies(self) -> None:
-        """Wait a moment until the other places have all heads."""
+        """Wait for a limited time until the other places have all heads."""
         for each in self.copies:
             each.wait()
 
     def unkept(self) -> list[str]:
-        """The other places that lack the last heads because they cannot be reached."""
+        """Other places that lack the last heads because they cannot be reached."""
         return [each.shown for each in self.copies if each.fault]
 
     def close(self) -> None:
@@ -109,8 +109,8 @@ class Signer:
 
     @contextmanager
     def writing(self, *locks: str) -> Iterator[chain.Trail]:
-        """One transaction with the end of the chain; on disk, and its head kept, when the block is
-        left without an error. Raises RecordError: then it may be tried again.
+        """Open a write transaction that can append to the chain; on disk, with its head stored,
+        when the block ends without an error. Raises RecordError: then it may be tried again.
         """
         if self._key is None:
             raise RecordError(
@@ -130,7 +130,7 @@ class Signer:
             each.wake()
 
     def rotate(self, operator: str) -> None:
-        """Sign with a new key from now on, and delete the old one."""
+        """Replace the key with a new one, and delete the old one."""
         path, following = self.key_file, self._following()
         following.unlink(missing_ok=True)  # of a rotation that was not committed
         key = SigningKey.make(following)
@@ -140,7 +140,7 @@ class Signer:
         self._key = key
 
     def replace_lost(self, operator: str, reason: str) -> None:
-        """Sign with a new key after the old one was lost. Raises UsageError when it was not."""
+        """Replace a lost key with a new one. Raises UsageError if it is not lost."""
         path = self.key_file
         try:
             self._load()
@@ -148,7 +148,7 @@ class Signer:
             pass
         else:
             raise UsageError(
-                f"The key is there: {printable(str(path))}.",
+                f"The key is not lost: {printable(str(path))}.",
                 remedy="If others may have it: flasher station key --rotate.",
             )
         if path.exists():
@@ -160,9 +160,8 @@ class Signer:
             trail.append(self._now(), chain.KEY_LOST, data)
 
     def accept_restored(self, operator: str, reason: str) -> int:
-        """Go on with records that lack rows of which the heads are kept; how many rows are lost.
-
-        Raises UsageError when nothing is missing.
+        """Accept that rows with stored heads are lost; their number. Raises UsageError if none
+        is.
         """
         kept = [place for place, last in self._lasts() if self._is_missing(last)]
         if not kept:
@@ -212,21 +211,19 @@ class Signer:
 
     @cached_property
     def heads_file(self) -> HeadsFile:
-        return self.keeping.heads_file(self._station, self.records_id)
+        return self.key_locations.heads_file(self._station, self.records_id)
 
     def _lasts(self) -> Iterator[tuple[Place, ChainHead]]:
-        """The head that each place has last, where it can be reached and has any. Raises
-        RecordError, UsageError for the one beside the key.
-        """
+        """Last heads of the places that can be reached. Raises RecordError, UsageError."""
         here = self.heads_file.last()
         if here is not None:
-            yield self.keeping.beside_key, here
-        for place, last in lasts(self.keeping.elsewhere, self._station, self.records_id):
+            yield self.key_locations.beside_key, here
+        for place, last in lasts(self.key_locations.elsewhere, self._station, self.records_id):
             if isinstance(last, ChainHead):
                 yield place, last
 
     def _copying(self, place: Place) -> Copying:
-        source = self.keeping.heads_file(self._station, self.records_id)
+        source = self.key_locations.heads_file(self._station, self.records_id)
         target = place.of(self._station, self.records_id)
         return Copying(source, place, target, self._key_now)
 
@@ -238,9 +235,9 @@ class Signer:
         return self.key_file.with_suffix(".new")
 
     def _is_missing(self, head: ChainHead) -> bool:
-        """True for a head whose row is missing in the records and was not accepted as lost."""
+        """True for a head whose audit row is missing and was not accepted as lost."""
         with self._database.reading() as connection:
             if chain.hash_at(connection, self._station, head.number) == head.hash:
                 return False
-            lost = chain.given_up(connection, self._station)
+            lost = chain.accepted_losses(connection, self._station)
             return not any(head.number in each for each in lost)

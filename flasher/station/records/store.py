@@ -32,7 +32,7 @@ from flasher.errors import FlasherError
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
-from flasher.station.records.claims import Claiming, checked
+from flasher.station.records.claims import Claiming, check_order
 from flasher.station.records.database import (
     Database,
     locate,
@@ -74,11 +74,11 @@ from flasher.station.records.signing import Signer
 from flasher.station.records.upgrade import upgrade
 
 _USUAL: Final = KeyLocations()
-_ONLY_FINITE = "a number that is no number cannot be recorded"
+_ONLY_FINITE = "only finite numbers can be recorded"
 
 
 class SystemClock:
-    """The clocks of this computer."""
+    """Clocks of this computer."""
 
     def utc(self) -> datetime:
         return datetime.now(UTC)
@@ -88,15 +88,19 @@ class SystemClock:
 
 
 class Store:
-    """The records. Open with `Store.open`; a context manager."""
+    """The records of a station. Open with `Store.open`; a context manager."""
 
     def __init__(
-        self, database: Database, station: str, clock: StationClock, keeping: KeyLocations = _USUAL
+        self,
+        database: Database,
+        station: str,
+        clock: StationClock,
+        key_locations: KeyLocations = _USUAL,
     ) -> None:
         self.database = database
         self.station = station
         self.files = FileStore(database.location.folder)
-        self.signer = Signer(database, station, clock.utc, keeping)
+        self.signer = Signer(database, station, clock.utc, key_locations)
         self.read = Records(database)
         self._clock = clock
         self._lock = database.station_lock(station)
@@ -112,20 +116,19 @@ class Store:
         lock_timeout_s: float = DEFAULT_LOCK_TIMEOUT_S,
         create: bool = True,
         read_only: bool = False,
-        keeping: KeyLocations = _USUAL,
-        told: Callable[[str], None] = lambda _text: None,
+        key_locations: KeyLocations = _USUAL,
+        report: Callable[[str], None] = lambda _text: None,
     ) -> Self:
-        """The records at an SQLAlchemy URL, or in an SQLite file; made when they are not there and
-        `create` is true. `folder` holds the attachments (beside an SQLite file by default). A file
-        of an older schema is brought up to date, after a backup beside it (`upgrade`).
-        `read_only` changes nothing, not even the journal. `told` gets a sentence about what takes
-        long.
+        """Open records at an SQLAlchemy URL or in an SQLite file, which is created with `create`.
 
-        Raises UsageError for a place that cannot be, SchemaVersionError, or another RecordError.
+        `folder` holds the attachments (by default beside an SQLite file). A file with an older
+        schema is upgraded after a backup (`upgrade`). `read_only` changes nothing, not even the
+        journal. `report` is called with a sentence before a long operation. Raises UsageError for
+        an invalid location, SchemaVersionError, RecordError.
         """
         clock = clock or SystemClock()
         location = locate(url, folder)
-        keeping.check(location)
+        key_locations.check(location)
         opened = partial(
             open_database,
             location,
@@ -140,16 +143,16 @@ class Store:
             # What is on a server is for its owner to change, after a backup of the server's own.
             if read_only or location.file is None:
                 raise
-            told(f"Records of an older flasher: copies, then changes {location.shown} (minutes).")
+            report(f"Records of an older flasher: copies, then changes {location.shown} (minutes).")
             upgrade(
                 location,
                 choose=lambda _: station,
-                keeping=keeping,
+                key_locations=key_locations,
                 now=clock.utc,
                 lock_timeout_s=lock_timeout_s,
             )
             database = opened()
-        return cls(database, station, clock, keeping)
+        return cls(database, station, clock, key_locations)
 
     def close(self) -> None:
         """Close the database and release the station lock."""
@@ -166,27 +169,26 @@ class Store:
     # -- beginning --------------------------------------------------------------------------------
 
     def become_station(self) -> None:
-        """Take the station lock: only this process writes the station's chain. Raises
-        StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
+        """Acquire the station lock: only this process may append to the station's chain. Raises
+        StationBusyError, KeyMissingError, RecordsCutError, RecordError.
         """
         self._lock.acquire()
         self.signer.begin()
 
     def recover(self) -> tuple[RunId, ...]:
-        """Become the station (one process at a time), and end what a dead one left running: these
-        runs become INTERRUPTED, with the traces that they left; their units RECHECK. Call it once
-        at start.
+        """Acquire the station lock and end runs that a dead process left RUNNING; call it once at
+        start.
 
-        Raises StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
+        These runs become INTERRUPTED and keep their traces; their units become RECHECK. Raises
+        StationBusyError, KeyMissingError, RecordsCutError, RecordError.
         """
         self.become_station()
         self.files.sweep(self._clock.utc())
         return self.end_unknown(())
 
     def end_unknown(self, known: Collection[RunId]) -> tuple[RunId, ...]:
-        """End runs of this station that go on in the records and are none of the `known` ones: a
-        dead station left them, or their claim was saved although it seemed lost. They become
-        INTERRUPTED. Raises RecordError.
+        """End runs of this station that are RUNNING but not `known`: a dead process left them, or a
+        claim was saved although it seemed to fail. They become INTERRUPTED. Raises RecordError.
         """
         now = self._clock.utc()
         with self.signer.writing() as trail:
@@ -216,12 +218,11 @@ class Store:
         return found
 
     def claim(self, order: Order, recipe: LoadedRecipe) -> Claim:
-        """Begin a run of a unit, when every rule allows it; nothing is recorded when not.
-
-        Raises ClaimRefusedError, RecordError (before `recover` too).
+        """Start a run of a unit if every rule allows it; otherwise nothing is recorded. Raises
+        ClaimRefusedError, RecordError (also before `recover`).
         """
         now = self._clock.utc()
-        order = checked(order, recipe, now)
+        order = check_order(order, recipe, now)
         # One claim at a time, of all stations: two must not find the last place of a lot free.
         with self.signer.writing("claims") as trail:
             return Claiming(trail, order, recipe, now).begin(self._clock.monotonic_s())
@@ -229,7 +230,7 @@ class Store:
     # -- while it runs ----------------------------------------------------------------------------
 
     def intent(self, run_id: RunId, target: str, what: str, value: str) -> WriteId:
-        """Record, on disk, an act that cannot be undone, before it is done."""
+        """Record an irreversible action before it is done. On disk on return."""
         with self.database.writing() as connection:
             write_id = insert(
                 connection,
@@ -244,8 +245,8 @@ class Store:
         return WriteId(write_id)
 
     def verified(self, write_id: WriteId, read_back: str | None) -> None:
-        """Record, on disk, that the act is done. `read_back` is the value that the device reports
-        now; None when it only confirmed ("completed, not read back").
+        """Record that the action is done. `read_back` is the value that the device reports now;
+        None if it only confirmed ("completed, not read back"). On disk on return.
         """
         table = schema.device_write
         with self.database.writing() as connection:
@@ -268,7 +269,7 @@ class Store:
         text: str = "",
         measurements: Sequence[Measurement] = (),
     ) -> None:
-        """Record one try of a step that has just ended. Tries are counted by name.
+        """Record one try of a step that has just ended. Tries are counted by step name.
 
         Raises RuleBrokenError for a PASS with a measurement out of its limits.
         """
@@ -303,14 +304,16 @@ class Store:
     # -- ending -----------------------------------------------------------------------------------
 
     def finish(self, run_id: RunId, ending: RunEnd) -> None:
-        """Save how a run ended, in one transaction. Only after it returned may PASS be shown.
+        """Save the end of a run in one transaction. Only after it returns may PASS be shown.
 
-        May be called again with the same ending after an error. Raises RuleBrokenError for a PASS
-        that is not one (not verified as the recipe asks, no log, a step or a write open, a file
-        that is not stored), RecordError when it was not saved.
+        May be called again with the same ending after an error. Raises RuleBrokenError for an
+        unproven PASS (verification below the recipe's, no trace, a failed step, an unverified
+        write, a missing file), RecordError if nothing was saved.
         """
         if ending.state not in OUTCOMES:
-            raise RuleBrokenError(f"{ending.state.value} is no outcome.", where=f"run {run_id}")
+            raise RuleBrokenError(
+                f"{ending.state.value} is not an end of a run.", where=f"run {run_id}"
+            )
         for file in ending.attachments:
             wrong = self.files.check(file.sha256)
             if wrong:
@@ -350,65 +353,62 @@ class Store:
             )
 
     def note(self, event: AuditEvent, data: Mapping[str, Any], run_id: RunId | None = None) -> None:
-        """Add an action of a person to the audit trail; on disk on return. `data` holds what JSON
-        can hold. Raises RecordError.
-        """
+        """Append an action of a person to the audit trail, on disk. Raises RecordError."""
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), event.value, data, run_id)
 
     # -- maintenance ------------------------------------------------------------------------------
 
     def backup(self, path: Path) -> Backup:
-        """A consistent copy of the database while the station runs, checked, whole or not there;
-        the attachments are copied beside it as `NAME.files`. SQLite only. Raises RecordError.
+        """Copy the SQLite database while the station runs, check the copy, and copy the attachments
+        to `NAME.files` beside it. Raises RecordError.
         """
         return make_backup(self.database, self.files, path)
 
     def examine(
-        self, *, goes_on: bool = False, progress: Progress = lambda _done, _total: None
+        self, *, incremental: bool = False, progress: Progress = lambda _done, _total: None
     ) -> Examination:
-        """Examine the records: all of them, or what came after the last time where it `goes_on`.
-        What is found good is noted for the next time, beside the keys of this user.
+        """Examine all records; with `incremental`, only those after the last examination.
 
-        Raises RecordError when they cannot be read.
+        Stores its result beside the keys of this user. Raises RecordError.
         """
         self.signer.wait_for_copies()
         note, remarks = self._examined()
-        since = note if goes_on else None
-        examiner = Examiner(self.database, self.files, self.signer.keeping, progress, since)
+        since = note if incremental else None
+        examiner = Examiner(self.database, self.files, self.signer.key_locations, progress, since)
         found = examiner.examine(self._clock.utc())
         if examiner.examined is not None:
             try:
                 save_examined(*self._examined_files, examiner.examined)
             except RecordError as error:
-                remarks += (f"the next examination begins anew: {error.what}",)
+                remarks += (f"the next examination starts from the beginning: {error.what}",)
         return replace(found, remarks=(*remarks, *found.remarks))
 
     def examine_run(self, run_id: RunId) -> RunExamination:
-        """Examine one run, without going through all records. Raises RecordError."""
+        """Examine one run without reading all records. Raises RecordError."""
         note, _ = self._examined()
-        keeping = self.signer.keeping
-        return Examiner(self.database, self.files, keeping, since=note).examine_run(run_id)
+        key_locations = self.signer.key_locations
+        return Examiner(self.database, self.files, key_locations, since=note).examine_run(run_id)
 
     @property
     def _examined_files(self) -> tuple[Path, Path]:
-        return self.signer.keeping.examined_files(self.signer.records_id)
+        return self.signer.key_locations.examined_files(self.signer.records_id)
 
     def _examined(self) -> tuple[Examined | None, tuple[str, ...]]:
-        """The examined part, and findings for a person."""
+        """State of the last examination, and remarks about it."""
         try:
             return load_examined(*self._examined_files), ()
         except FlasherError as error:
             return None, (f"{error.what} Everything is examined.",)
 
     def release_clock(self, operator: str, reason: str) -> None:
-        """Record that the clock is right although the records contain a later time."""
+        """Record that the clock is right although later times are recorded."""
         self.become_station()
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), chain.CLOCK, {"by": operator, "reason": reason})
 
     def accept_restored(self, operator: str, reason: str) -> int:
-        """Accept an older copy of the records; returns the number of audit rows it lacks."""
+        """Accept an older copy of the records; returns the number of missing audit rows."""
         self._lock.acquire()
         return self.signer.accept_restored(operator, reason)
 
@@ -417,7 +417,7 @@ class Store:
         self.signer.rotate(operator)
 
     def replace_lost_key(self, operator: str, reason: str) -> None:
-        """Replace a lost key with a new one. Raises UsageError when it is not lost."""
+        """Replace a lost key with a new one. Raises UsageError if it is not lost."""
         self._lock.acquire()
         self.signer.replace_lost(operator, reason)
 
@@ -425,7 +425,7 @@ class Store:
 def _end_run(
     trail: Trail, run_id: int, attached: Iterable[AttachmentFile], now: datetime, **values: Any
 ) -> None:
-    """End a run with its attachments, and sign it with all its parts in the audit trail."""
+    """End a run, with its attachments and a signed audit row."""
     connection, run = trail.connection, schema.run
     for file in attached:
         insert(connection, schema.attachment, run_id=run_id, **asdict(file))

@@ -1,8 +1,8 @@
 # ruff: noqa: S608  all of this SQL is written here, no value comes from outside
-"""Rules over several rows, as triggers of the database: they hold for every program.
+"""Database triggers for rules over several rows, which bind every program.
 
-The conditions are written once, in SQL that SQLite and PostgreSQL share; only the frame around them
-differs. The fingerprint tells later whether a rule was taken away or made weaker.
+The conditions are written once, in SQL that SQLite and PostgreSQL share. The fingerprint of the
+schema shows later whether a rule was removed or weakened.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flasher.station.records.schema import metadata
 
 
 class Rule(NamedTuple):
-    """`when` is the forbidden condition before `event` on `table`; `text` is its message."""
+    """A rule: `when` forbids `event` on `table`; `text` is the error message."""
 
     name: str
     table: str
@@ -42,7 +42,7 @@ _PARTS: Final = {
     "device_write": _RUN_IS_OVER,
     "attachment": _RUN_IS_OVER,
 }
-"""The parts of a run, and the condition that their run is over."""
+"""Tables with the parts of a run, and the condition that the run has ended."""
 _NAMED: Final = ("station", "socket", "operator", "lot", "unit", "recipe", "artifact")
 """Tables that runs refer to."""
 
@@ -176,7 +176,7 @@ _OF_TABLES: Final[Mapping[tuple[str, str], Mapping[str, tuple[str, str]]]] = {
         )
     },
 }
-"""By table and event: the name of each rule, what must not be, and the words that say it."""
+"""By table and event: name of each rule, forbidden condition, and error message."""
 
 
 def _rules() -> Iterator[Rule]:
@@ -218,7 +218,7 @@ def trigger_statements(dialect: str) -> list[str]:
 
 
 def drop_triggers(connection: Connection) -> None:
-    """Remove all triggers, and on a server their functions."""
+    """Drop all triggers and, on a server, their functions."""
     if connection.dialect.name == "sqlite":
         query, drop = "SELECT name FROM sqlite_master WHERE type = 'trigger'", "DROP TRIGGER {}"
     else:
@@ -294,9 +294,7 @@ and restored."""
 
 
 def fingerprint_of(connection: Connection) -> dict[str, str]:
-    """A short hash for each table, index, trigger, ... by its name. A restored dump has the
-    same ones.
-    """
+    """Short hash of each table, index, trigger, ... by name; the same after dump and restore."""
     query = _SQLITE if connection.dialect.name == "sqlite" else _POSTGRESQL
     return {
         name: hashlib.sha256(_as_created(sql or "").encode()).hexdigest()[:16]
@@ -313,10 +311,10 @@ def _as_created(sql: str) -> str:
 
 
 def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """The differences of two fingerprints: name and kind of change."""
+    """Names that differ between two fingerprints, each with the kind of difference."""
     for name in sorted(stated.keys() | found.keys()):
         if name not in found:
-            yield name, "it was taken away"
+            yield name, "it was removed"
         elif name not in stated:
             yield name, "it was added"
         elif stated[name] != found[name]:
@@ -326,8 +324,8 @@ def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator
 def stated_differences(
     stated: Collection[tuple[object, Mapping[str, str]]], found: Mapping[str, str]
 ) -> dict[tuple[str, str], None]:
-    """Differences between the schema and the chains' statements, each once. A statement of an older
-    version is void once another chain states the newer one.
+    """Differences between the schema and the schemas that the chains record, each once. A record of
+    an older version is void if another chain records the newer one.
     """
     numbers = [version if isinstance(version, int) else 0 for version, _ in stated]
     newest = max(numbers, default=0)

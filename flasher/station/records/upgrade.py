@@ -1,7 +1,7 @@
-"""Upgrades records of an older schema: after a backup, in one transaction.
+"""Upgrades records of an older schema in one transaction, after a backup.
 
-Alembic runs the changes (`migrations`). The old triggers and indexes are compared with the
-statements of the audit trail; the differences are recorded there with the new ones.
+Alembic makes the changes (`migrations`). The old triggers and indexes are compared with the audit
+trail, which then records the differences and the new schema.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from flasher.station.records.triggers import (
 )
 
 CHANGES: Final = "flasher.station.records:migrations"
-"""Folder of Alembic's changes."""
+"""Alembic's script location."""
 NEWEST: Final = str(schema.SCHEMA_VERSION)
 
 
@@ -57,26 +57,26 @@ class Upgraded:
     """Result of an upgrade."""
 
     before: str
-    """The schema of the records before."""
+    """Schema version before the upgrade."""
     after: str
     backup: Path | None
-    """The copy made before; None where nothing was changed, or on a server."""
+    """The backup; None on a server, or if nothing was changed."""
     problems: tuple[str, ...]
-    """How the old schema differed from what the audit trail states of it."""
+    """Differences between the old schema and the one that the audit trail records."""
 
 
 def upgrade(
     location: Location,
     *,
     choose: Callable[[tuple[str, ...]], str],
-    keeping: KeyLocations,
+    key_locations: KeyLocations,
     now: Callable[[], datetime],
     lock_timeout_s: float,
 ) -> Upgraded:
-    """Bring the records up to date. `choose` gets the names of their stations, and returns the one
-    whose key signs the change in its audit trail.
+    """Upgrade the records. `choose` gets the names of their stations and returns the one whose
+    audit trail records and signs it.
 
-    Raises StationBusyError while a station runs; UsageError, RecordError: nothing was changed then.
+    Raises StationBusyError while a station runs, UsageError, RecordError: nothing was changed.
     """
     database = Database(location, lock_timeout_s, changes_schema=True)
     with closing(database), ExitStack() as held:
@@ -111,7 +111,7 @@ def upgrade(
                 with database.writing("schema") as connection:
                     _change(connection)
                 return Upgraded(before, NEWEST, backup, ())
-            signer = Signer(database, station, now, keeping)
+            signer = Signer(database, station, now, key_locations)
             signer.begin()
             with signer.writing("schema") as trail:
                 problems = _change_signed(trail, now())
@@ -119,7 +119,7 @@ def upgrade(
 
 
 def _stations(connection: Connection) -> tuple[str, ...]:
-    """The stations with signed rows."""
+    """Stations with signed audit rows."""
     station = schema.station.c
     signed = select(schema.audit.c.id).where(schema.audit.c.station_id == station.id).exists()
     return tuple(
@@ -142,7 +142,7 @@ def _unchanged_on_error(before: str, database: Database) -> Iterator[None]:
 
 @contextmanager
 def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
-    """A copy of an SQLite file, removed again when the change fails."""
+    """Back up an SQLite file; the backup is deleted if the change fails."""
     if file is None:
         yield None
         return
@@ -174,7 +174,7 @@ def _change_signed(trail: Trail, now: datetime) -> tuple[str, ...]:
 
 
 def _stated(connection: Connection) -> list[tuple[object, Mapping[str, str]]]:
-    """The last statement of each chain on the schema, with the version."""
+    """Version and schema that each chain recorded last."""
     audit = schema.audit.c
     query = select(audit.station_id, audit.data).where(
         audit.event.in_((chain.BEGUN, chain.MIGRATED))
@@ -208,11 +208,11 @@ def _change(connection: Connection) -> None:
         connection.exec_driver_sql(statement)
     connection.execute(update(schema.schema_info).values(version=schema.SCHEMA_VERSION))
     if is_file and _missing_rows(connection) != missing:
-        raise RecordsDamagedError(f"{NOT_SAVED}: rows would name rows that are missing.")
+        raise RecordsDamagedError(f"{NOT_SAVED}: rows would refer to missing rows.")
     if not is_file:
         grant_again(connection)
 
 
 def _missing_rows(connection: Connection) -> list[Any]:
-    """References to missing rows: SQLite does not check them during the change."""
+    """References to missing rows, which SQLite does not check during the change."""
     return [tuple(row) for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all()]

@@ -29,7 +29,7 @@ def examined(any_bench: Bench) -> Bench:
 
 
 def go_on(bench: Bench) -> Examination:
-    return bench.store.examine(goes_on=True)
+    return bench.store.examine(incremental=True)
 
 
 def changed(bench: Bench, statement: str) -> None:
@@ -43,7 +43,7 @@ def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) 
     examined.work(running)
     seen: list[tuple[int, int]] = []
     found = examined.store.examine(
-        goes_on=True, progress=lambda done, total: seen.append((done, total))
+        incremental=True, progress=lambda done, total: seen.append((done, total))
     )
     assert not found.problems
     assert found.since is not None
@@ -85,7 +85,7 @@ def test_more_runs_are_no_more_statements(any_bench: Bench) -> None:
         ("DELETE FROM audit WHERE number = 8", "audit trail of line-2", "its end was cut off"),
         ("UPDATE audit SET signature = 'x' WHERE number = 7", "audit row 7", "not signed"),
         ("DELETE FROM attachment WHERE run_id = 3", "run 3", "its attachments"),
-        ("INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W1')", "unit W1", "no run names it"),
+        ("INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W1')", "unit W1", "no run refers"),
     ],
 )
 def test_what_was_changed_since_is_reported(
@@ -129,7 +129,7 @@ def test_a_note_that_was_changed_is_not_believed(examined: Bench) -> None:
     found = go_on(examined)
     assert found.since is None
     assert found.remarks[0] == (
-        "The note of the last examination was changed. Everything is examined."
+        "The file of the last examination was changed. Everything is examined."
     )
     assert go_on(examined).since is not None
 
@@ -144,7 +144,7 @@ def test_a_folder_that_cannot_be_written_is_examined_all_the_same(
     monkeypatch.setattr(Path, "replace", full)
     found = bench.store.examine()
     assert not found.problems
-    assert "the next examination begins anew" in found.remarks[0]
+    assert "the next examination starts from the beginning" in found.remarks[0]
 
 
 # -- one run ---------------------------------------------------------------------------------------
@@ -178,8 +178,8 @@ RUN_FORGERIES: list[tuple[str, str]] = [
     ("UPDATE unit SET serial = 'W2605009' WHERE id = 1", "serial number or part"),
     ("UPDATE audit SET signature = 'x' WHERE run_id = 1", "not signed with the key"),
     ("UPDATE audit SET at = '2026-01-01' WHERE run_id = 1", "it was changed"),
-    ("DELETE FROM audit WHERE run_id = 1", "does not know it"),
-    ("DELETE FROM audit WHERE number = 6", "but is not there"),
+    ("DELETE FROM audit WHERE run_id = 1", "does not have it"),
+    ("DELETE FROM audit WHERE number = 6", "but missing here"),
     ("DELETE FROM attachment WHERE run_id = 1", "its attachments"),
 ]
 
@@ -200,6 +200,8 @@ def test_a_run_of_a_chain_made_anew_is_reported_by_another_place(tmp_path: Path)
     bench.store.signer.wait_for_copies()
     assert bench.store.examine_run(RunId(1)).elsewhere == (str(tmp_path / "share"),)
     make_anew(bench)
-    with Store.open(str(bench.path), station="x", read_only=True, keeping=bench.keeping) as store:
+    with Store.open(
+        str(bench.path), station="x", read_only=True, key_locations=bench.key_locations
+    ) as store:
         found = store.examine_run(RunId(1))
-    assert any("is not the one that is kept" in each.what for each in found.problems)
+    assert any("is not the one that is stored" in each.what for each in found.problems)

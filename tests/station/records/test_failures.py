@@ -135,7 +135,7 @@ def test_a_database_of_something_else_is_left_alone(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(path)) as other:
         other.execute("CREATE TABLE holiday (photo BLOB)")
         other.commit()
-    with pytest.raises(SchemaVersionError, match="something else"):
+    with pytest.raises(SchemaVersionError, match="other data"):
         Store.open(str(path), station="x")
     with contextlib.closing(sqlite3.connect(path)) as other:
         assert other.execute("SELECT name FROM sqlite_master").fetchall() == [("holiday",)]

@@ -111,9 +111,11 @@ def examined(
     forger = Forger(copy)
     forge(forger, folder)
     forger.put_back()
-    keeping = KeyLocations(folder / "keys")
+    key_locations = KeyLocations(folder / "keys")
     files = plant.store.files.folder
-    with Store.open(str(copy), station="x", folder=files, read_only=True, keeping=keeping) as store:
+    with Store.open(
+        str(copy), station="x", folder=files, read_only=True, key_locations=key_locations
+    ) as store:
         return store.examine().problems
 
 
@@ -123,11 +125,11 @@ def told(problems: tuple[Problem, ...], where: str, what: str) -> bool:
 
 PLAIN = [
     ("UPDATE run SET text = 'all was well' WHERE id = 3", "run 3", "the run itself"),
-    ("UPDATE run SET kind = 'golden' WHERE id = 3", "run 3", "what it was claimed with"),
-    ("UPDATE run_target SET reached = 2 WHERE run_id = 1", "run 1", "its targets were verified"),
+    ("UPDATE run SET kind = 'golden' WHERE id = 3", "run 3", "its claim"),
+    ("UPDATE run_target SET reached = 2 WHERE run_id = 1", "run 1", "verification of its targets"),
     ("UPDATE step SET duration_s = 0.1 WHERE run_id = 1", "run 1", "its steps"),
     ("DELETE FROM step WHERE run_id = 3", "run 3", "its steps"),
-    ("UPDATE device_write SET read_back = 'V9' WHERE run_id = 1", "run 1", "what was written"),
+    ("UPDATE device_write SET read_back = 'V9' WHERE run_id = 1", "run 1", "its writes"),
     ("DELETE FROM attachment WHERE run_id = 3", "run 3", "its attachments"),
     ("UPDATE unit SET serial = 'W9999999' WHERE id = 3", "unit of run 3", "serial number or part"),
     ("UPDATE operator SET name = 'someone'", "operator of run 1, 2, 3, 4", "operator's name"),
@@ -138,7 +140,7 @@ PLAIN = [
     ("UPDATE artifact SET size_bytes = 1", "artifacts of run", "size"),
     ("UPDATE station SET name = 'line-9'", "station of run", "the station's name"),
     ("UPDATE station SET name = 'line-9'", "audit row 1 of line-9", "that of the station line-2"),
-    ("DELETE FROM audit WHERE id = 4", "audit row 5", "the row before it is missing"),
+    ("DELETE FROM audit WHERE id = 4", "audit row 5", "the previous row is missing"),
     ("UPDATE audit SET at = '2026-01-01' WHERE id = 4", "audit row 4", "changed after it was"),
     ("UPDATE audit SET signature = 'x' WHERE id = 4", "audit row 4", "not signed with the key"),
     ("DELETE FROM audit WHERE id > 7", "audit trail of line-2", "row 9"),
@@ -150,9 +152,9 @@ PLAIN = [
     ("UPDATE run SET text = X'00FF' WHERE id = 3", "run 3", "the run itself"),
     ("DELETE FROM unit WHERE id = 3", "unit of run 3", "serial number or part"),
     ("UPDATE audit SET event = 'restored' WHERE id = 4", "audit row 4", "changed after it was"),
-    ("UPDATE audit SET number = 'x' WHERE id = 4", "audit row", "the row before it is missing"),
-    ("INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W1')", "unit W1", "no run names it"),
-    ("INSERT INTO lot (part, name) VALUES ('BAT-36', 'L9')", "lot L9", "no run names it"),
+    ("UPDATE audit SET number = 'x' WHERE id = 4", "audit row", "the previous row is missing"),
+    ("INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W1')", "unit W1", "no run refers to it"),
+    ("INSERT INTO lot (part, name) VALUES ('BAT-36', 'L9')", "lot L9", "no run refers to it"),
     ("UPDATE step SET run_id = 77 WHERE run_id = 1", "table step", "a missing row of run"),
 ]  # fmt: skip
 
@@ -171,11 +173,11 @@ def test_a_changed_row_on_a_server_is_told(
     """Each in a transaction of its own, which is examined and then rolled back: that is quicker."""
     made = Bench(tmp_path, url=postgres.records())
     fill(made)
-    keeping, files = KeyLocations(made.keys), made.store.files
+    key_locations, files = KeyLocations(made.keys), made.store.files
     engine = create_engine(postgres_url := str(made.url))
     refused = []
     with Store.open(
-        postgres_url, station="x", folder=files.folder, read_only=True, keeping=keeping
+        postgres_url, station="x", folder=files.folder, read_only=True, key_locations=key_locations
     ) as store:
         for statement, where, what in PLAIN:
             with engine.connect() as connection:
@@ -218,8 +220,8 @@ def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_told(
     problems = examined(plant, tmp_path, forge)
     assert told(problems, "audit row 8 of line-2", "not signed with the key of the station")
     assert told(problems, "audit trail of line-2", "the chain was made anew")
-    assert told(problems, f"run 3, PASS of {FAILED}", f"it is of the unit {OTHER}")
-    assert told(problems, "runs 2, 3", "one and the same trace")
+    assert told(problems, f"run 3, PASS of {FAILED}", f"it is the trace of {OTHER}")
+    assert told(problems, "runs 2, 3", "the same trace")
 
 
 def test_a_chain_signed_anew_with_another_key_is_told_by_the_kept_heads(
@@ -249,7 +251,7 @@ def test_rules_taken_away_or_made_weaker_are_told(plant: Bench, tmp_path: Path) 
     assert [(each.where, each.what) for each in examined(plant, tmp_path, forge)] == [
         ("schema, trigger own", "it was added"),
         ("schema, trigger pass_log", "it was changed"),
-        ("schema, trigger run_delete", "it was taken away"),
+        ("schema, trigger run_delete", "it was removed"),
     ]
 
 
@@ -271,11 +273,11 @@ def test_a_pass_with_the_trace_of_something_else_is_told(bench: Bench) -> None:
     folder = bench.folder
     other_image = IMAGES[next(target for target in IMAGES if target.name == "wmc")]
     traces = {
-        SERIAL: (run_messages(OTHER, BMS_VERSION, IMAGES_BMS), f"it is of the unit {OTHER}"),
+        SERIAL: (run_messages(OTHER, BMS_VERSION, IMAGES_BMS), f"it is the trace of {OTHER}"),
         "W2605011": (run_messages("W2605011", BMS_VERSION, other_image), "another image"),
-        "W2605012": (run_messages("W2605012", BMS_VERSION, None), "no whole transfer"),
+        "W2605012": (run_messages("W2605012", BMS_VERSION, None), "no complete transfer"),
         "W2605013": (run_messages("W2605013", "V9r9r9_20200101", IMAGES_BMS), "answers version"),
-        "W2605014": (iter(()), "no whole transfer"),
+        "W2605014": (iter(()), "no complete transfer"),
     }
     for serial, (messages, what) in traces.items():
         run_id = passed(bench, serial, write_trace(folder / f"{serial}.log.gz", messages))
@@ -285,7 +287,9 @@ def test_a_pass_with_the_trace_of_something_else_is_told(bench: Bench) -> None:
     bench.store.verified(write, "W2605015")
     bench.work(run_id)
     bench.store.finish(run_id, bench.ending(trace=bench.traced("W2605015")))
-    assert told(bench.store.examine().problems, f"run {run_id}", "W2605015 is not written in it")
+    assert told(
+        bench.store.examine().problems, f"run {run_id}", "W2605015 is not written in the trace"
+    )
     broken = folder / "broken.log.gz"
     broken.write_bytes(b"no trace")
     run_id = passed(bench, "W2605016", broken)
@@ -306,17 +310,17 @@ def test_wholly_new_records_are_told_where_the_heads_have_to_be(
     plant: Bench, tmp_path: Path
 ) -> None:
     new = str(tmp_path / "new.sqlite")
-    with Store.open(new, station="line-2", keeping=KeyLocations(tmp_path / "own")) as made:
+    with Store.open(new, station="line-2", key_locations=KeyLocations(tmp_path / "own")) as made:
         made.recover()
-    keeping = KeyLocations(tmp_path / "none")
-    with Store.open(new, station="x", read_only=True, keeping=keeping) as store:
+    key_locations = KeyLocations(tmp_path / "none")
+    with Store.open(new, station="x", read_only=True, key_locations=key_locations) as store:
         found = store.examine()
         assert not found.problems
         assert found.unkept == ("line-2",)
         assert not found.is_checked_elsewhere
-    keeping = KeyLocations(tmp_path / "none", (str(plant.keys),))
-    with Store.open(new, station="x", read_only=True, keeping=keeping) as store:
-        assert told(store.examine().problems, "heads of line-2", "none of these records is kept")
+    key_locations = KeyLocations(tmp_path / "none", (str(plant.keys),))
+    with Store.open(new, station="x", read_only=True, key_locations=key_locations) as store:
+        assert told(store.examine().problems, "heads of line-2", "no head of these records")
 
 
 def test_kept_heads_that_were_changed_are_told(plant: Bench, tmp_path: Path) -> None:
@@ -327,7 +331,7 @@ def test_kept_heads_that_were_changed_are_told(plant: Bench, tmp_path: Path) -> 
 
     (problem,) = examined(plant, tmp_path, forge)
     assert problem.where.startswith("heads of line-2, ")
-    assert problem.what == "line 2 is no head"
+    assert problem.what == "line 2 is not a head"
 
 
 def test_the_key_is_for_this_user_alone_and_a_head_is_kept_of_every_row(plant: Bench) -> None:

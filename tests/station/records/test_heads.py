@@ -209,7 +209,7 @@ def test_a_crash_between_two_segments_spoils_nothing(
     assert again(file).last() == head(30)
     again(file).append([head(31)], key)
     assert heads_of(again(file)) == [*numbers, 31]
-    assert faults_of(again(file)) == ([f"{new.name}: line 1 is no head"] if left else [])
+    assert faults_of(again(file)) == ([f"{new.name}: line 1 is not a head"] if left else [])
 
 
 def test_a_line_does_not_stop_at_any_size_of_its_heads(

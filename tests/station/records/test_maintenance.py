@@ -27,8 +27,10 @@ def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Ben
     assert made.size_bytes == path.stat().st_size
     assert not list(bench.folder.glob(".*part*"))
     bench.make(RunState.PASS, "W2605004", "B")
-    keeping = KeyLocations(bench.folder / "of nobody")  # the kept heads know the later run as well
-    with Store.open(str(path), station="line-2", create=False, keeping=keeping) as copy:
+    key_locations = KeyLocations(
+        bench.folder / "of nobody"
+    )  # the kept heads know the later run as well
+    with Store.open(str(path), station="line-2", create=False, key_locations=key_locations) as copy:
         assert not copy.examine().problems
         assert copy.read.unit(SERIAL).state is UnitState.PASS
         assert copy.read.units("W2605004") == ()

@@ -24,7 +24,7 @@ from flasher.station.records.errors import RecordsCutError
 from flasher.station.records.heads import ChainHead, HeadsFile
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Examination, Problem
-from flasher.station.records.places import patiently, place_of
+from flasher.station.records.places import call_all, place_of
 from flasher.station.records.schema import audit, run
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
@@ -67,12 +67,12 @@ def forging(bench: Bench) -> Iterator[Connection]:
     engine.dispose()
 
 
-def verified(bench: Bench, keeping: KeyLocations | None = None) -> Examination:
+def verified(bench: Bench, key_locations: KeyLocations | None = None) -> Examination:
     bench.store.close()
     files = bench.store.files.folder
     with Store.open(
         bench.url or str(bench.path), station="x", folder=files, read_only=True,
-        keeping=keeping or bench.keeping,
+        key_locations=key_locations or bench.key_locations,
     ) as store:  # fmt: skip
         return store.examine()
 
@@ -255,7 +255,7 @@ def test_a_share_that_is_not_mounted_is_not_begun_anew(tmp_path: Path) -> None:
     bench.make(serial=OTHER)
     (copying,) = bench.store.signer.copies
     assert copying.wait()
-    assert "is it the right share?" in copying.fault
+    assert "another share may be mounted" in copying.fault
     assert not list(share.iterdir())
 
 
@@ -303,13 +303,13 @@ def test_a_folder_in_which_an_older_flasher_kept_all_heads_goes_on(tmp_path: Pat
 
 def test_a_place_that_does_not_answer_is_not_waited_for() -> None:
     ended = Event()
-    silent, good = patiently([ended.wait, lambda: True], 0.01)
+    silent, good = call_all([ended.wait, lambda: True], 0.01)
     ended.set()
     assert "did not answer" in str(silent)
     assert good is True
 
 
 def test_a_keeping_is_sent_to_another_process_without_its_connections(postgres: Server) -> None:
-    keeping = KeyLocations(heads=(postgres.url("postgres"),))
-    assert keeping.elsewhere
-    assert pickle.loads(pickle.dumps(keeping)) == keeping  # noqa: S301
+    key_locations = KeyLocations(heads=(postgres.url("postgres"),))
+    assert key_locations.elsewhere
+    assert pickle.loads(pickle.dumps(key_locations)) == key_locations  # noqa: S301

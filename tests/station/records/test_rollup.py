@@ -291,7 +291,7 @@ def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines) -> None:
     with closing(sqlite3.connect(file)) as damaged:
         damaged.execute("UPDATE times SET content = x'00'")
         damaged.commit()
-    with pytest.raises(RecordError, match="Delete this file") as found:
+    with pytest.raises(RecordError, match="Delete the file") as found:
         Overview(made.bench.store.database).step_times(RunFilter())
     assert found.value.where == str(file)
 

@@ -45,7 +45,7 @@ class Old:
 
     @property
     def place(self) -> dict[str, Any]:
-        return {"folder": self.files, "keeping": KeyLocations(self.folder / "keys")}
+        return {"folder": self.files, "key_locations": KeyLocations(self.folder / "keys")}
 
     def open(self, station: str = "line-2", *, read_only: bool = False, **more: Any) -> Store:
         return Store.open(
@@ -57,7 +57,7 @@ class Old:
         return upgrade.upgrade(
             database.locate(self.url, self.files),
             choose=lambda _: station,
-            keeping=KeyLocations(self.folder / "keys"),
+            key_locations=KeyLocations(self.folder / "keys"),
             now=FakeClock().utc,
             lock_timeout_s=0.5,
         )
@@ -132,7 +132,7 @@ def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureReque
 def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old_file: Old) -> None:
     before = old_file.rows()
     said: list[str] = []
-    with old_file.open(told=said.append) as store:
+    with old_file.open(report=said.append) as store:
         assert "minutes" in said[0]
         assert not store.examine().problems
         assert store.recover() != ()
@@ -184,11 +184,11 @@ def test_a_rule_that_was_taken_away_before_is_told_and_stays_told(old: Old) -> N
         connection.execute(text(f"DROP TRIGGER run_update{where}"))
         connection.execute(text("CREATE INDEX foreign_one ON unit (part)"))
     done = old.upgrade()
-    assert "schema, trigger run_update: it was taken away" in done.problems
+    assert "schema, trigger run_update: it was removed" in done.problems
     assert "schema, index foreign_one: it was added" in done.problems
     with old.open(read_only=True) as store:
         told = [each.what for each in store.examine().problems]
-    assert told == [f"found at the migration: {problem}" for problem in done.problems]
+    assert told == [f"found at the upgrade: {problem}" for problem in done.problems]
 
 
 @ON_A_SERVER
@@ -376,6 +376,6 @@ def test_what_holds_no_records_is_not_upgraded(tmp_path: Path) -> None:
     other = Old(tmp_path, str(tmp_path / "other.sqlite"))
     with other.engine.begin() as connection:
         connection.execute(text("CREATE TABLE holiday (photo BLOB)"))
-    with pytest.raises(SchemaVersionError, match="something else"):
+    with pytest.raises(SchemaVersionError, match="other data"):
         other.upgrade()
     other.engine.dispose()

@@ -117,7 +117,7 @@ def test_another_computer_with_this_station_s_name_ends_no_run_of_it(
     elsewhere = Store.open(
         str(bench.url), station="line-2", folder=tmp_path / "elsewhere", lock_timeout_s=0.02
     )
-    with elsewhere, pytest.raises(StationBusyError, match="line-2 already, on the computer 127"):
+    with elsewhere, pytest.raises(StationBusyError, match="line-2, on the computer 127"):
         elsewhere.recover()
     assert bench.store.read.run(run_id).run.state is RunState.RUNNING
     bench.store.close()

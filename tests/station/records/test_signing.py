@@ -56,7 +56,7 @@ def test_a_key_that_is_gone_stops_the_station_until_a_person_replaces_it(bench: 
     found = store.examine()
     assert not found.problems
     assert "the key was declared lost on 2026-05-17 by jo" in found.remarks[0]
-    with pytest.raises(UsageError, match="The key is there"):
+    with pytest.raises(UsageError, match="The key is not lost"):
         store.replace_lost_key("jo", "again")
 
 
@@ -129,7 +129,7 @@ def test_half_a_line_that_a_crash_left_spoils_nothing(bench: Bench) -> None:
         file.write('{"at": "2026')
     bench.make()
     (problem,) = bench.store.examine().problems
-    assert "is no head" in problem.what
+    assert "is not a head" in problem.what
     kept.write_text("".join(line for line in kept.read_text().splitlines(keepends=True)[:-1]))
 
 
@@ -231,8 +231,8 @@ def test_reading_changes_no_byte_and_a_report_of_a_backup_leaves_nothing_beside_
     copy.parent.mkdir()
     bench.store.backup(copy)
     before = {path: path.read_bytes() for path in copy.parent.rglob("*") if path.is_file()}
-    keeping = KeyLocations(bench.keys)
-    with Store.open(str(copy), station="x", read_only=True, keeping=keeping) as store:
+    key_locations = KeyLocations(bench.keys)
+    with Store.open(str(copy), station="x", read_only=True, key_locations=key_locations) as store:
         assert not store.examine().problems
         assert store.read.unit(SERIAL).last
         with pytest.raises(Exception, match="read-only"), store.database.writing() as connection:
@@ -248,7 +248,7 @@ def test_records_on_media_that_nobody_can_write_are_read(
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
     monkeypatch.setattr(os, "access", lambda *_: False)
     with Store.open(
-        str(bench.path), station="x", read_only=True, keeping=KeyLocations(bench.keys)
+        str(bench.path), station="x", read_only=True, key_locations=KeyLocations(bench.keys)
     ) as store:
         assert not store.examine().problems
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
@@ -266,6 +266,6 @@ def test_a_line_without_end_in_the_heads_is_told_by_its_number(tmp_path: Path) -
     (tmp_path / "heads").write_bytes(b"[" * 100_000 + b"\n{}\n")
     found = HeadsFile(tmp_path / "heads").entries()
     assert [each.what for each in found if isinstance(each, HeadsFault)] == [
-        "line 1 is no head",
-        "line 2 is no head",
+        "line 1 is not a head",
+        "line 2 is not a head",
     ]

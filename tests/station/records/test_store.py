@@ -269,7 +269,7 @@ def test_another_station_s_runs_are_left_alone(bench: Bench) -> None:
 
 def test_a_station_exists_once_and_claims_only_after_it_looked_back(bench: Bench) -> None:
     with bench.opened(lock_timeout_s=0.02) as second:
-        with pytest.raises(StationBusyError, match=r"station.* already"):
+        with pytest.raises(StationBusyError, match="already runs"):
             second.recover()
         with pytest.raises(RecordError, match="not the station"):
             second.claim(Order(SERIAL, "B", "jo"), bench.recipe)
