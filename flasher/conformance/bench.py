@@ -152,7 +152,7 @@ class Bench:
 
     def next_version(self) -> Received:
         """Wait for the next boot version of the burst."""
-        return self.expect(Reply.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
+        return self.expect(Reply.BOOT_VERSION, within_s=self.waits.next_version_s)
 
     def update(self, size_bytes: int) -> Received:
         """Send the update command, repeated at every boot version (R2), until request transfer."""
@@ -182,6 +182,7 @@ class Bench:
         sent = self.send_packet(image, number)
         reply = self.expect(Reply.ACK, number=number)
         self.continued_at = sent.left_at
+        self.judge.note_listening()
         self.measure(TimeName.ANSWER, reply.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
@@ -204,6 +205,7 @@ class Bench:
         is "silence", "either" or a word for a NAK.
         """
         replies = self.answers()
+        self.judge.note_stimulus(heard=bool(replies))
         known = sorted({number for number in numbers if number is not None})
         is_open = None in numbers
         right = [

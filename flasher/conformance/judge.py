@@ -42,6 +42,7 @@ class Judge:
         self.infos: list[str] = []
         self._tester = tester
         self._step = ""
+        self._stimuli = self._heard = self._unanswered = 0
 
     @property
     def verdict(self) -> CaseVerdict:
@@ -127,10 +128,10 @@ class Judge:
     def expect_silence(
         self, for_s: float | None = None, *, ignoring: Sequence[Reply] = (), why: str = "no answer"
     ) -> bool:
-        """Check that no message arrives for `for_s` (default: `limits.silence_s`), except the kinds
+        """Check that no message arrives for `for_s` (default: `Waits.silence_s`), except the kinds
         `ignoring`.
         """
-        silence_s = self._tester.profile.limit("silence_s") if for_s is None else for_s
+        silence_s = self._tester.waits.silence_s if for_s is None else for_s
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
 
@@ -146,6 +147,33 @@ class Judge:
     def info(self, text: str) -> None:
         """Record an observation without judging it."""
         self.infos.append(text)
+
+    # -- stimuli ----------------------------------------------------------------------------------
+
+    def note_stimulus(self, count: int = 1, *, heard: bool = False) -> None:
+        """Count stimuli that the device may reject or ignore. Without `heard` they count as heard
+        once an answer shows that the device listened at the time (`note_listening`).
+        """
+        self._stimuli += count
+        if heard:
+            self._heard += count
+        else:
+            self._unanswered += count
+
+    def note_listening(self, *, listens: bool = True) -> None:
+        """The device did listen when the stimuli so far were sent, or did not."""
+        self._heard += self._unanswered if listens else 0
+        self._unanswered = 0
+
+    def conclude(self) -> None:
+        """Record how many stimuli were heard. A case of which none was heard does not pass."""
+        if not self._stimuli:
+            return
+        got = f"{self._heard} of {self._stimuli} stimuli were heard"
+        self.info(got)
+        if not self._heard:
+            expected = "the device listens when a stimulus is sent"
+            self._record(CheckOutcome.INCONCLUSIVE, expected, got)
 
     # -- times ------------------------------------------------------------------------------------
 

@@ -122,10 +122,12 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     """Run a case and return its end; never raises."""
     try:
         case.run(bench)
+        bench.judge.conclude()
     except CaseStopped:
         return CaseEnd(bench.judge.verdict)
     except Unsupported as ended:
         bench.unsupported("the rest of the case", str(ended))
+        bench.judge.conclude()
         return CaseEnd(bench.judge.verdict, str(ended))
     except RunStopped as ended:
         return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))

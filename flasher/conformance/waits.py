@@ -17,6 +17,7 @@ _WINDOW_MAX_S: Final = 1.0
 """Longest window to assume when the profile does not define it (up_04)."""
 _INCOMPLETE: Final = 2
 """A device waits for the rest of a message at most this many times the gap that it accepts."""
+_LATE_VERSION: Final = 4
 _FRAME_BITS: Final = 135
 """Bits of an 8-byte frame with all possible stuff bits and the interframe space."""
 
@@ -40,12 +41,23 @@ class Waits:
         return (count - 1) * spacing_s + window_s
 
     @property
+    def next_version_s(self) -> float:
+        """How long to wait for the next boot version of a burst; RS-01 judges its time."""
+        spacing_s = self._limit("version_spacing_s") + self._limit("version_spacing_tolerance_s")
+        return _LATE_VERSION * spacing_s
+
+    @property
     def settle_s(self) -> float:
         """From the last frame of damaged or incomplete messages to the last answer to them: the
         device notices that the rest is missing, and then takes as long as for any answer. No
         partial message is left in it then.
         """
         return _INCOMPLETE * self._limit("inter_frame_s") + self._limit("ack_s")
+
+    @property
+    def silence_s(self) -> float:
+        """How long the bus must be quiet to count as silent: any answer would have arrived."""
+        return max(self._limit("silence_s"), self._limit("feedback_s"), self.settle_s)
 
     @property
     def packet_s(self) -> float:

@@ -31,7 +31,7 @@ from flasher.mock.variants.entering import LOOP_S, QueuesUpdates
 from flasher.mock.variants.framing import HeaderAtFrameStart, PaddingFatal, ShortFrameEnds
 from flasher.mock.variants.transfer import FillerChecked
 from flasher.protocol import messages
-from flasher.protocol.spec import TARGETS, WELLING, Mode
+from flasher.protocol.spec import TARGETS, WELLING, Command, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Reassembler
 
@@ -68,22 +68,31 @@ class _ConfirmsAll(_ConfirmsUnknown):
         super()._take_row(row, now)
 
 
-class _RefusesByNak(MockDevice):
-    """Says NAK to a size that it does not take."""
+class RefusesByNak(MockDevice):
+    """Answers an update command that it does not accept by NAK."""
+
+    def _classify(self, row: AnyMessage) -> BootloaderEvent:
+        event = super()._classify(row)
+        is_update = isinstance(row, messages.UpdateCommand) or (
+            isinstance(row, messages.Malformed) and row.message.command == Command.UPDATE
+        )
+        is_ignored = self.state in _BOOTLOADER and event is BootloaderEvent.NO_CONCERN
+        return BootloaderEvent.UPDATE_REFUSED if is_update and is_ignored else event
 
     def _refuse_update(self, now: float) -> str:
         self._send(messages.Nak(0))
         return super()._refuse_update(now)
 
 
-class _ListensBehindBurst(MockDevice):
+class ListensAfterBurst(MockDevice):
     """Takes the update command when the burst is over, not between its announcements (R2)."""
 
     def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
         in_burst = self.state is BootloaderState.ANNOUNCING and self._announced < self.burst
         is_deaf = in_burst and self._has_whole_application
-        return BootloaderEvent.NO_CONCERN if is_deaf and event is BootloaderEvent.UPDATE else event
+        updates = (BootloaderEvent.UPDATE, BootloaderEvent.UPDATE_REFUSED)
+        return BootloaderEvent.NO_CONCERN if is_deaf and event in updates else event
 
 
 class _RequestsForEach(QueuesUpdates):
@@ -207,8 +216,8 @@ class CountsFromPackets(MockDevice):
 _BEHAVIOURS: Final[tuple[tuple[type[MockDevice], dict[str, Value]], ...]] = (
     (_ConfirmsUnknown, {"fr_10": "either"}),
     (_ConfirmsAll, {"fr_10": "either"}),
-    (_RefusesByNak, {"up_02": "either"}),
-    (_ListensBehindBurst, {"up_04_burst": "rejected"}),
+    (RefusesByNak, {"up_02": "either"}),
+    (ListensAfterBurst, {"up_04_burst": "rejected"}),
     (_RequestsForEach, {"up_05": "each"}),
     (_AsksForDamaged, {"tx_01": "either"}),
     (_SilentToShort, {}),

@@ -19,10 +19,14 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.mock.variants.ending import RecordErasedLast
+from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
 from flasher.protocol import messages
 from tests.campaigns.right_devices import (
     HELD,
     CountsFromPackets,
+    ListensAfterBurst,
+    RefusesByNak,
     answers_late,
     faults_of,
     right_device,
@@ -127,3 +131,53 @@ def test_a_nak_after_all_packets_may_name_any_number(step: str) -> None:
     explorer = Explorer(subject(_AsksBeyondTheEnd), profile_of_mock(), seed="1")
     walk = ["reset", "update=384", "packets=all", step, step]
     assert explorer.replay(walk).finding is None
+
+
+# -- heard -----------------------------------------------------------------------------------------
+
+
+class _RecordLast(MockDevice):
+    store_type = RecordErasedLast
+
+
+_AFTER_BURST: dict[str, Value] = {"up_04_burst": "rejected"}
+
+
+@each("case_id", ("UP-02", "UP-06", "SE-04"))
+def test_wrong_update_commands_are_sent_when_the_device_listens(case_id: str) -> None:
+    kind = type("Right", (ListensAfterBurst, RefusesByNak), {})
+    assert blamed(case_id, kind=kind, given={**_AFTER_BURST, "up_02": "nak"}) == []
+
+
+@each("case_id", ("FR-06", "FR-10", "CR-03", "PW-01", "PW-02"))
+def test_a_device_may_listen_only_after_its_announcements(case_id: str) -> None:
+    assert blamed(case_id, kind=ListensAfterBurst, given=_AFTER_BURST) == []
+
+
+@each(
+    "case_id, flaw",
+    (("UP-06", AnyTargetName), ("UP-02", ErasesBeforeCheck), ("PW-01", _RecordLast)),
+)
+def test_a_flaw_is_found_in_a_device_that_listens_only_after_its_announcements(
+    case_id: str, flaw: type[MockDevice]
+) -> None:
+    kind = type("Wrong", (ListensAfterBurst, flaw), {})
+    assert blamed(case_id, kind=kind, given={**_AFTER_BURST, "up_02": "silence"})
+
+
+@each("case_id", ("UP-02", "UP-06"))
+def test_a_case_without_a_stimulus_that_was_heard_does_not_pass(case_id: str) -> None:
+    stated: dict[str, Value] = {"up_04_burst": "accepted", "up_02": "silence"}
+    (found,) = blamed(case_id, kind=ListensAfterBurst, given=stated)
+    assert found.startswith(f"{case_id} inconclusive")
+    assert "were heard" in found
+
+
+@each("case_id", ("UP-02", "UP-06", "FR-04", "TX-04", "RS-04", "UP-03"))
+def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
+    report = run(subject(), profile_of_mock(), selection=Selection(cases=(case_id,)))
+    (result,) = report.results
+    (text,) = [info for info in result.infos if "stimuli were heard" in info]
+    heard, _, sent, *_ = text.split()
+    assert heard == sent
+    assert int(sent) > 1

@@ -238,7 +238,7 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
                 bench.encoder.has_version_query and bench.application_version() is not None
             ):
                 sent = bench.send(bench.encoder.update(len(image)))
-                reply = bench.host.request_or_version(sent.left_at, limit("silence_s"))
+                reply = bench.host.request_or_version(sent.left_at, bench.waits.silence_s)
         if reply is not None and reply.kind is Reply.REQUEST:
             break
         # A device that ignores the reset may wait for packet 1: request transfer was lost (R26).
@@ -282,7 +282,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=bench.limit("silence_s"))
+            reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=bench.waits.silence_s)
         if disturbance.hits_answer:
             break
     if reply is not None and reply.kind is Reply.COMPLETE:

@@ -116,6 +116,7 @@ def bursts(bench: Bench) -> None:
                 bench.send(frames)
                 replies = bench.collect(bench.waits.settle_s)
             _require_none_accepted(bench, f"a packet whose {fault}", replies)
+            bench.judge.note_stimulus(heard=bool(replies))
         bench.succeed(f"none of {len(faults)} packets is accepted", "none was")
     probe.send_next()
     probe.check_stored()
@@ -383,6 +384,7 @@ def _check_none_accepted(
         replies = bench.collect(bench.waits.settle_s)
         _require_none_accepted(bench, f"a packet with {name}", replies)
         answers = bool(replies)
+        bench.judge.note_stimulus(heard=answers)
     size = _SILENT_BATCH if framed and not answers else 1
     for start in range(0, len(left), size):
         batch = left[start : start + size]
@@ -398,6 +400,7 @@ def _check_none_accepted(
         first, last = batch[0][0], batch[-1][0]
         names = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
         _require_none_accepted(bench, f"a packet with {names}", replies)
+        bench.judge.note_stimulus(len(batch), heard=bool(replies))
     _require_none_accepted(bench, "the last ones", bench.collect(bench.waits.settle_s))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
 

@@ -77,6 +77,7 @@ def end_early_and_twice(bench: Bench) -> None:
             bench.send(bench.encoder.end())
             # A NAK of any number (R6) and no other message.
             bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
+            bench.judge.note_stimulus(heard=True)
             bench.expect_silence(bench.limit("ack_s"), ignoring=(Reply.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
             reply = bench.wait_for(Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)

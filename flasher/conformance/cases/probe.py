@@ -33,6 +33,10 @@ def complies(wanted: str, taken: bool) -> bool:  # noqa: FBT001
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
 
+def _is_nak(one: Received) -> bool:
+    return one.kind is Reply.NAK
+
+
 class PacketTransfer:
     """A transfer of `image`, packet by packet; `stored` counts the packets acknowledged so far."""
 
@@ -120,25 +124,23 @@ class Probe(PacketTransfer):
         self.stored = 0
 
     def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:
-        """At the first boot version, send stimuli that have to be rejected: the device may answer
-        NAK, continues to announce itself, and then accepts the update command.
+        """Once the device listens, send stimuli that have to be rejected: it may answer NAK,
+        continues to announce itself, and then accepts the update command.
         """
         bench = self.bench
         bench.reset_to_bootloader()
+        bench.wait_until_listening()
         for frames in stimuli:
             bench.send(frames)
-        is_burst = bench.number("versions") > 1
-        half_s = bench.limit("window_s") / 2
-        deadline = bench.now + (4 * bench.limit("version_spacing_s") if is_burst else half_s)
-        replies: list[Received] = []
-        while (one := bench.next_message(deadline - bench.now)) is not None:
-            replies.append(one)
-            if one.kind is not Reply.NAK:
-                break
-        ok = all(one.kind in (Reply.NAK, Reply.BOOT_VERSION) for one in replies)
-        goes_on = not is_burst or (bool(replies) and replies[-1].kind is Reply.BOOT_VERSION)
-        bench.require(ok and goes_on, "boot version, at most NAK before it", describe(replies))
+            bench.judge.note_stimulus()
+        is_burst = bench.number("versions") > 1 and bench.choice("up_04_burst") == "accepted"
+        if is_burst:
+            expected = "boot version, at most NAK before it"
+            found = bench.wait_for(*Reply, within_s=bench.waits.next_version_s, unlike=_is_nak)
+            is_version = found is not None and found.kind is Reply.BOOT_VERSION
+            bench.require(is_version, expected, found or "nothing")
         bench.update(len(self.image))
+        bench.judge.note_listening()
         self.stored = 0
 
     def frames(self) -> list[RawFrame]:
@@ -192,6 +194,7 @@ class Probe(PacketTransfer):
         }
         ok = complies(wanted, taken) and not others
         bench.check(ok, expected[wanted], describe(replies))
+        bench.judge.note_stimulus(heard=bool(replies))
         if taken:
             self.stored += 1
             bench.continued_at = bench.tester.left_at
@@ -209,6 +212,7 @@ class Probe(PacketTransfer):
         replies = bench.collect(self.bench.waits.settle_s)
         ok = all(one.kind is Reply.NAK for one in replies)
         bench.require(ok, "NAK or no answer", describe(replies))
+        bench.judge.note_stimulus(heard=bool(replies))
         self.send_next()
 
     def check_stored(self) -> None:

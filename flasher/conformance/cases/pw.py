@@ -192,6 +192,7 @@ def _upgrade_up_to(bench: Bench, upgrade: _InterruptedUpgrade, cut: _Cut) -> Non
     if not cut.packet:
         if upgrade.runs:
             bench.reset_to_bootloader()
+        bench.wait_until_listening()
         bench.send(encoder.update(len(upgrade.new))[: cut.frames])
         return
     _enter(bench, upgrade)
@@ -307,10 +308,13 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
                     _restore_old_image(bench, upgrade)
                 if upgrade.runs:
                     bench.reset_to_bootloader()
+                    bench.wait_until_listening()
                 upgrade.end_was_sent = False
                 bench.subject.cut_in_operation(operation, share, _OFF_S)
                 version = _upgrade_until_cut(bench, upgrade)
                 if not bench.subject.take_cut():
+                    got = "boot version, and no power cut"
+                    bench.require(version is None, "the update command is accepted", got)
                     # The upgrade finished without a cut; EN-01 and EN-07 judge its result.
                     upgrade.runs = bench.application_runs()
                     upgrade.swap()

@@ -152,6 +152,7 @@ def no_reset(bench: Bench) -> None:
             raw = build(can_id, WRITE, encoder.reset_command, encoder.reset_data)
             _check_ignored(bench, f"on id {can_id:03X}", split(can_id, raw))
     bench.check_application()
+    bench.judge.note_listening()
 
 
 @case(
@@ -209,6 +210,7 @@ def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
     """Check that the device does not restart; an application may confirm every write."""
     with bench.step(step):
         bench.send(frames)
+        bench.judge.note_stimulus()
         bench.expect_silence(
             ignoring=(Reply.FEEDBACK, Reply.OTHER, Reply.VERSION_INFORMATION), why="no restart"
         )

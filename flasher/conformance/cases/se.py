@@ -7,7 +7,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import transfer_image
-from flasher.conformance.cases.up import check_update_rejected
+from flasher.conformance.cases.up import check_updates_rejected
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.wire import (
     BOOT_VERSION,
@@ -112,7 +112,7 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
         expected = f"an application that answers within {limit_s:g} s"
         bench.check(reply is not None, expected, reply or "none")
         # Many queries were sent: discard late answers.
-        bench.collect(bench.limit("silence_s"))
+        bench.collect(bench.waits.silence_s)
     else:
         expected = "an application that answers while useless data continue"
         bench.unsupported(expected, "the document has no version query for this target")
@@ -248,8 +248,10 @@ def _random_message(bench: Bench) -> list[RawFrame]:
 def outside(bench: Bench) -> None:
     area = bench.number("application_bytes")
     sizes = (area + 1, IMAGE_BYTES_MAX + 1, 0x8000_0000, 0xFFFF_FF80, 0xFFFF_FF81, 0xFFFF_FFFF)
-    for size in dict.fromkeys(size for size in sizes if size > area):
-        check_update_rejected(bench, f"size {size:X}", bench.encoder.update(size))
+    beyond_area = dict.fromkeys(size for size in sizes if size > area)
+    check_updates_rejected(
+        bench, {f"size {size:X}": bench.encoder.update(size) for size in beyond_area}
+    )
     image = transfer_image(bench)
     total = packet_count(len(image))
     marker = bench.random.randbytes(PACKET_BYTES)
@@ -266,6 +268,7 @@ def outside(bench: Bench) -> None:
                 bench.stay_before(image, stored + 1)
                 bench.send(bench.encoder.packet(number, named, marker))
                 replies = bench.answers()
+                bench.judge.note_stimulus(heard=bool(replies))
                 ok = all(one.kind is Reply.NAK for one in replies)
                 bench.check(ok, "NAK or silence", describe(replies))
     expected = "none of the rejected data in the flash"

@@ -84,6 +84,8 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     bench.wait_until_listening()
     bench.send(frames)
     replies = bench.collect(bench.waits.burst_s + bench.limit("inter_frame_s"))
+    bench.judge.note_stimulus(heard=any(one.kind is Reply.NAK for one in replies))
+    bench.judge.note_listening(listens=False)  # silence does not show whether it listens
     positive = [one for one in replies if one.kind in (Reply.ACK, Reply.COMPLETE, Reply.REQUEST)]
     bench.check(not positive, "neither ACK nor complete", describe(positive or replies))
 
@@ -227,7 +229,9 @@ def out_of_order(bench: Bench) -> None:
                     allowed = [f"ACK {number}"]
                     if choice == "either":
                         allowed += ["nothing", f"NAK {number}", f"NAK {_STORED + 1}"]
-                    replies = describe(bench.answers())
+                    answers = bench.answers()
+                    bench.judge.note_stimulus(heard=bool(answers))
+                    replies = describe(answers)
                     bench.check(replies in allowed, " or ".join(allowed), replies)
 
 

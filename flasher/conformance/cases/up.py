@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -12,11 +13,13 @@ from flasher.conformance.wire import (
     READ,
     UPDATE,
     WRITE,
+    Encoder,
     RawFrame,
     Received,
     Reply,
     describe,
     inverted,
+    joined,
     packet_count,
 )
 
@@ -25,6 +28,8 @@ _SENT_WHOLE_PACKETS: Final = 2
 """Images of up to this many packets are sent in full, to check the expected number of packets."""
 _SIZE_BITS: Final = (16, 24, 31)
 """A device that stores the size in fewer bits would take it for a small image."""
+_UPDATE_HEAD: Final = joined(Encoder("bms").update(0))[:6]
+"""Start of a write of the update command, to any target."""
 _FIRST_PACKETS: Final = 3
 _MANY: Final = 24
 """Transfers started without a restart in between, to find state that is left behind."""
@@ -69,8 +74,8 @@ def wrong_sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
     good = len(bench.good_image)
     more = (good | 1 << bit for bit in _SIZE_BITS)
-    for size in (0, largest + 1, *(size for size in more if size > largest), 0xFFFF_FFFF):
-        check_update_rejected(bench, f"{size} bytes", bench.encoder.update(size))
+    sizes = (0, largest + 1, *(size for size in more if size > largest), 0xFFFF_FFFF)
+    check_updates_rejected(bench, {f"{size} bytes": bench.encoder.update(size) for size in sizes})
 
 
 @case(
@@ -88,8 +93,11 @@ def without_reset(bench: Bench) -> None:
     for step, frames in bench.encoder.upgrade_messages(len(image)).items():
         with bench.step(step), bench.tester.collecting_feedback():
             bench.send(frames)
-            _check_answer(bench, bench.collect(bench.limit("silence_s")), Reply.FEEDBACK, choice)
+            replies = bench.collect(bench.waits.silence_s)
+            bench.judge.note_stimulus(heard=bool(replies))
+            _check_answer(bench, replies, Reply.FEEDBACK, choice)
     bench.check_application()
+    bench.judge.note_listening()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
         bench.collect(bench.waits.burst_s)
@@ -178,8 +186,7 @@ def wrong_names(bench: Bench) -> None:
         name = own[:at] + b"X" + own[at + 1 :]
         names[f"name {name.decode()}"] = name
     names |= {"name in small letters": own.lower(), "name of zeros": bytes(7)}
-    for step, name in names.items():
-        check_update_rejected(bench, step, encoder.update(size, name))
+    stimuli = {step: encoder.update(size, name) for step, name in names.items()}
     payload = own + size.to_bytes(4, "little")
     for step, mode, command, data in (
         ("payload too short", WRITE, 0xA10A, payload[:-1]),
@@ -187,7 +194,8 @@ def wrong_names(bench: Bench) -> None:
         ("length greater by four", WRITE, UPDATE, payload + bytes(4)),
         ("as a read", READ, UPDATE, payload),
     ):
-        check_update_rejected(bench, step, encoder.message(mode, command, data))
+        stimuli[step] = encoder.message(mode, command, data)
+    check_updates_rejected(bench, stimuli)
 
 
 @case(
@@ -301,7 +309,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
         bench.finish(image)
         return
     # A device that accepted it against the profile has no application when this time is over.
-    within_s = limit("erase_s") if choice == "either" else limit("silence_s")
+    within_s = limit("erase_s") if choice == "either" else bench.waits.silence_s
     request = bench.wait_for(Reply.REQUEST, within_s=within_s)
     ok = request is None or choice == "either"
     bench.check(ok, f"update command {choice}", request or "no request transfer")
@@ -324,16 +332,36 @@ def _enter_at(bench: Bench, version: int) -> float:
     return reply.at
 
 
-def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
-    """Send these frames to the bootloader and check that it does not request the transfer, answers
-    as up_02 says, and starts the old application.
+def check_updates_rejected(bench: Bench, stimuli: Mapping[str, list[RawFrame]]) -> None:
+    """Send these frames to the listening bootloader, by the names of their steps, and check that it
+    does not request the transfer, answers as up_02 says, and starts the old application.
+
+    A valid update command, sent at the same moment after a reset, shows that it listens then.
     """
+    for step, frames in stimuli.items():
+        # To an unknown command or a read, silence is always right (FR-10).
+        is_update = joined(frames).startswith(_UPDATE_HEAD)
+        choice = bench.choice("up_02") if is_update else "either"
+        _check_update_rejected(bench, step, frames, choice)
+    with bench.step("a valid update command at the same moment"):
+        bench.reset_to_bootloader()
+        bench.wait_until_listening()
+        bench.send(bench.encoder.update(len(bench.good_image)))
+        listens = bench.wait_for(Reply.REQUEST) is not None
+        bench.judge.note_listening(listens=listens)
+        if listens:
+            bench.finish(bench.good_image)
+
+
+def _check_update_rejected(bench: Bench, step: str, frames: list[RawFrame], choice: str) -> None:
     with bench.step(step):
         bench.reset_to_bootloader()
+        bench.wait_until_listening()
         bench.send(frames)
-        replies = bench.collect(bench.waits.burst_s + bench.limit("silence_s"))
-        answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
-        _check_answer(bench, answers, Reply.NAK, bench.choice("up_02"), "rejected by ")
+        replies = bench.collect(bench.waits.burst_s + bench.waits.silence_s)
+        answers = [one for one in replies if not _is_version(one)]
+        bench.judge.note_stimulus(heard=bool(answers))
+        _check_answer(bench, answers, Reply.NAK, choice, "rejected by ")
         bench.check_image(bench.good_image)
 
 

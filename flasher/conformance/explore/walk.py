@@ -118,6 +118,8 @@ class Walk:
         """Ids on which the device may answer other nodes whose messages the walk imitated."""
         self._requested_at = -inf
         self._version_at = -inf
+        self._announced = 0
+        """Boot versions of the burst so far."""
         self._answered_at = bench.now
         """Time of the last message that required an answer; a pause counts from there."""
 
@@ -262,6 +264,9 @@ class Walk:
                             f"{self.phase.value}")  # fmt: skip
         if reply.boot_name != self.bench.encoder.boot_name or not reply.has_good_version_text:
             raise Violation("form", f"{reply} is not a valid boot version of this device")
+        is_burst = reply.at - self._version_at < self.bench.waits.next_version_s
+        is_next = self.phase is DevicePhase.ANNOUNCING and is_burst
+        self._announced = self._announced + 1 if is_next else 1
         self.phase = DevicePhase.ANNOUNCING
         self._version_at = reply.at
         self._may_complete = False
@@ -390,10 +395,13 @@ class Walk:
         if self.phase is not DevicePhase.ANNOUNCING:
             return
         bench = self.bench
-        within_s = 4 * bench.limit("version_spacing_s")
+        within_s = bench.waits.next_version_s
         if self.has_application is False:  # it may restart just now
             within_s = bench.limit("first_version_s")
-        reply = self._listen(within_s, lambda one: one.kind is Reply.BOOT_VERSION)
+        reply = self._listen(within_s, _is_version)
+        if bench.choice("up_04_burst") != "accepted":
+            while reply is not None and self._announced < bench.number("versions"):
+                reply = self._listen(within_s, _is_version)
         if reply is None and self.has_application:  # its window is over, or nearly
             self._await_start()
         elif reply is None and self.has_application is None:
@@ -725,6 +733,10 @@ class Walk:
                 self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
         self.bench.send(refused.frames)
         self._listen_for_answers()
+
+
+def _is_version(reply: Received) -> bool:
+    return reply.kind is Reply.BOOT_VERSION
 
 
 def _answers_update(reply: Received, not_before: float) -> bool:

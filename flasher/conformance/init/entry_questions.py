@@ -230,8 +230,9 @@ def rejected_update(session: InitSession) -> Findings:
     for stimulus, frames in stimuli.items():
         for _ in range(REPEATS):
             session.enter()
+            bench.wait_until_listening()
             bench.send(frames)
-            replies = bench.collect(bench.waits.burst_s + bench.limit("ack_s"))
+            replies = bench.collect(bench.waits.burst_s + bench.waits.silence_s)
             answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
             yield Trial(_choice_for(answers), answer_text(answers), stimulus)
             session.await_application()
@@ -282,7 +283,7 @@ def application(session: InitSession) -> Findings:
             bench.forget()
             with bench.tester.collecting_feedback():
                 bench.send(frames)
-                replies = bench.collect(bench.limit("silence_s"))
+                replies = bench.collect(bench.waits.silence_s)
             yield Trial(
                 _choice_for(replies), answer_text(replies), f"{stimulus} to the application"
             )
