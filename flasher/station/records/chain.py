@@ -10,14 +10,15 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from datetime import datetime
+from functools import cache
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, Table, select
+from sqlalchemy import Connection, Row, Select, Table, bindparam, select
 
 from flasher.station.records import schema
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import AuditEvent, utc_text
-from flasher.station.records.rows import beside_index, find_or_insert, grouped
+from flasher.station.records.rows import KEYS, beside_index, find_or_insert, grouped, insert
 from flasher.station.records.schema import audit, station
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.triggers import fingerprint_of
@@ -53,6 +54,26 @@ EVENTS: Final = (
 )  # fmt: skip
 """All events of audit rows."""
 
+_LAST: Final = (
+    select(audit.c.number, audit.c.hash)
+    .where(audit.c.station_id == bindparam("station_id"))
+    .order_by(audit.c.number.desc())
+    .limit(1)
+)
+_STATION_ID: Final = select(station.c.id).where(station.c.name == bindparam("station"))
+# No join: a server would sort all rows of the chain, where an index has them in order.
+_OF_STATION: Final = audit.c.station_id == _STATION_ID.scalar_subquery()
+_HASH_AT: Final = select(audit.c.hash).where(_OF_STATION, audit.c.number == bindparam("number"))
+_LATEST: Final = (
+    select(audit.c.at)
+    .where(_OF_STATION, beside_index(audit.c.number) >= bindparam("since"))
+    .order_by(audit.c.at.desc())
+    .limit(1)
+)
+_WITHOUT_RUN: Final = select(audit).where(
+    audit.c.run_id.is_(None), audit.c.event.in_(bindparam("events", expanding=True))
+)
+
 
 class Trail:
     """Appends rows to a station's chain, inside a write transaction."""
@@ -69,12 +90,7 @@ class Trail:
     ) -> None:
         """Append a signed row."""
         station_id = find_or_insert(self.connection, station, name=self.station)
-        last = self.connection.execute(
-            select(audit.c.number, audit.c.hash)
-            .where(audit.c.station_id == station_id)
-            .order_by(audit.c.number.desc())
-            .limit(1)
-        ).one_or_none()
+        last = self.connection.execute(_LAST, {"station_id": station_id}).one_or_none()
         number, before = (1, GENESIS) if last is None else (last.number + 1, last.hash)
         row: dict[str, Any] = {
             "number": number,
@@ -86,8 +102,8 @@ class Trail:
         }
         found = row_hash(row)
         signature = self.key.sign(found)
-        self.connection.execute(
-            audit.insert().values(**row, station_id=station_id, hash=found, signature=signature)
+        insert(
+            self.connection, audit, **row, station_id=station_id, hash=found, signature=signature
         )
         head = ChainHead(self.station, number, row["at"], found, signature, self.key.public)
         self.heads.append(head)
@@ -154,10 +170,9 @@ def rows_without_run(
 
     They are few among millions of rows; the index of `run_id` finds them.
     """
-    station_id = select(station.c.id).where(station.c.name == station_name)
-    wanted = connection.execute(station_id).scalar_one_or_none()
-    query = select(audit).where(audit.c.run_id.is_(None), audit.c.event.in_(events))
-    found = (row for row in connection.execute(query) if row.station_id == wanted)
+    wanted = connection.execute(_STATION_ID, {"station": station_name}).scalar_one_or_none()
+    rows = connection.execute(_WITHOUT_RUN, {"events": list(events)})
+    found = (row for row in rows if row.station_id == wanted)
     return sorted(found, key=lambda row: row.number)
 
 
@@ -199,26 +214,16 @@ def ending_of(connection: Connection, run_id: int) -> dict[str, Any]:
 
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
     """Hash of row `number`; None if the chain has no such row."""
-    query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)
-    return connection.execute(query).scalar_one_or_none()
+    found = connection.execute(_HASH_AT, {"station": station_name, "number": number})
+    return found.scalar_one_or_none()
 
 
 def latest(connection: Connection, station_name: str) -> str | None:
     """The latest time in the chain since the clock was last confirmed; None without rows."""
     released = rows_without_run(connection, station_name, [CLOCK])
-    query = (
-        _rows_of(station_name, audit.c.at)
-        .where(beside_index(audit.c.number) >= (released[-1].number if released else 0))
-        .order_by(audit.c.at.desc())
-        .limit(1)
-    )
-    return connection.execute(query).scalar_one_or_none()
-
-
-def _rows_of(station_name: str, *columns: Any) -> Any:
-    # No join: a server would sort all rows of the chain, where an index has them in order.
-    named = select(station.c.id).where(station.c.name == station_name).scalar_subquery()
-    return select(*columns).where(audit.c.station_id == named)
+    since = released[-1].number if released else 0
+    found = connection.execute(_LATEST, {"station": station_name, "since": since})
+    return found.scalar_one_or_none()
 
 
 CLAIM: Final = "claim"
@@ -248,6 +253,19 @@ _OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
 """Columns of a run that are set when it ends."""
+
+
+_MEASUREMENTS: Final = (
+    select(schema.measurement, schema.step.c.run_id)
+    .join_from(schema.measurement, schema.step)
+    .where(schema.step.c.run_id.in_(KEYS))
+    .order_by(schema.measurement.c.id)
+)
+
+
+@cache
+def _rows_by(table: Table, column: str) -> Select[Any]:
+    return select(table).where(table.c[column].in_(KEYS)).order_by(table.c.id)
 
 
 def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, str]]:
@@ -284,33 +302,26 @@ def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dic
     """Rows of runs, and all rows that they refer to, by run id and part."""
     wanted = list(run_ids)
 
-    def named_by(rows: Iterable[Mapping[str, Any]], table: Table) -> dict[Any, dict[str, Any]]:
-        """Rows of a table that other rows refer to, by id."""
-        keys = dict.fromkeys(row[f"{table.name}_id"] for row in rows)
-        found = grouped(connection, select(table), table.c.id, keys)
+    def by_id(table: Table, ids: Iterable[Any]) -> dict[Any, dict[str, Any]]:
+        found = grouped(connection, _rows_by(table, "id"), "id", ids)
         return {key: row for key, (row,) in found.items()}
 
-    def parts_of(table: Table) -> dict[int, list[dict[str, Any]]]:
-        query = select(table).order_by(table.c.id)
-        return grouped(connection, query, table.c.run_id, wanted)
+    def named_by(rows: Iterable[Mapping[str, Any]], table: Table) -> dict[Any, dict[str, Any]]:
+        """The rows of a table that others name, by their ids."""
+        return by_id(table, dict.fromkeys(row[f"{table.name}_id"] for row in rows))
 
-    measurement, step = schema.measurement, schema.step
-    of_steps = select(measurement, step.c.run_id).join_from(measurement, step)
+    def parts_of(table: Table) -> dict[int, list[dict[str, Any]]]:
+        return grouped(connection, _rows_by(table, "run_id"), "run_id", wanted)
+
     targets = parts_of(schema.run_target)
     parts = {
-        "steps": parts_of(step),
-        "measurements": grouped(
-            connection, of_steps.order_by(measurement.c.id), step.c.run_id, wanted
-        ),
+        "steps": parts_of(schema.step),
+        "measurements": grouped(connection, _MEASUREMENTS, "run_id", wanted),
         "writes": parts_of(schema.device_write),
         "attachments": parts_of(schema.attachment),
         "targets": targets,
     }
-    in_order = select(schema.run).order_by(schema.run.c.id)
-    runs = {
-        run_id: row
-        for run_id, (row,) in grouped(connection, in_order, schema.run.c.id, wanted).items()
-    }
+    runs = by_id(schema.run, wanted)
     of_runs = {
         table.name: named_by(runs.values(), table)
         for table in (schema.unit, schema.socket, schema.operator, schema.recipe, schema.lot)

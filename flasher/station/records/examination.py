@@ -36,7 +36,7 @@ from flasher.station.records.model import (
 from flasher.station.records.places import PATIENCE_S, Place, call_all
 from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of_content, is_whole
-from flasher.station.records.rows import batches, grouped
+from flasher.station.records.rows import KEYS, batches, grouped
 from flasher.station.records.signatures import is_signed
 from flasher.station.records.triggers import fingerprint_of, stated_differences
 from flasher.trace.reader import read_trace
@@ -649,6 +649,11 @@ def _same_traces(connection: Connection) -> Iterator[Problem]:
         yield Problem(f"runs {shown}", "they have the same trace", same)
 
 
+_AUDIT_OF_RUNS: Final = (
+    select(schema.audit).where(schema.audit.c.run_id.in_(KEYS)).order_by(schema.audit.c.id)
+)
+
+
 @dataclass
 class _RunDigests:
     """Digests of a run that the audit trail records."""
@@ -666,8 +671,7 @@ class _RunDigests:
 def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, _RunDigests]:
     """Digests in the intact audit rows of these runs."""
     found: dict[int, _RunDigests] = defaultdict(_RunDigests)
-    query = select(schema.audit).order_by(schema.audit.c.id)
-    for run_id, rows in grouped(connection, query, schema.audit.c.run_id, run_ids).items():
+    for run_id, rows in grouped(connection, _AUDIT_OF_RUNS, "run_id", run_ids).items():
         for row in rows:
             digests = _table(chain.data_of(row["data"]).get("digests"))
             if not digests or row["hash"] != chain.row_hash(row):

@@ -4,28 +4,53 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cache
 from itertools import islice
 from typing import Any, Final, TypeVar
 
-from sqlalchemy import Connection, Integer, Select, Table, select
+from sqlalchemy import (
+    BindParameter,
+    Connection,
+    Insert,
+    Integer,
+    Select,
+    Table,
+    bindparam,
+    select,
+)
 from sqlalchemy.sql.expression import ColumnElement
 
 _Key = TypeVar("_Key")
 _BATCH: Final = 500
 """Keys in one IN (...); every database allows this number."""
+KEYS: Final[BindParameter[Any]] = bindparam("keys", expanding=True)
+"""Keys of the rows of `grouped`."""
 
 
 def insert(connection: Connection, table: Table, **values: Any) -> int:
     """Insert a row; returns its id."""
-    key = connection.execute(table.insert().values(**values)).inserted_primary_key
+    key = connection.execute(_into(table), values).inserted_primary_key
     assert key is not None  # noqa: S101  every table here has a key of one column
     return int(key[0])
 
 
-def find_or_insert(connection: Connection, table: Table, **key: Any) -> int:
+def find_or_insert(connection: Connection, table: Table, **key: str | int) -> int:
     """Find the row with these values, or insert it; returns its id."""
-    found = connection.execute(select(table.c.id).filter_by(**key)).scalar_one_or_none()
+    found = connection.execute(_id_by(table, *key), key).scalar_one_or_none()
     return insert(connection, table, **key) if found is None else int(found)
+
+
+# Building a statement and its cache key takes SQLAlchemy longer than executing it.
+
+
+@cache
+def _into(table: Table) -> Insert:
+    return table.insert()
+
+
+@cache
+def _id_by(table: Table, *names: str) -> Select[Any]:
+    return select(table.c.id).where(*(table.c[name] == bindparam(name) for name in names))
 
 
 def batches(keys: Iterable[_Key]) -> Iterator[list[_Key]]:
@@ -36,16 +61,16 @@ def batches(keys: Iterable[_Key]) -> Iterator[list[_Key]]:
 
 
 def grouped(
-    connection: Connection, query: Select[Any], column: Any, keys: Iterable[int]
+    connection: Connection, query: Select[Any], column: str, keys: Iterable[int]
 ) -> dict[int, list[dict[str, Any]]]:
-    """Rows of an ordered query, grouped by the value of `column`, for these keys."""
+    """Rows of an ordered query with `column.in_(KEYS)`, grouped by the value of this column."""
     found = defaultdict(list)
     for some in batches(keys):
-        rows = connection.execute(query.where(column.in_(some)))
+        rows = connection.execute(query, {KEYS.key: some})
         names = list(rows.keys())  # once: each row of a result would look them up anew
         for row in rows:
             each = dict(zip(names, row, strict=True))
-            found[each[column.name]].append(each)
+            found[each[column]].append(each)
     return found
 
 
