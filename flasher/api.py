@@ -708,7 +708,7 @@ def prepare(
         identity = profile.identity(
             release=beside,
             waived=frozenset(check for check in WAIVABLE if check.value in names),
-            goes_on_unchecked=at_power_up,
+            reports_unchecked=at_power_up,
         )
     release = identity.release
     plan = plan_for(with_release(loaded, release), profile, bitrate_bps)

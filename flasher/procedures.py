@@ -642,7 +642,7 @@ def _check_no_other_tool(survey: Survey) -> None:
 def _no_answer(asked: Query) -> NoAnswerError:
     item = asked.request.item
     node = item.receiver.name if item.receiver else "bus"
-    misfit = asked.misfit
+    misfit = asked.misformatted
     if misfit is None:
         cause = "it is off, asleep or not connected, it speaks the other dialect, or it is an older"
         cause += " device that does not know the question"
@@ -684,7 +684,7 @@ def _reading(entry: Readable, asked: Query | None) -> ItemReading:
     if asked is None:
         return ItemReading(entry.name, entry.item, None, was_asked=False)
     misfit = ""
-    if asked.answer is None and asked.misfit is not None:
-        came = asked.misfit
+    if asked.answer is None and asked.misformatted is not None:
+        came = asked.misformatted
         misfit = f"{came.command:04X} with {len(came.data)} bytes, mode {came.mode:02X}"
     return ItemReading(entry.name, entry.item, asked.answer, misfit)

@@ -80,7 +80,7 @@ class ImageOptions:
     )]  # fmt: skip
     allow_outside_vector: Annotated[bool, option(
         "--allow-outside-vector", is_flag=True, panel="image",
-        help=f"send {WAIVERS[OUTSIDE_VECTOR].lets_through}",
+        help=f"send {WAIVERS[OUTSIDE_VECTOR].permits}",
     )]  # fmt: skip
 
     def load(self, *, force: bool = False) -> Image:
@@ -104,7 +104,7 @@ def allow_implausible_option(panel: str | None = None) -> Decorator:
         "--allow-implausible",
         is_flag=True,
         panel=panel,
-        help=f"let through {WAIVERS[IMPLAUSIBLE].lets_through}",
+        help=f"let through {WAIVERS[IMPLAUSIBLE].permits}",
     )
 
 

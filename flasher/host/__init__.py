@@ -1,1 +1,1 @@
-"""The tool's side as pure engines: protocol and image, without bus and clock."""
+"""Upgrades, queries and identity checks of the tool, as pure engines without bus and clock."""

@@ -1,11 +1,11 @@
-"""Detects a second device of the same kind (R27) by traffic that a single one does not cause; pure.
+"""Detection of a second device of the same kind on the bus (R27); pure.
 
-A message that was sent once is answered once. Call `asked` and `left` for every message sent,
-`heard` and `see` for everything received. Evidence of a second device:
+One device answers each message once. `request_sent` and `upgrade_message_sent` take every message
+sent, `received` and `frame_received` all that arrives. Evidence of a second device:
 
 - the reset, a packet or end of transfer has more answers than copies sent; or a query has, twice in
   a row (an answer on a broadcast id may belong to an unseen query);
-- two units report different versions or serial numbers, or announce different boot versions;
+- answers differ in version or serial number, or bootloaders announce different versions;
 - the announcements of two bootloaders alternate, or one continues while an application sends;
 - a packet is acknowledged after a bootloader announced itself, or requested the transfer again,
   since the last update command;
@@ -37,24 +37,24 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message
 
 SECOND_DEVICE_WAIT_S: Final = 0.1
-"""How much later than the first device a second one is still detected."""
+"""Wait after an answer for the answer of a second device, in seconds."""
 _DOUBLED_S: Final = 0.0003
-"""Maximum distance of a message doubled by the link: on the wire, two messages take longer."""
+"""Maximum interval of a message and its copy made by the link: two messages take longer."""
 _CLEARLY_APART_S: Final = 0.002
-"""Minimum distance of an answer that was sent separately; frames of one message, or of consecutive
+"""Minimum interval of answers that were sent separately; frames of one message, or of consecutive
 messages, are closer."""
 _TOLERANCE: Final = 0.25
-"""Relative tolerance of the distance between announcements of one bootloader."""
+"""Relative tolerance of the interval between announcements of one bootloader."""
 _ODD_ANSWERS: Final = 2.0
-"""Packets with two answers that prove two devices: with the forgiven ones, three of twenty. A bad
-line makes one when it doubles the first frame of a packet: NAK, then ACK."""
-_FORGIVEN: Final = 0.05
-"""Reduction of that count with every packet."""
-_RUN: Final = 5
-"""Length of a run that is not accidental, although a bad line loses feedbacks."""
-_REMEMBERED: Final = 8
+"""Number of packets with two answers that proves two devices: with the decay below, three of
+twenty. A bad line makes one when it doubles the first frame of a packet: NAK, then ACK."""
+_DECAY: Final = 0.05
+"""Decrease of that number with every packet."""
+_RUN_MIN: Final = 5
+"""Length of a run of ACKs that is not accidental, although a bad line loses feedbacks."""
+_STORED_MAX: Final = 8
 """Maximum number of stored packets, and of different answers to one query."""
-_OF_A_TRANSFER: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
+_TRANSFER_ANSWERS: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
 _SENDER_MASK, _RECEIVER_MASK = 0x7F0, 0x00F
 
 Key = tuple[int, int]
@@ -63,8 +63,8 @@ Key = tuple[int, int]
 
 @dataclass
 class _Question:
-    """A query or write, identified by its answer, and counted in rounds. A round ends when every
-    copy is answered, or no answer can follow.
+    """Query or write with its answers, counted in rounds. A round ends when every copy is answered,
+    or no answer can follow.
     """
 
     key: Key
@@ -75,9 +75,9 @@ class _Question:
     asked_at: float = -inf
     answered_at: float = -inf
     is_odd: bool = False
-    """This round has an excess answer."""
+    """There were more answers than copies in this round."""
     odd_rounds: int = 0
-    """Number of consecutive rounds with an excess answer."""
+    """Number of consecutive rounds with more answers than copies."""
     contents: list[Content] = field(default_factory=list)
     """All different answers."""
 
@@ -87,19 +87,18 @@ class _Packet:
     """Copies and answers of one packet."""
 
     unacknowledged: int = 0
-    """Copies sent without an ACK; outlives an attempt, because an ACK may be late."""
+    """Copies sent without an ACK, also in earlier attempts, because an ACK may be late."""
     has_ack: bool = False
     has_nak: bool = False
     acked_at: float = -inf
     is_odd: bool = False
 
     def begin(self) -> None:
-        """Begin a new attempt."""
         self.has_ack = self.has_nak = self.is_odd = False
 
     @property
     def has_two_answers(self) -> bool:
-        """True if each copy has its ACK, and there were more answers. A line that spoils many
+        """True if each copy has its ACK, and there were more answers. A line that damages many
         frames causes several NAKs per copy, but no ACK.
         """
         all_acked = self.has_ack and self.unacknowledged <= 0
@@ -108,18 +107,18 @@ class _Packet:
 
 @dataclass
 class _Announcements:
-    """Announcements on one id."""
+    """Boot versions on one CAN id."""
 
     boot: BootVersion | None = None
     last_at: float = -inf
     times: deque[float] = field(default_factory=lambda: deque(maxlen=4))
-    """Times of the last ones since a reset or an update command."""
+    """Times of the last boot versions since a reset or an update command."""
     is_documented: bool = False
-    """Two consecutive ones were as far apart as documented."""
+    """Two consecutive boot versions came at the documented interval."""
 
 
-class _Balance:
-    """Counts messages sent against answers, which may come late from a device that hung."""
+class _OpenFeedbacks:
+    """Counts messages without feedback yet; a device that hung may send it late."""
 
     def __init__(self) -> None:
         self._open = 0
@@ -130,15 +129,15 @@ class _Balance:
         self._has_left = True
 
     def is_odd(self) -> bool:
-        """Count an answer; True if it is an excess one (never before anything was sent)."""
+        """Count a feedback; True for one without a message (never before the first message)."""
         if not self._open:
             return self._has_left
         self._open -= 1
         return False
 
 
-class _Runs:
-    """Runs of ACKs with and without feedback: one device confirms all messages or none (R15)."""
+class _FeedbackRuns:
+    """Runs of ACKs with and without general feedback: one device sends all or none (R15)."""
 
     def __init__(self) -> None:
         self._has_feedback = False
@@ -153,48 +152,48 @@ class _Runs:
         """Count an ACK; True once there were runs of both kinds."""
         self._length = self._length + 1 if self._has_feedback is self._is_confirmed else 1
         self._is_confirmed, self._has_feedback = self._has_feedback, False
-        if self._length >= _RUN:
+        if self._length >= _RUN_MIN:
             self._seen.add(self._is_confirmed)
         return len(self._seen) > 1
 
 
 class DuplicateDetector:
-    """Collects evidence of a second device on the bus."""
+    """Detects a second device by messages that a single one does not send."""
 
     def __init__(self, timings: Timings) -> None:
-        self._seen = ""
+        self._evidence = ""
         """First evidence; may be empty."""
         self._timings = timings
         self._questions: dict[Key, _Question] = {}
         self._announced: dict[int, _Announcements] = {}
         self._application_at: dict[int, float] = {}
-        """Time of the last message of an application, by sender."""
-        self.is_beside = False
-        """The last reset was confirmed while a bootloader announced itself."""
+        """Time of the last message of an application, by sender id."""
+        self.application_beside = False
+        """An application answered the last reset while a bootloader announced itself."""
 
         # The upgrade.
         self._update_was_sent = False
         self._requested_at = inf
         self._left_at = -inf
-        self._lost_by = ""
-        """Message since the last update command after which a single device has no transfer any
-        more."""
+        self._transfer_lost_by = ""
+        """Message since the last update command after which a single device cannot continue the
+        transfer."""
         self._packets: dict[int, _Packet] = {}
         self._packet = _Packet()
         """Current packet."""
         self._has_ack = False
-        """Since the last update command."""
-        self._feedbacks = _Balance()
-        """Feedbacks of the application, and of a bootloader that sends them too."""
-        self._confirmed = _Runs()
+        """A packet was acknowledged since the last update command."""
+        self._feedbacks = _OpenFeedbacks()
+        """General feedback of the application, and of a bootloader that sends it too."""
+        self._confirmed = _FeedbackRuns()
         self._last_row: tuple[object, float] = (None, -inf)
         self._has_ended = self._is_complete = False
         self._odd_answers = 0.0
 
     # -- what is sent -----------------------------------------------------------------------------
 
-    def asked(self, key: Key, now: float, item: Item | None = None) -> None:
-        """Note that a copy of a request was sent; `key` and `item` are its answer."""
+    def request_sent(self, key: Key, now: float, item: Item | None = None) -> None:
+        """Record that a copy of a request was sent; `key` and `item` are those of its answer."""
         question = self._questions.setdefault(key, _Question(key))
         is_answered = question.answers >= question.copies
         timings = self._timings
@@ -206,22 +205,22 @@ class DuplicateDetector:
         question.copies += 1
         question.asked_at = now
 
-    def left(self, command: Command, now: float, packet: int = 0) -> None:
-        """Note that a message of the upgrade was sent; `packet` is the number of a packet."""
+    def upgrade_message_sent(self, command: Command, now: float, packet: int = 0) -> None:
+        """Record that an upgrade message was sent; `packet` is the number of a packet."""
         if command is Command.RESET:
             self._forget_announcements(is_reset=True)
-            self.is_beside = False
+            self.application_beside = False
             self._feedbacks.left()
             return
         if command is Command.UPDATE:
             self._forget_announcements(is_reset=False)
-            self.is_beside = False
+            self.application_beside = False
             self._questions.clear()  # another application answers from now on
             for each in self._packets.values():
                 each.begin()
             self._packet = _Packet()
             self._update_was_sent = True
-            self._lost_by, self._requested_at = "", inf
+            self._transfer_lost_by, self._requested_at = "", inf
             self._is_complete = self._has_ack = False
         elif command is Command.PACKET:
             self._packet = self._packet_of(packet)
@@ -231,17 +230,17 @@ class DuplicateDetector:
         self._feedbacks.left()
 
     def _packet_of(self, number: int) -> _Packet:
-        """Return the entry of a packet, and forget packets that were fully answered long ago."""
+        """Return the record of a packet, and drop one that was answered long ago."""
         if number in self._packets:
             return self._packets[number]
-        self._odd_answers = max(0.0, self._odd_answers - _FORGIVEN)
-        if len(self._packets) >= _REMEMBERED:
+        self._odd_answers = max(0.0, self._odd_answers - _DECAY)
+        if len(self._packets) >= _STORED_MAX:
             answered = (key for key, each in self._packets.items() if each.unacknowledged <= 0)
             del self._packets[next(answered, min(self._packets))]
         return self._packets.setdefault(number, _Packet())
 
     def _forget_announcements(self, *, is_reset: bool) -> None:
-        """Forget announcements before a reset or update command."""
+        """Drop boot versions from before a reset or update command."""
         for announced in self._announced.values():
             announced.times.clear()
             if is_reset:
@@ -249,32 +248,32 @@ class DuplicateDetector:
 
     # -- what comes -------------------------------------------------------------------------------
 
-    def see(self, frame: Frame, now: float) -> None:
-        """Note a frame from any node: only applications send to other nodes than the tool."""
+    def frame_received(self, frame: Frame, now: float) -> None:
+        """Record a frame of any node: only applications send to other nodes than the tool."""
         if self._announced and frame.is_payload and frame.can_id & _RECEIVER_MASK != Node.CDL.value:
             self._application_at[frame.can_id & _SENDER_MASK] = now
 
-    def heard(self, found: Message | Damage, now: float) -> None:
+    def received(self, incoming: Message | Damage, now: float) -> None:
         """Process a received message or damaged bytes."""
-        if isinstance(found, Damage):
-            self._garbled(found, now)
+        if isinstance(incoming, Damage):
+            self._take_damage(incoming, now)
             return
-        key = found.can_id, found.command
+        key = incoming.can_id, incoming.command
         item = BY_KEY.get(key)
-        answer = None if item is None or item.mode != found.mode else answer_of(item)
+        answer = None if item is None or item.mode != incoming.mode else answer_of(item)
         if answer is not None:
-            self.asked(answer.key, now, answer)
+            self.request_sent(answer.key, now, answer)
             return
         if key in self._questions:
-            self._answered(self._questions[key], found, now)
+            self._answered(self._questions[key], incoming, now)
         else:
-            self._upgrade(found, now)
+            self._upgrade(incoming, now)
 
     # -- answers to questions ---------------------------------------------------------------------
 
     @property
-    def doubts(self) -> list[Item]:
-        """Queries with an excess answer, to be repeated."""
+    def ambiguous_queries(self) -> list[Item]:
+        """Queries with more answers than copies, to be repeated."""
         return [each.item for each in self._questions.values() if each.item and each.odd_rounds]
 
     @property
@@ -284,18 +283,18 @@ class DuplicateDetector:
 
     @property
     def evidence(self) -> str:
-        """Evidence of a second device, and how the answers of the two differ; may be empty."""
+        """Evidence of a second device with the values in which the answers differ; may be empty."""
         differences = "; ".join(
             f"{name} {' / '.join(values)}"
             for question in self._questions.values()
             for name, values in _differences(question.contents)
         )
-        if not self._seen or not differences:
-            return self._seen
-        return text("{seen}: {differences}", seen=self._seen, differences=differences)
+        if not self._evidence or not differences:
+            return self._evidence
+        return text("{seen}: {differences}", seen=self._evidence, differences=differences)
 
-    def _garbled(self, damage: Damage, now: float) -> None:
-        """Count a damaged answer: two at once destroy each other."""
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        """Count a damaged answer, because two simultaneous answers destroy each other."""
         data = damage.data
         command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
         second = data[FRAME_DATA_SIZE : 2 * FRAME_DATA_SIZE]
@@ -311,13 +310,13 @@ class DuplicateDetector:
         item, contents = question.item, question.contents
         if item is not None and len(message.data) == item.content.SIZE_BYTES:
             content = item.content.from_data(message.data)
-            if content not in contents and len(contents) < _REMEMBERED:
+            if content not in contents and len(contents) < _STORED_MAX:
                 contents.append(content)
         self._count(question, now)
         if len(contents) > 1 and hasattr(contents[0], "firmware_version"):
-            self._see_two(text("two devices answered"))
+            self._set_evidence(text("two devices answered"))
         elif question.is_odd and question.key[1] == Command.GENERAL_FEEDBACK:
-            self._see_two(text("one message was confirmed twice"))
+            self._set_evidence(text("one message was confirmed twice"))
 
     def _count(self, question: _Question, now: float) -> None:
         if now - question.answered_at < _DOUBLED_S:
@@ -330,12 +329,12 @@ class DuplicateDetector:
             question.is_odd = True
             question.odd_rounds += 1
             if question.odd_rounds > 1:
-                self._see_two(text("two devices answered"))
+                self._set_evidence(text("two devices answered"))
 
     # -- the upgrade ------------------------------------------------------------------------------
 
     def announces(self, answer_id: int, now: float) -> bool:
-        """True while a bootloader announces itself repeatedly."""
+        """True while a bootloader repeats its boot version."""
         announced = self._announced.get(answer_id)
         return announced is not None and now - announced.last_at <= self._longest_s
 
@@ -344,19 +343,19 @@ class DuplicateDetector:
         if self._update_was_sent:
             self._confirmed.note_feedback()
         else:
-            self.is_beside = self.is_beside or self.announces(answer_id, now)
+            self.application_beside = self.application_beside or self.announces(answer_id, now)
         if is_odd and not self._packets:
-            self._see_two(text("one message was confirmed twice"))
+            self._set_evidence(text("one message was confirmed twice"))
         elif is_odd:
             self._note_odd()
 
     def has_announced(self, answer_id: int) -> bool:
-        """True if a bootloader announced itself since the last reset or update command."""
+        """True if a boot version arrived since the last reset or update command."""
         announced = self._announced.get(answer_id)
         return announced is not None and bool(announced.times)
 
     def overlap(self, answer_id: int) -> bool:
-        """True if the last two announcements are too close for one bootloader."""
+        """True if the last two boot versions came too close together for one bootloader."""
         announced = self._announced.get(answer_id)
         if announced is None or len(announced.times) < 2:
             return False
@@ -384,22 +383,24 @@ class DuplicateDetector:
             self._take_feedback(message.can_id, now)
         if not self._update_was_sent:
             return
-        if self._is_complete and isinstance(row, _OF_A_TRANSFER):
-            self._see_two(text("one device continued a transfer that another one had completed"))
+        if self._is_complete and isinstance(row, _TRANSFER_ANSWERS):
+            self._set_evidence(
+                text("one device continued a transfer that another one had completed")
+            )
         match row:
             case messages.RequestTransfer():
                 self._requested_at = min(self._requested_at, now)
                 if self._has_ack:
-                    self._lost_by = text("request transfer came again")
+                    self._transfer_lost_by = text("request transfer came again")
             case messages.Ack(number):
                 self._acknowledged(number, now)
             case messages.Nak():
                 self._packet.has_nak = True
-                self._weigh(self._packet)
+                self._check_two_answers(self._packet)
             case messages.Complete():
-                if self._lost_by:
-                    self._see_two(
-                        text("{what}, yet the transfer was completed", what=self._lost_by)
+                if self._transfer_lost_by:
+                    self._set_evidence(
+                        text("{what}, yet the transfer was completed", what=self._transfer_lost_by)
                     )
                 self._is_complete = self._has_ended
 
@@ -410,28 +411,30 @@ class DuplicateDetector:
             announced.boot = boot
         elif boot != announced.boot:
             texts = [printable(f"{each.name} {each.version}") for each in (announced.boot, boot)]
-            self._see_two(
+            self._set_evidence(
                 text("bootloaders announced {one} and {other}", one=texts[0], other=texts[1])
             )
-        # Received frames are processed before anything is sent: this came after it.
+        # Received frames are processed before anything is sent, so this one came after it.
         after_request_s = self._left_at - self._requested_at
         if after_request_s > self._timings.leftover_boot_version_s and not self._has_ended:
-            self._lost_by = text("a bootloader announced itself")
+            self._transfer_lost_by = text("a bootloader announced itself")
         application_at = self._application_at.get(can_id & _SENDER_MASK, -inf)
         is_between = bool(times) and times[-1] < application_at < now
         if is_between and max(application_at - times[-1], now - application_at) <= self._longest_s:
-            self._see_two(text("a bootloader announced itself while an application was running"))
+            self._set_evidence(
+                text("a bootloader announced itself while an application was running")
+            )
         gap_s = now - (times[-1] if times else announced.last_at)
         is_documented = self._shortest_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
         announced.last_at = now
         times.append(now)
         if self._alternate(list(times), is_documented=announced.is_documented):
-            self._see_two(text("two bootloaders announced themselves alternately"))
+            self._set_evidence(text("two bootloaders announced themselves alternately"))
 
     def _alternate(self, times: list[float], *, is_documented: bool) -> bool:
-        """True if the last four announcements come from two bootloaders. One that is twice as fast
-        as documented has equal distances.
+        """True if the last four boot versions come from two bootloaders. One that is twice as fast
+        as documented has equal intervals.
         """
         if len(times) < 4 or not all(
             self._shortest_s <= later - earlier <= self._longest_s
@@ -445,27 +448,29 @@ class DuplicateDetector:
     def _acknowledged(self, number: int, now: float) -> None:
         self._has_ack = True
         if self._confirmed.note_ack():
-            self._see_two(text("some packets were confirmed by general feedback, others were not"))
-        if self._lost_by:
-            what = self._lost_by
-            self._see_two(
+            self._set_evidence(
+                text("some packets were confirmed by general feedback, others were not")
+            )
+        if self._transfer_lost_by:
+            what = self._transfer_lost_by
+            self._set_evidence(
                 text("{what}, yet packet {number} was acknowledged", what=what, number=number)
             )
         packet = self._packets.get(number)
         if packet is None:  # never sent, or long ago
             self._packet.has_nak = True
-            self._weigh(self._packet)
+            self._check_two_answers(self._packet)
             return
         packet.has_ack = True
         packet.unacknowledged -= 1
         if packet.unacknowledged < 0 and now - packet.acked_at > _CLEARLY_APART_S:
-            self._see_two(
+            self._set_evidence(
                 text("packet {number} was acknowledged more often than it was sent", number=number)
             )
         packet.acked_at = now
-        self._weigh(packet)
+        self._check_two_answers(packet)
 
-    def _weigh(self, packet: _Packet) -> None:
+    def _check_two_answers(self, packet: _Packet) -> None:
         if packet.has_two_answers and not packet.is_odd:
             packet.is_odd = True
             self._note_odd()
@@ -473,14 +478,14 @@ class DuplicateDetector:
     def _note_odd(self) -> None:
         self._odd_answers += 1
         if self._odd_answers >= _ODD_ANSWERS:
-            self._see_two(text("packets were answered more often than they were sent"))
+            self._set_evidence(text("packets were answered more often than they were sent"))
 
-    def _see_two(self, what: str) -> None:
-        self._seen = self._seen or what
+    def _set_evidence(self, what: str) -> None:
+        self._evidence = self._evidence or what
 
 
 def _differences(contents: list[Content]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each field that differs, with its values."""
+    """Yield label and values of each field in which contents differ."""
     for name, codec in contents[0].LAYOUT if contents else ():
         values = [f"{codec.show(getattr(each, name))} {codec.unit}".strip() for each in contents]
         if len(set(values)) > 1:

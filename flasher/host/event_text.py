@@ -1,4 +1,4 @@
-"""Texts of upgrade events for people."""
+"""Texts of upgrade events: warnings and progress lines for terminal and pages."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from flasher.wording import wording, wording_of
 
 _MINUTES_FROM_S: Final = 180.0
 _TRIES_SHOWN: Final = 10
-"""Every tenth try of a message, after 5 s without an answer, is shown without -v."""
+"""Without -v only every tenth try of a message is shown, after 5 s without an answer."""
 
 
 def reason_text(reason: str, what: str = "") -> str:
-    """Text of a reason of `MessageRepeated` and `AttemptStarted`."""
+    """Text of a repetition's reason (`MessageRepeated`, `AttemptStarted`)."""
     return wording_of("Reason", reason).replace("{what}", what)
 
 
 def warning_text(event: object) -> str:
-    """Text of an event that must not be missed; empty for any other event."""
+    """Text of an event that the user must see at once; empty for other events."""
     match event:
         case events.ShutdownHeard(sender):
             return f"the {sender} sent the command SHUTDOWN: it switches off"
@@ -44,7 +44,7 @@ def warning_text(event: object) -> str:
 
 
 def progress_line(event: object) -> tuple[str, int] | None:
-    """Return a line and the verbosity level that shows it; None for an event without a line."""
+    """Return the progress line of an event and the verbosity that shows it; None without one."""
     match event:
         case events.PhaseEntered(phase, _):
             return f"{wording(phase)} ...", 0

@@ -1,8 +1,7 @@
-"""Watches the whole bus during a session for a second tool and for SHUTDOWN; pure.
+"""Bus guard: detects a second tool, and SHUTDOWN of the battery, during an upgrade session; pure.
 
-A second tool: a frame with the id that only the tool uses, and that is not an echo of an own frame.
-A query (mode 11) is classified apart from all other messages, because it writes nothing. SHUTDOWN
-of the battery: it removes the power of every target.
+A second tool sends with the CAN id of the tool. Queries (mode 11) are distinguished from other
+messages, because they write nothing. SHUTDOWN switches off the supply of every target.
 """
 
 from __future__ import annotations
@@ -28,25 +27,25 @@ from flasher.protocol.wire import Message, Reassembler
 
 
 class ForeignFrame(NamedTuple):
-    """Frame of a second tool: description, whether a transfer may continue, and the queried command
-    (None if the frame does not begin a query).
+    """Frame of a second tool: its description, whether a transfer may continue, and the queried
+    command (None if it does not begin a query).
 
     The first frame of a message determines its kind. Other frames are harmless as long as they may
     be the rest of a query. More of them belong to a message whose beginning was missed, or was
     mistaken for an echo because it equals an own frame (a packet with the same number).
     """
 
-    seen: str
+    description: str
     is_harmless: bool
     query: int | None = None
 
 
 _QUERY_REST_FRAMES: Final = 2
-"""Frames after the first one of the longest query (4308, 19 bytes)."""
+"""Frames of the longest query (4308, 19 bytes) after its first one."""
 
 
 class Guard:
-    """Inspects every frame of both directions."""
+    """Inspects every received frame of a session."""
 
     def __init__(self, target: Target, timings: Timings) -> None:
         self._own_id = target.request_id
@@ -58,10 +57,10 @@ class Guard:
         self._rest_at = 0.0
         self._events: list[object] = []
         self.shutdown_heard = False
-        """The battery announced that it switches off."""
+        """The battery sent SHUTDOWN."""
 
     def see(self, frame: Frame, now: float) -> ForeignFrame | None:
-        """Inspect a received frame; return it if a second tool sent it."""
+        """Inspect a received frame; return its description if a second tool sent it."""
         frame_id = frame[0]
         if frame_id == self._own_id:
             return self._judge_own(frame, now)
@@ -72,7 +71,6 @@ class Guard:
         return None
 
     def take_events(self) -> list[object]:
-        """Return the events since the last call."""
         taken, self._events = self._events, []
         return taken
 
@@ -80,17 +78,17 @@ class Guard:
         if frame.is_echo or not frame.is_payload:
             return None
         data = frame.data
-        seen = f"frame {data.hex(' ')} with id 0x{frame.can_id:03X}, not sent by this tool"
+        description = f"frame {data.hex(' ')} with id 0x{frame.can_id:03X}, not sent by this tool"
         if len(data) < FRAME_DATA_SIZE or not data.startswith(HEADER):
             if now - self._rest_at > self._gap_s:
                 self._rest_frames = 0
             self._rest_frames, self._rest_at = self._rest_frames + 1, now
-            return ForeignFrame(seen, is_harmless=self._rest_frames <= _QUERY_REST_FRAMES)
+            return ForeignFrame(description, is_harmless=self._rest_frames <= _QUERY_REST_FRAMES)
         self._rest_frames = 0
         if data[len(HEADER)] != Mode.READ:
-            return ForeignFrame(seen, is_harmless=False)
+            return ForeignFrame(description, is_harmless=False)
         command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
-        return ForeignFrame(seen, is_harmless=True, query=command)
+        return ForeignFrame(description, is_harmless=True, query=command)
 
     def _note(self, message: Message) -> None:
         decoded = catalogue.decode(message)

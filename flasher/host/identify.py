@@ -1,10 +1,10 @@
-"""Identification: asks a device for its identity and state before anything is written to it.
+"""Identification of a device before an upgrade: version query, running information, second device.
 
-It asks for the version information (if the target has a query for it) and, for the battery, the
-running information. A device in its bootloader announces itself instead of answering: that ends the
-queries at once, so that the announcement can be answered within its window. Before the first query
-it listens briefly for another tool (`guard`); after the last one it waits for answers of a second
-device (`duplicates`).
+It queries the version information (if the target has a query for it) and, from the battery, the
+running information. A device in its bootloader sends boot versions instead of answers: that ends
+the queries at once, so that the update command is in time. Before the first query it listens
+briefly for another tool (`guard`); after the last one it waits for answers of a second device
+(`duplicates`).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from flasher.protocol.spec import Node, Target
 from flasher.protocol.wire import Message
 
 LISTEN_FIRST_S: Final = 0.1
-"""How long every querying command listens first. A tool that flashes sends more often, unless it
-waits for the device."""
+"""Time in seconds for which a command listens before its first query. A tool that flashes sends
+more often, unless it waits for the device."""
 
 
 class IdentifyStage:
-    """Listens, then sends all queries of the target. With `asks` False it only listens."""
+    """Listens for another tool, then sends the target's queries. Without `asks` it only listens."""
 
     def __init__(self, plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> None:
         self._requests = _requests(plan.target, options) if asks else []
@@ -39,21 +39,20 @@ class IdentifyStage:
         self._version_item = None if version is None else version.answer_item
         self._queries: list[Query] = []
         self.phase = Phase.LISTEN
-        """Current phase."""
         self.announcement: Message | None = None
-        """Boot version announced by the device; None without one."""
+        """Boot version received from the device; None without one."""
         self.two_devices = ""
         """Evidence of a second device; may be empty."""
         self.cancelled = False
 
     @property
     def asks(self) -> bool:
-        """False if nothing is queried: only the battery has queries (5.2)."""
+        """False if there is no query to send: only the battery has queries (table 7)."""
         return bool(self._requests)
 
     @property
-    def seen(self) -> DeviceAnswers:
-        """Answers of the device."""
+    def answers(self) -> DeviceAnswers:
+        """Answers of the device so far."""
         answers = [query.answer for query in self._queries]
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         version = next(
@@ -62,7 +61,7 @@ class IdentifyStage:
         return DeviceAnswers(version, running)
 
     def stage(self, run: Runner[Any]) -> Stage[IdentifyStage]:
-        """Listen and query; the result is this object."""
+        """Listen, then query; the result is this object."""
         item = self._version_item
         run.listen_always(self._answer_id, *(() if item is None else (item.can_id,)))
         run.emit(PhaseEntered(Phase.LISTEN, 1))
@@ -72,14 +71,14 @@ class IdentifyStage:
         self.phase = Phase.IDENTIFY
         if self._requests and self.announcement is None:
             run.emit(PhaseEntered(Phase.IDENTIFY, 1))
-            asking = ask_all(run, self._while_silent(), self._queries, stop_at_silence=True)
+            asking = ask_all(run, self._until_announced(), self._queries, stop_at_silence=True)
             yield from filtered(asking, self._look)
             if not self.cancelled and self.announcement is None:
                 yield from filtered(count_answers(run, self._queries), self._look)
         self.two_devices = run.duplicates.evidence
         return self
 
-    def _while_silent(self) -> Iterator[Request]:
+    def _until_announced(self) -> Iterator[Request]:
         for request in self._requests:
             if self.announcement is None:
                 yield request
@@ -89,7 +88,7 @@ class IdentifyStage:
             self._look((yield until))
 
     def _look(self, came: StageInput) -> StageInput:
-        """Process an input; an announcement ends the current query."""
+        """Process an input of a query; a boot version cancels the query."""
         self.cancelled = self.cancelled or came is Signal.CANCEL
         if not isinstance(came, Message):
             return came
@@ -100,13 +99,13 @@ class IdentifyStage:
 
 
 def identify(plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> Runner[IdentifyStage]:
-    """Run `IdentifyStage` as an engine."""
+    """Create an engine that runs an `IdentifyStage`."""
     asked = IdentifyStage(plan, options, asks=asks)
     return Runner(asked.stage, bitrate_bps=plan.bitrate_bps, timings=options.timings)
 
 
 def _requests(target: Target, options: UpgradeOptions) -> list[Request]:
-    """Return the queries of this target; may be empty (chapter 3)."""
+    """Return the version and state queries of a target; may be empty."""
     requests = []
     version = options.version_request_for(target)
     if version is not None:

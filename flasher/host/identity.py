@@ -1,9 +1,8 @@
-"""Identity checks: whether an image is meant for a device, before the first write to it.
+"""Identity checks: whether an image is for this device, before anything is written to it.
 
-`judge_image` checks the image and its manifest alone, `judge_device` compares them with the answers
-of the running application. The upgrade itself checks name and version of the bootloader when it
-announces itself. Each check has its own option to waive it. An impossible check has the verdict
-UNKNOWN.
+`judge_image` checks the image and its manifest, `judge_device` compares them with the answers of
+the running application. The upgrade itself checks name and version of the bootloader. Each check
+has its own option that waives it. A check that cannot be made has the verdict UNKNOWN.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from flasher.protocol.text import FirmwareVersion, printable
 
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_IN_USE_MA: Final = 1000
-"""More than lights and displays use, less than the motor."""
+"""Discharge current in mA: more than lights and displays use, less than the motor."""
 
 
 class IdentityCheck(Enum):
-    """Checks; the value is the name of the check and of the option that waives it."""
+    """Identity checks; the value is the check's name in events and in the option that waives it."""
 
     PLAUSIBLE = "implausible"
     TARGET = "other-target"
@@ -44,7 +43,7 @@ class IdentityCheck(Enum):
 
     @property
     def option(self) -> str:
-        """Option that waives it."""
+        """Command-line option that waives the check."""
         return f"--allow-{self.value}"
 
 
@@ -56,47 +55,47 @@ WAIVABLE: Final = (
     IdentityCheck.PREVIOUS,
     IdentityCheck.IN_USE,
 )
-"""Checks that can refuse an upgrade; the others only report."""
+"""Checks that can refuse an upgrade; the others only warn."""
 _ENDINGS: Final[Mapping[IdentityCheck, Ending]] = {
     IdentityCheck.PLAUSIBLE: Ending.IMPLAUSIBLE,
     IdentityCheck.IN_USE: Ending.IN_USE,
     IdentityCheck.SAME_VERSION: Ending.UP_TO_DATE,
 }
-"""How a refused check ends the session, if not with NOT_FOR_DEVICE."""
+"""Ending of a session by its refused check, if not NOT_FOR_DEVICE."""
 
 
 class CheckVerdict(Enum):
-    """Result of a check; the value is its name in events."""
+    """Verdict of an identity check; the value is its name in events."""
 
     PASSED = "passed"
     UNKNOWN = "unknown"
-    """Nothing to compare with."""
+    """There was no value to compare with."""
     WARNED = "warned"
     WAIVED = "waived"
     REFUSED = "refused"
     SKIPPED = "skipped"
-    """Not upgraded, as requested."""
+    """The upgrade is skipped, as requested."""
 
 
 class CheckResult(NamedTuple):
-    """A check with its result in one sentence."""
+    """Identity check with its verdict and a sentence about it."""
 
     check: IdentityCheck
     verdict: CheckVerdict
     text: str
-    other_ways: str = ""
-    """Alternatives to the option; continues the sentence that names the option."""
+    other_waivers: str = ""
+    """Other ways to waive the check; continues the sentence that names the option."""
     is_unchecked: bool = False
-    """True if nothing contradicts, but a rule could not be checked."""
+    """True if a rule of the manifest could not be checked."""
 
     @property
     def event(self) -> CheckMade:
-        """The event that reports it."""
+        """Event that reports the result."""
         return CheckMade(self.check.value, self.verdict.value, self.text)
 
     @property
     def ending(self) -> Ending | None:
-        """How it ends the session; None if it does not."""
+        """Ending of the session that the result causes; None if the session continues."""
         if self.verdict not in (CheckVerdict.REFUSED, CheckVerdict.SKIPPED):
             return None
         if self.is_unchecked:
@@ -105,49 +104,49 @@ class CheckResult(NamedTuple):
 
     @property
     def waiver(self) -> str:
-        """Name of the check if it can be waived."""
+        """Name of the check if it can be waived, else empty."""
         return self.check.value if self.check in WAIVABLE else ""
 
     @property
     def detail(self) -> str:
-        """The problem, and the option that waives it."""
+        """The problem, and the options that waive the check."""
         if not self.waiver:
             return self.text
-        return f"{self.text}; {self.check.option} waives this{self.other_ways}"
+        return f"{self.text}; {self.check.option} waives this{self.other_waivers}"
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Requirements and limits for the checks before an upgrade."""
+    """Rules and limits for the identity checks of an upgrade."""
 
     release: Release | None = None
-    """Release of the image's manifest, if any."""
+    """Manifest of the image, if any."""
     waived: frozenset[IdentityCheck] = frozenset()
     skip_same_version: bool = False
     low_charge_percent: int = DEFAULT_LOW_CHARGE_PERCENT
     """Warn below this state of charge."""
     in_use_ma: int = DEFAULT_IN_USE_MA
-    """A larger discharge current means that the vehicle is in use."""
-    goes_on_unchecked: bool = False
-    """Only report rules of the manifest that cannot be checked: for a rescue, because the device
-    runs no application."""
+    """Discharge current in mA above which the vehicle counts as in use."""
+    reports_unchecked: bool = False
+    """Only report rules of the manifest that cannot be checked, because the device runs no
+    application (rescue)."""
     cpu: Cpu = Cpu.CORTEX_M
-    """Processor type of the device; an image is expected to look like a program for it."""
+    """Processor type of the device, for the plausibility check."""
 
-    def vouches_for(self, image: Image) -> bool:
-        """True if the manifest is of these exact bytes."""
+    def matches_bytes(self, image: Image) -> bool:
+        """True if the manifest contains the SHA-256 of this image."""
         return self.release is not None and self.release.sha256 == image.sha256
 
-    def refusal(self, check: IdentityCheck, text: str, other_ways: str = "") -> CheckResult:
-        """Create the result of a failed check: refused or waived."""
+    def refusal(self, check: IdentityCheck, text: str, other_waivers: str = "") -> CheckResult:
+        """Create the result of a failed check: refused, or waived."""
         verdict = CheckVerdict.WAIVED if check in self.waived else CheckVerdict.REFUSED
-        return CheckResult(check, verdict, text, other_ways)
+        return CheckResult(check, verdict, text, other_waivers)
 
     def uncheckable(self, check: IdentityCheck, text: str) -> CheckResult:
         """Create the result for a rule of the manifest that cannot be checked. It refuses like a
         failed rule, but --allow-hardware also waives it.
         """
-        if self.goes_on_unchecked:
+        if self.reports_unchecked:
             return CheckResult(
                 IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, f"{text}: goes on unchecked"
             )
@@ -158,25 +157,25 @@ class Identity:
 
 @dataclass(frozen=True)
 class DeviceAnswers:
-    """Answers of the running application; None if it did not answer or was not asked."""
+    """Answers of the running application; None for a missing answer."""
 
     version: Content | None = None
     running: RunningInformation | None = None
 
     @property
     def hardware_version(self) -> str | None:
-        """Escaped."""
+        """Hardware version, escaped; None if not answered."""
         hardware = getattr(self.version, "hardware_version", None)
         return None if hardware is None else str(hardware)
 
     @property
     def firmware_version(self) -> str | None:
-        """Escaped."""
+        """Firmware version, escaped; None if not answered."""
         return None if self.version is None else firmware_version(self.version)
 
 
 def new_version(image: Image, release: Release | None) -> str | None:
-    """Version of the image: the one inside it, else the manifest's."""
+    """Firmware version in the image, else in the manifest; None if unknown."""
     return image.version or (release.firmware_version if release else None)
 
 
@@ -184,7 +183,7 @@ def new_version(image: Image, release: Release | None) -> str | None:
 
 
 def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[CheckResult]:
-    """Check whether image and manifest match the target, and whether it can be a program."""
+    """Check that image and manifest are for the target, and that the image can be a program."""
     yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
@@ -208,7 +207,7 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
-    """Check whether the bytes can be a program for the device; no result if they look like one."""
+    """Check that the image can be a program for the device; no result if it looks like one."""
     found = find_doubt(image)
     if found is None:
         return
@@ -216,7 +215,7 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
     if not found.is_certain and identity.cpu is not Cpu.CORTEX_M:
         text += ": the profile names another processor"
         yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
-    elif not found.is_certain and identity.vouches_for(image):
+    elif not found.is_certain and identity.matches_bytes(image):
         text += ": the manifest was made for these very bytes"
         yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     else:
@@ -227,20 +226,20 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
 
 
 def judge_device(
-    image: Image, target: Target, identity: Identity, seen: DeviceAnswers
+    image: Image, target: Target, identity: Identity, answers: DeviceAnswers
 ) -> Iterator[CheckResult]:
-    """Compare the image with the application's answers; `seen` is empty without any."""
-    if seen.version is None:
+    """Compare image and manifest with the application's answers, which may be missing."""
+    if answers.version is None:
         yield _versions_unknown(identity, target)
     else:
-        yield _hardware(identity, seen.hardware_version)
-        yield from _versions(image, identity, seen.firmware_version or "")
-    if seen.running is not None:
-        yield from _state(identity, seen.running)
+        yield _hardware(identity, answers.hardware_version)
+        yield from _versions(image, identity, answers.firmware_version or "")
+    if answers.running is not None:
+        yield from _state(identity, answers.running)
 
 
 def _versions_unknown(identity: Identity, target: Target) -> CheckResult:
-    """Result when the application does not answer, or has no query for its versions."""
+    """Result for an application that does not answer, or has no version query."""
     release = identity.release
     hardware = release is not None and bool(release.hardware_versions)
     previous = release is not None and release.rules_previous
@@ -289,7 +288,7 @@ def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
 
 
 def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckResult]:
-    """Compare the running version with the new one and with the manifest's rule."""
+    """Compare the running version with the new one and with the manifest's rules."""
     release = identity.release
     if release is not None:
         yield from _previous(release, identity, running)
@@ -322,7 +321,7 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
 
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:
-    """Check the manifest's rule about the replaced version, if any."""
+    """Check the manifest's rules about the version to be replaced, if any."""
     if not release.rules_previous:
         return
     if release.fits_previous(running):
@@ -341,7 +340,7 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
-    """Check charge and current; a discharging current is negative (5.1)."""
+    """Check state of charge and current; a discharge current is negative (table 5)."""
     if running.mean_current_ma < -identity.in_use_ma:
         sentence = text(
             "the battery gives {current_ma} mA, more than {limit_ma} mA",

@@ -1,7 +1,7 @@
-"""Items that the tool can read from and write to a device, by name; derived from the catalogue.
+"""Readable and writable data items of a device, by name: serial number, user strings, memory, ...
 
-The name is the catalogue's title with dashes ("serial-number"). A writable item without a query of
-its own (serial number, model) is read as a field of the version information.
+An item's name is the catalogue's title with dashes ("serial-number"). A writable item without its
+own query (serial number, model) is read as a field of the version information.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _DATE: Final = re.compile(r"([0-9]{4})-?([0-9]{2})-?([0-9]{2})")
 
 @dataclass(frozen=True)
 class Readable:
-    """Readable item: its query, and one field of the answer (empty: all of it)."""
+    """Readable item: its query, and one field of the answer (empty for all fields)."""
 
     name: str
     item: Item
@@ -48,7 +48,7 @@ class Readable:
 
 @dataclass(frozen=True)
 class Writable:
-    """Writable item, and how to read it back."""
+    """Writable item, and the readable item that reads it back."""
 
     name: str
     item: Item
@@ -61,14 +61,14 @@ class Writable:
 
 
 def meaningful_fields(content: type[Content]) -> tuple[tuple[str, Codec], ...]:
-    """Return the fields of a content without reserved ones."""
+    """Return name and codec of each field that is not reserved."""
     return tuple(
         (name, codec) for name, codec in content.LAYOUT if not isinstance(codec, ReservedField)
     )
 
 
 def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
-    """Return the readable items of the target by name, without memory."""
+    """Return the readable items of a target by name, without memory."""
     queries = {
         name: Readable(name, item)
         for name, item in _named(target, dialect, Mode.READ)
@@ -83,7 +83,7 @@ def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
 
 
 def writable(target: Target, dialect: Dialect) -> dict[str, Writable]:
-    """Return the writable items of the target by name."""
+    """Return the writable items of a target by name."""
     reads = readable(target, dialect)
     return {
         name: Writable(name, item, reads[name])
@@ -103,7 +103,7 @@ def _named(target: Target, dialect: Dialect, mode: Mode) -> list[tuple[str, Item
 
 
 def _holder(item: Item, queries: Mapping[str, Readable]) -> Readable | None:
-    """Return the query whose answer contains the one field that `item` writes."""
+    """Find the query whose answer contains the only field that `item` writes."""
     (field, codec), *more = meaningful_fields(item.content)
     for query in queries.values():
         if not more and (field, codec) in query.content.LAYOUT:
@@ -135,7 +135,7 @@ def find_item(name: str, among: Mapping[str, NamedItem], target: Target, verb: s
 
 
 def make_content(writable: Writable, values: Sequence[object]) -> Content:
-    """Create the content to write, from one value per field: text, a date (YYYYMMDD), bytes in
+    """Create the content of a write from one value per field: text, a date (YYYYMMDD), or bytes in
     hexadecimal.
 
     Raises UsageError if a value is missing, superfluous, or does not fit its field.
@@ -172,7 +172,7 @@ def _value(name: str, codec: Codec, value: object) -> Any:
 
 
 def check_date(text: str) -> str:
-    """Convert a date to YYYYMMDD. Raises UsageError if the calendar does not have it."""
+    """Convert a date to YYYYMMDD. Raises UsageError for an invalid date."""
     match = _DATE.fullmatch(text)
     if match is None:
         raise UsageError(f"date: {text!a} is not a date YYYYMMDD.")

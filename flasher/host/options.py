@@ -1,4 +1,4 @@
-"""Upgrade options of users and products, and the resulting overall deadline."""
+"""Options of an upgrade (attempts, gaps, version query, ...), and its overall deadline."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
 PATIENT_TRIES: Final = 60
-"""Maximum number of transmissions of a packet while the device has no application to lose: 30 s
-without an answer."""
+"""Maximum number of transmissions of a packet to a device without application: 30 s without an
+answer."""
 ERASURES_MAX: Final = 20
-"""Maximum number of erasures in one upgrade without user limit, because flash wears out. In the
-campaign tests/campaigns/world no device needed more than ten."""
+"""Maximum number of erasures in one upgrade without user limit, because flash wears out. No device
+of the campaign tests/campaigns/world needed more than ten."""
 OTHER_TOOL_QUIET_S: Final = 2.0
-"""Required silence of another tool that wrote to an erased device, before the upgrade is
+"""Silence required of another tool that wrote to an erased device, before the upgrade is
 repeated."""
 DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
-"""Enough time to walk to the bicycle and unplug its battery."""
+"""Time to walk to the bicycle and unplug its battery."""
 DEFAULT_ADAPTER_RETURN_S: Final = 5.0
-"""Enough time to plug in a USB adapter again."""
+"""Time to plug in a USB adapter again."""
 BRIEF_ADAPTER_RETURN_S: Final = 0.8
-"""Before anything was sent there is nothing to save. A bus-off recovers within this time."""
+"""Time limit before anything was sent, when only a bus-off is worth waiting for."""
 FRAME_GAP_SHARE: Final = 0.8
-"""Maximum gap between two frames, as a share of the time after which their receiver drops the
-message (R12); the rest is a margin for late wake-ups."""
+"""Maximum gap between two frames, as a share of the receiver's inter-frame timeout (R12); the rest
+is a margin for late wake-ups."""
 PACKET_GAP_MAX_S: Final = 10.0
-"""A device that waits longer has probably given up."""
+"""Longer than a device waits for a packet."""
 
 
 @dataclass(frozen=True)
 class UpgradeOptions:
-    """Upgrade options of a user or a product; the defaults are this project's readings.
+    """Options of an upgrade, from user and target profile.
 
     Raises UsageError for gaps that make an upgrade impossible.
     """
 
     timings: Timings = DEFAULT_TIMINGS
     attempts: int | None = None
-    """Maximum number of attempts, after a restart of the device, a lost and restored adapter, or a
-    packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS`, and until the overall deadline once
-    the device has no application."""
+    """Maximum number of attempts, each after a restart of the device, a lost and restored adapter,
+    or a packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS`, and until the overall deadline
+    once the device has no application."""
     single_session: bool = False
-    """Never start over: a device that restarted may be another one. A lost adapter may be restored,
-    up to `attempts` times, while the device continues."""
+    """Never start over, because a device that restarted may be another one. A lost adapter may be
+    restored, up to `attempts` times, while the device continues."""
     waits_for_other_tool: bool = True
     """Repeat the upgrade of an erased device when another tool that wrote to it is silent, while an
     attempt is left. False: end at once."""
@@ -58,31 +58,31 @@ class UpgradeOptions:
     """Tries per packet and attempt once the device has no application and `attempts` is None. None:
     `PATIENT_TRIES`, or the value of `timings` if that is not the default."""
     timeout_s: float | None = None
-    """Overall deadline; None computes it from the plan."""
+    """Overall deadline in seconds; None computes it from the plan."""
     frame_gap_s: float = 0.0
-    """Silence between the frames of one message, for slow receivers."""
+    """Silence between frames of a message, in seconds, for slow receivers."""
     packet_gap_s: float = 0.0
-    """Silence before each packet and before end of transfer, for slow receivers."""
+    """Silence before each packet and before end of transfer, in seconds, for slow receivers."""
     nak_next_is_ack: bool = False
-    """Take NAK n+1 for ACK n when n was sent more than once (R10)."""
+    """Accept NAK n+1 as ACK n if packet n was sent more than once (R10)."""
     reset_command: int = Command.RESET
     reset_data: bytes = b"RESET"
-    """Restarts the application into the bootloader; a product may have its own (R3)."""
+    """Command and data that restart the application into the bootloader (R3)."""
     version_request: Request | None = None
-    """Version query for the new application; None uses the document's, if any."""
+    """Version query for the new application; None uses the documented one, if any."""
     allow_boot_name: bool = False
-    """Accept a bootloader with another name than the target's, or without a version."""
+    """Accept a bootloader with another name than the target's, or without a valid version."""
     minimum_boot_version: str | None = None
-    """Oldest accepted bootloader, as `Vx.x.x`; None accepts any."""
+    """Oldest accepted bootloader version, as `Vx.x.x`; None accepts all."""
     at_power_up: bool = False
-    """Send no reset; wait for the announcement of a device that is switched on."""
+    """Send no reset; wait for the boot version of a device that is switched on."""
     in_session: bool = False
-    """An earlier upgrade may have left the device in its session: if it is silent, and does not
-    answer a reset, send an update command (R26) before asking for a power cycle."""
+    """An earlier upgrade may have left the device in its transfer: if it stays silent after a
+    reset, send an update command (R26) before asking for a power cycle."""
     power_up_timeout_s: float = DEFAULT_POWER_UP_TIMEOUT_S
-    """Time limit for such an announcement."""
+    """Maximum wait for a boot version at power-up, in seconds."""
     adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
-    """Time limit for a lost adapter to come back once anything was sent."""
+    """Maximum wait for a lost adapter, in seconds, once anything was sent."""
 
     def __post_init__(self) -> None:
         limit_s = FRAME_GAP_SHARE * self.timings.inter_frame_timeout_s
@@ -109,7 +109,7 @@ class UpgradeOptions:
 
     @property
     def tries_without_application(self) -> int:
-        """Maximum tries per packet and attempt when nothing can be lost."""
+        """Maximum tries per packet and attempt when the device has no application to lose."""
         if self.patient_tries is not None:
             return self.patient_tries
         tries = self.timings.packet_tries
@@ -117,11 +117,11 @@ class UpgradeOptions:
 
     @property
     def boot_timeout_s(self) -> float:
-        """Time limit for a boot version."""
+        """Maximum wait for a boot version, in seconds."""
         return self.power_up_timeout_s if self.at_power_up else self.timings.boot_version_timeout_s
 
     def version_request_for(self, target: Target) -> Request | None:
-        """Return the version query of this target; None if unknown."""
+        """Return the version query of a target; None if it has none."""
         if self.version_request is not None:
             return self.version_request
         item = BY_KEY.get((target.request_id, Command.READ_VERSION))
@@ -134,19 +134,19 @@ def firmware_version(answer: Content) -> str:
 
 
 def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
-    """Overall deadline: the chosen one, else the plan's default."""
+    """Overall deadline in seconds: the chosen one, else `default_timeout_s`."""
     return default_timeout_s(plan, options) if options.timeout_s is None else options.timeout_s
 
 
 def gaps_s(plan: Plan, options: UpgradeOptions) -> float:
-    """Total of all requested gaps in an upgrade without errors."""
+    """Total seconds of the requested gaps in an upgrade without errors."""
     between_frames = plan.host_frames - plan.host_messages
     return options.frame_gap_s * between_frames + options.packet_gap_s * (plan.total_packets + 1)
 
 
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
-    """Overall deadline of a plan: every attempt with every wait at its limit. It never cuts off a
-    device that answers in time, only one that keeps requiring repetitions.
+    """Overall deadline in seconds: every attempt with every wait at its limit. It stops only a
+    device that needs repetition after repetition, never one that answers in time.
     """
     timings = options.timings
     answers_s = timings.ack_timeout_s * plan.total_packets

@@ -1,4 +1,4 @@
-"""Outcome of an upgrade: how it ended, the state of the device, and the error to raise.
+"""Outcome of an upgrade: its ending, the state of the device, statistics, and the error to raise.
 
 Three claims are distinct: "transferred" (every packet acknowledged), "completed" (confirmed by the
 device), and "running version X" (answered by the new application).
@@ -35,7 +35,7 @@ from flasher.wording import wording
 
 
 class DeviceLeft(Enum):
-    """State in which the device was left, as far as the host can know."""
+    """State in which an upgrade left the device, as far as the tool can know."""
 
     UNTOUCHED = "untouched"
     PERHAPS_ERASED = "perhaps_erased"
@@ -45,13 +45,13 @@ class DeviceLeft(Enum):
 
     @property
     def needs_rescue(self) -> bool:
-        """True if it has no application, or perhaps none."""
+        """True if the device has no application, or perhaps none."""
         return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW)
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Figures of one upgrade; times in seconds."""
+    """Statistics of an upgrade; times in seconds."""
 
     attempts: int = 0
     packets_acknowledged: int = 0
@@ -65,7 +65,7 @@ class Statistics:
 
 
 def describe_progress(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
-    """Describe the progress of an upgrade."""
+    """Describe phase, packet and attempt of an upgrade."""
     where = text(wording(phase))
     if packet:
         where = text(
@@ -85,7 +85,7 @@ def describe_progress(phase: Phase, packet: int | None, total_packets: int, atte
 )
 @dataclass(frozen=True)
 class Outcome:
-    """How an upgrade ended."""
+    """Result of an upgrade: ending, phase, state of the device, statistics."""
 
     ending: Ending
     phase: Phase
@@ -102,10 +102,10 @@ class Outcome:
     # Observation that the ending alone does not convey.
     detail: str = ""
     waiver: str = ""
-    """Refusing check, if it can be waived and the ending does not imply it."""
+    """Check that refused the upgrade, if it can be waived and the ending does not imply it."""
     sent_into_silence: bool = False
-    """The device answered nothing, and got an update command: it might be in a session that an
-    earlier upgrade left open (R26)."""
+    """A silent device got an update command, in case an earlier upgrade left it in its transfer
+    (R26)."""
 
     @property
     def ok(self) -> bool:
@@ -124,18 +124,18 @@ class Outcome:
 
     @property
     def where(self) -> str:
-        """Phase, packet and attempt in words."""
+        """Phase, packet and attempt, as text."""
         return describe_progress(
             self.phase, self.packet, self.total_packets, self.statistics.attempts
         )
 
     @property
     def nothing_to_do(self) -> bool:
-        """True if the device already runs the version and was skipped as requested."""
+        """True if the device already runs the version and was skipped, as requested."""
         return self.ending is Ending.UP_TO_DATE
 
     def error(self) -> FlasherError | None:
-        """Create the error for this outcome; None for a good one, or if there was nothing to do."""
+        """Create the error for this outcome; None for a success, and if there was nothing to do."""
         if self.ok or self.nothing_to_do:
             return None
         explained = _EXPLANATIONS.get(self.ending)
@@ -183,7 +183,7 @@ def ended_before_start(
     duration_s: float,
     waiver: str = "",
 ) -> Outcome:
-    """Outcome of a session that ends before its upgrade has begun."""
+    """Create the outcome of a session that ended before its upgrade began."""
     return Outcome(
         ending=ending,
         phase=phase,
@@ -200,17 +200,17 @@ def ended_before_start(
 
 
 class _Explanation(NamedTuple):
-    """Error class of a bad ending, likely cause and remedy."""
+    """Error class, likely cause and remedy of an ending."""
 
     kind: type[FlasherError]
     cause: str
     remedy: str
     code: ErrorCode | None = None
-    """None: the code of the class."""
+    """None for the code of the class."""
 
 
 AGAIN: Final = "Run the same command again."
-"""Replaces {again} below."""
+"""Text of {again} in remedies."""
 
 TWO_DEVICES_CAUSE: Final = (
     "two devices of the same kind are on the bus, or one whose bootloader answers twice"
@@ -343,7 +343,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
     "by flasher rescue and a power cycle."
 )
-"""For a device that did not answer the update command into its silence either (R26)."""
+"""For a device that did not answer the update command sent into its silence either (R26)."""
 
 
 _TWO_PERHAPS_ERASED: Final = _Explanation(
@@ -352,7 +352,7 @@ _TWO_PERHAPS_ERASED: Final = _Explanation(
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
-    """Explanation of a passed deadline, by the phase reached."""
+    """Explain a missed deadline by the phase that was reached."""
     remedy = "Allow more time with --timeout, or find what is slow. {again}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:

@@ -1,4 +1,4 @@
-"""Queries and writes of chapter 3: send a request and wait for its answer.
+"""Queries and writes (chapter 3): send a request and wait for its answer.
 
 A request is sent every 200 ms until the answer arrives or 1 s has passed. A copy is sent only after
 the previous one was on the wire: a sleeping device acknowledges nothing, and the first frames may
@@ -36,11 +36,11 @@ _EMPTY: Final = Empty()
 
 @dataclass(frozen=True)
 class Request:
-    """Request: a row of the catalogue and its content.
+    """Query or write of the catalogue, with its content.
 
-    `accepts` can reject an answer that belongs to another request; an answer to a memory read must
-    name the requested addresses. `answer` is the answering row if the catalogue does not contain it
-    (a product's own query).
+    `accepts` can reject an answer that belongs to another request; the answer to a memory read must
+    contain the requested addresses. `answer` is the answer's catalogue row if the catalogue does
+    not contain it (a product's own query).
     """
 
     item: Item
@@ -50,14 +50,14 @@ class Request:
 
     @property
     def answer_item(self) -> Item:
-        """Answering row. Raises ValueError for a message without answer."""
+        """Catalogue row of the answer. Raises ValueError for a message without answer."""
         found = self.answer or catalogue.answer_of(self.item)
         if found is None:
             raise ValueError(f"{self.item.name} ({self.item.title}) has no answer")
         return found
 
     def is_answered_by(self, answer: Content) -> bool:
-        """Return False if the answer belongs to another request."""
+        """Return False for an answer that belongs to another request."""
         if self.accepts is not None:
             return self.accepts(answer)
         if isinstance(self.content, ReadMemory) and isinstance(answer, Memory):
@@ -66,8 +66,7 @@ class Request:
 
 
 class Query:
-    """A request in progress, with its result. `ask` runs it, and reports events unless it is
-    `quiet`.
+    """State and result of a request that `ask` sends; `quiet` suppresses its events.
 
     Raises ValueError if the content does not fit or the message has no answer.
     """
@@ -76,27 +75,26 @@ class Query:
         self.request = request
         self.quiet = quiet
         self.answer: Content | None = None
-        """Content of the answer; None until it arrives."""
+        """Answer; None until it arrives."""
         self.tries = 0
-        """How often the request was sent, including the current transmission."""
-        self.misfit: Message | None = None
-        """Last message with the serial number of the answer but another format."""
-        self.copies_left = 0
-        """Copies of the request that were sent."""
+        """Number of transmissions, with a current one."""
+        self.misformatted: Message | None = None
+        """Last message with the serial number of the answer but another mode or size."""
+        self.copies_sent = 0
+        """Number of copies of the request that were sent."""
         self.answers = 0
-        """Number of answers."""
         self.is_settled = False
-        """Every copy sent was answered."""
+        """Every sent copy was answered."""
         self.repeat_at = inf
         self.ends_at = inf
         self.cancelled = False
-        """It was cancelled before its answer arrived."""
+        """The query was cancelled before its answer arrived."""
         self.answer_item = request.answer_item
         message = catalogue.encode(request.item, request.content)
         self.frames = split(message.can_id, encode(message))
 
     def is_answer(self, message: Message) -> bool:
-        """Process a message received after the request was sent; True if it is the answer."""
+        """Process a message received after the request was sent; True for the answer."""
         expected = self.answer_item
         if (message.can_id, message.mode, message.command) != (
             expected.can_id,
@@ -113,8 +111,8 @@ class Query:
             self.answer = content
         return True
 
-    def note_misfit(self, message: Message) -> None:
-        """Keep a message with the answer's serial number but another format."""
+    def keep_misformatted(self, message: Message) -> None:
+        """Keep a message with the serial number of the answer but another mode or size."""
         expected = self.answer_item
         if message.can_id != expected.can_id:
             return
@@ -122,14 +120,14 @@ class Query:
             return
         # The serial number is the command's first byte; the second is a size (2.2.1).
         if message.command >> 8 == expected.command >> 8:
-            self.misfit = message
+            self.misformatted = message
 
 
 def ask(run: Runner[Any], query: Query) -> Stage[Query]:
-    """Run one query; see the module for the times."""
+    """Send a request until it is answered, by the times at the top of this module."""
     title = query.request.item.title
     run.tx.limit_left_at(run.now)
-    run.also_listen_on(query.answer_item.can_id, *_others_ask(query))
+    run.also_listen_on(query.answer_item.can_id, *_other_request_ids(query))
     query.repeat_at = run.now
     query.ends_at = run.now + run.timings.command_timeout_s
     came: StageInput = Signal.TIME
@@ -148,7 +146,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
                     why = Reason.QUERY_UNANSWERED.value
                     run.emit(events.MessageRepeated(title, why, query.tries))
             case Signal.LEFT:
-                _copy_left(run, query)
+                _copy_sent(run, query)
             case Message():
                 _take(run, query, came)
             case Damage() if came.can_id == query.answer_item.can_id and not query.quiet:
@@ -161,8 +159,8 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     return query
 
 
-def _others_ask(query: Query) -> set[int]:
-    """Ids on which other nodes send the same request."""
+def _other_request_ids(query: Query) -> set[int]:
+    """CAN ids on which other nodes send the same request."""
     return {
         item.can_id
         for item in catalogue.ITEMS
@@ -170,23 +168,23 @@ def _others_ask(query: Query) -> set[int]:
     }
 
 
-def _copy_left(run: Runner[Any], query: Query) -> None:
+def _copy_sent(run: Runner[Any], query: Query) -> None:
     timings, left_at = run.timings, run.tx.left_at
-    run.duplicates.asked(query.answer_item.key, run.now, query.answer_item)
-    query.copies_left += 1
+    run.duplicates.request_sent(query.answer_item.key, run.now, query.answer_item)
+    query.copies_sent += 1
     if query.answer is not None:
         query.ends_at = left_at + timings.quiet_after_repeat_s
         return
-    if query.copies_left == 1:
+    if query.copies_sent == 1:
         query.ends_at = left_at + timings.command_timeout_s
     query.repeat_at = left_at + timings.command_repeat_s
 
 
 def _take(run: Runner[Any], query: Query, message: Message) -> None:
     """Process a message; after an answer, wait for answers to the other copies."""
-    query.note_misfit(message)
+    query.keep_misformatted(message)
     # Before the request was sent, it answers another node.
-    if not query.copies_left or not query.is_answer(message):
+    if not query.copies_sent or not query.is_answer(message):
         return
     query.answers += 1
     if query.answers == 1 and query.answer is not None and not query.quiet:
@@ -194,7 +192,7 @@ def _take(run: Runner[Any], query: Query, message: Message) -> None:
         run.emit(events.QueryAnswered(title, query.answer, query.tries))
     query.repeat_at = inf
     run.tx.drop_unstarted()
-    query.is_settled = run.tx.idle and query.answers >= query.copies_left
+    query.is_settled = run.tx.idle and query.answers >= query.copies_sent
     query.ends_at = max(run.now, run.tx.left_at) + run.timings.quiet_after_repeat_s
 
 
@@ -205,10 +203,10 @@ def ask_all(
     *,
     stop_at_silence: bool = False,
 ) -> Stage[None]:
-    """Run several queries one after the other, and append them to `queries` as they begin.
+    """Run queries one after the other, and append each to `queries` when it begins.
 
     `requests` may be a generator. With `stop_at_silence` the first query without an answer is the
-    last.
+    last one.
     """
     for request in requests:
         query = Query(request)
@@ -219,26 +217,26 @@ def ask_all(
 
 
 def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
-    """Wait for a second device's answers, and repeat queries with an excess answer (R27)."""
+    """Wait for answers of a second device, and repeat queries with too many answers (R27)."""
     if not any(query.answers for query in queries):
         return
     if (yield from run.await_second_device()):
         return
     for query in queries:
-        if query.answer_item in run.duplicates.doubts:
+        if query.answer_item in run.duplicates.ambiguous_queries:
             yield from ask(run, Query(query.request, quiet=True))
             if (yield from run.await_second_device()):
                 return
 
 
 def report_two_devices(run: Runner[Any]) -> None:
-    """Report a second device, if detected."""
+    """Emit an event if a second device was detected."""
     if run.duplicates.evidence:
         run.emit(events.TwoDevicesSeen(run.duplicates.evidence))
 
 
 class Queries(Runner[None]):
-    """Several queries as an engine; see `ask_all`, and `count_answers` for `counts`."""
+    """Engine that runs several queries (`ask_all`), then `count_answers` if `counts` is set."""
 
     def __init__(
         self,
@@ -250,7 +248,7 @@ class Queries(Runner[None]):
         counts: bool = False,
     ) -> None:
         self.queries: list[Query] = []
-        """Queries begun, in order."""
+        """Queries sent so far, in order."""
         iterator = iter(requests)
         first = list(islice(iterator, 1))
         self._requests = chain(first, iterator)
@@ -267,7 +265,7 @@ class Queries(Runner[None]):
 
     @property
     def answers(self) -> list[Content | None]:
-        """One per query begun, in order."""
+        """Answers of the queries sent so far; None for a missing one."""
         return [query.answer for query in self.queries]
 
 
@@ -275,18 +273,18 @@ class Queries(Runner[None]):
 
 
 def memory_requests(start: int, end: int) -> Iterator[Request]:
-    """Yield requests for `start` up to `end`, exclusive (R5), of 128 bytes at most."""
+    """Yield memory reads of at most 128 bytes from `start` up to `end`, exclusive (R5)."""
     for at in range(start, end, MEMORY_PIECE_SIZE):
         yield Request(READ_MEMORY, ReadMemory(at, min(at + MEMORY_PIECE_SIZE, end)))
 
 
 def memory_bytes(answer: Memory) -> bytes:
-    """Bytes of an answer without the filler after them (R5)."""
+    """Memory contents in an answer, without filler (R5)."""
     return answer.content[: answer.end - answer.start]
 
 
 def check_range(start: int, end: int) -> None:
-    """Raise UsageError for an address range that the message cannot encode."""
+    """Raise UsageError for an address range that a memory read cannot encode."""
     if not 0 <= start < end <= ADDRESS_MAX:
         raise UsageError(
             f"0x{start:08X} to 0x{end:08X} is not a valid memory range.",

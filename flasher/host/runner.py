@@ -1,4 +1,4 @@
-"""Runs the stages of a dialogue with a device as one engine; pure.
+"""Runner: executes a dialogue with a device, written as generators, as one protocol engine; pure.
 
 A stage is a generator. It yields the time until which it waits (None: indefinitely), and receives
 the next input:
@@ -42,7 +42,7 @@ Stage = Generator[float | None, StageInput, T]
 
 
 class Runner(Generic[T]):
-    """Engine that runs one stage from its first `tick` to its result."""
+    """Engine that runs a stage from its first `tick` to its result."""
 
     def __init__(
         self,
@@ -56,20 +56,18 @@ class Runner(Generic[T]):
         self.bitrate_bps = bitrate_bps
         self.tx = Transmitter(bitrate_bps, frame_gap_s, timings.inter_frame_timeout_s)
         self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
-        """Return the next frame to send."""
         self.frame_sent: Callable[[float], Any] = self.tx.frame_sent
-        """Note that the adapter accepted it."""
         self.tx.on_message_sent = self._message_left
         self.now = 0.0
-        """Time of the current input."""
+        """Time of the current input, in seconds."""
         self.is_cancelled = False
-        """It was cancelled before its end."""
+        """The engine was cancelled before its end."""
         self.limit_at = inf
-        """When to cancel it unless it has ended."""
+        """Time at which the stage is cancelled unless it has ended."""
         self.watch: Callable[[Frame], bool] | None = None
-        """Inspects every frame; a frame for which it returns True is hidden from the stage."""
+        """Called with every received frame; if it returns True, the stage does not get it."""
         self.duplicates = DuplicateDetector(timings)
-        """Detects a second device; stages report their requests to it."""
+        """Detects a second device."""
         self._make_stage = stage
         self._stage: Stage[T] | None = None
         self._wake_at = 0.0  # at once
@@ -89,17 +87,17 @@ class Runner(Generic[T]):
     # -- for the stage ---------------------------------------------------------------------------
 
     def listen(self, *can_ids: int) -> None:
-        """Receive messages on these ids from now on, besides those of `listen_always`."""
+        """Receive messages on these CAN ids, besides those of `listen_always`."""
         fresh = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = fresh | self._always
 
     def listen_always(self, *can_ids: int) -> None:
-        """Receive messages on these ids until this is called again."""
+        """Receive messages on these CAN ids until the next call."""
         self._always = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = dict(self._always)
 
     def also_listen_on(self, *can_ids: int) -> None:
-        """Receive messages on these ids as well."""
+        """Receive messages on these CAN ids as well."""
         for can_id in can_ids:
             if can_id not in self._always:
                 self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
@@ -123,11 +121,11 @@ class Runner(Generic[T]):
         self._events.append(event)
 
     def emit_damage(self, damage: Damage) -> None:
-        """Report bytes that are not a message."""
+        """Report damaged bytes as an event."""
         self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
 
     def await_second_device(self) -> Stage[bool]:
-        """Wait for late messages of a second device; return True if cancelled."""
+        """Wait for late answers of a second device; return True if cancelled."""
         until = self.now + SECOND_DEVICE_WAIT_S
         came: StageInput = Signal.TIME
         while self.now < until and came is not Signal.CANCEL:
@@ -135,7 +133,7 @@ class Runner(Generic[T]):
         return came is Signal.CANCEL
 
     def finish_message(self) -> Stage[None]:
-        """Finish a partly sent message, unless the adapter accepts nothing more."""
+        """Send the rest of a partly sent message, unless the adapter accepts no more frames."""
         self.tx.drop_unstarted()
         give_up_at = self.now + self.timings.command_timeout_s
         while not self.tx.idle and self.now < give_up_at:
@@ -147,14 +145,14 @@ class Runner(Generic[T]):
         if self.done:
             return
         self.now = now
-        self.duplicates.see(frame, now)
+        self.duplicates.frame_received(frame, now)
         if self.watch is not None and self.watch(frame):
             return
         reassembler = self._listening.get(frame[0])
         if reassembler is None or not frame.is_payload:
             return
         for found in reassembler.feed(frame[1], now):
-            self.duplicates.heard(found, now)
+            self.duplicates.received(found, now)
             self._resume(found)
 
     def tick(self, now: float) -> None:
@@ -167,7 +165,7 @@ class Runner(Generic[T]):
         for reassembler in tuple(self._listening.values()):
             if now >= reassembler.due_at:
                 for found in reassembler.tick(now):
-                    self.duplicates.heard(found, now)
+                    self.duplicates.received(found, now)
                     self._resume(found)
         if now >= self.limit_at:
             self.cancel(now)
@@ -201,7 +199,7 @@ class Runner(Generic[T]):
         return taken
 
     def interrupt(self, interruption: Exception) -> None:
-        """Raise an exception in the waiting stage."""
+        """Raise an exception inside the stage."""
         if self._stage is not None and not self.done:
             try:
                 self._wait(self._stage.throw(interruption))
@@ -236,7 +234,7 @@ class Runner(Generic[T]):
 
 
 def filtered(stage: Stage[T], look: Callable[[StageInput], StageInput]) -> Stage[T]:
-    """Run a stage whose inputs first pass through `look`."""
+    """Run a stage whose inputs first pass through the function `look`."""
     try:
         until = next(stage)
         while True:

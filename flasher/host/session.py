@@ -1,4 +1,4 @@
-"""Upgrade session: identification, checks, upgrade and verification of one device.
+"""Upgrade session: identification, identity checks, upgrade and verification of one device.
 
 The stages run one after the other under one runner, so that simulator, command line and station run
 the same code. A guard watches the bus during all stages.
@@ -53,22 +53,21 @@ from flasher.protocol.spec import Node, can_id
 from flasher.wording import wording
 
 _NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
-"""Errors that a switched-off battery or a paused computer can explain."""
+"""Errors that may be caused by a switched-off battery or a pause of this computer."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a session: the outcome of the upgrade and of the verification."""
+    """Result of a session: outcome of the upgrade, and verification."""
 
     outcome: Outcome
     verification: Verification = NOT_ASKED
     shutdown_heard: bool = False
     """The battery sent SHUTDOWN during the session."""
     previous_version: str | None = None
-    """Version answered by the application before the upgrade, escaped; None if not asked or not
-    answered."""
+    """Firmware version before the upgrade, escaped; None if not answered."""
     stalled_s: float = 0.0
-    """Total of all pauses of this computer during the session (`events.HostStalled`)."""
+    """Seconds for which this computer paused during the session (`events.HostStalled`)."""
 
     @property
     def ok(self) -> bool:
@@ -84,11 +83,11 @@ class Result:
 
     @property
     def running_version(self) -> str | None:
-        """Version answered by the application, escaped."""
+        """Firmware version that the application reported, escaped; None if not answered."""
         return self.verification.running_version or self.outcome.running_version
 
     def error(self) -> FlasherError | None:
-        """Create the error for this result; None if it is good, or there was nothing to do."""
+        """Create the error for this result; None for a success, and if there was nothing to do."""
         error = self.outcome.error() or self.verification.error(self.outcome.target)
         if isinstance(error, _NO_CONTACT):
             if self.stalled_s:
@@ -100,11 +99,11 @@ class Result:
 
 
 class UpgradeSession(Runner[Result]):
-    """One session as an engine; begins with the first `tick`.
+    """Engine of an upgrade session; begins with the first `tick`.
 
     It listens for a second tool before it sends anything. With `identity` it then identifies the
     device, and checks the image against the answers before anything is written. A device awaited at
-    power-up is not asked, unless it may be in an open session.
+    power-up is not queried, unless an earlier upgrade may have left it in its transfer.
     """
 
     def __init__(
@@ -129,7 +128,7 @@ class UpgradeSession(Runner[Result]):
         self._guard = Guard(plan.target, self._options.timings)
         self.watch = self._watch_frame
         self._foreign_queries: set[int] = set()
-        """Commands of the reported foreign queries."""
+        """Commands of another tool's queries that were reported."""
         self._losses = 0
         self._began_at = 0.0
         # At power-up no application runs, and nothing is sent before the device announces itself. A
@@ -144,7 +143,7 @@ class UpgradeSession(Runner[Result]):
 
     @property
     def progress(self) -> str:
-        """Describe the progress."""
+        """Phase, packet and attempt, as text."""
         if self._checking is Level.NONE:
             return "listening for a second device"
         if self._checking is not None:
@@ -155,22 +154,22 @@ class UpgradeSession(Runner[Result]):
 
     @property
     def device_left(self) -> DeviceLeft:
-        """State of the device if nothing more were sent."""
+        """State of the device if the session ended now."""
         return self._upgrade.device_left if self._checking is None else DeviceLeft.NEW
 
     @property
     def has_begun_to_erase(self) -> bool:
-        """True once an update command is being sent or was sent, which may erase."""
+        """True once an update command is being sent or was sent, so that the device may erase."""
         return self._upgrade.has_begun_to_erase
 
     @property
     def goes_on(self) -> bool:
-        """True while only the overall deadline limits the attempts."""
+        """True while only the overall deadline limits the number of attempts."""
         return self._is_upgrading and self._upgrade.goes_on
 
     @property
     def may_begin_again(self) -> bool:
-        """True if an attempt is left for opening a lost adapter again."""
+        """True if the session can continue after a lost adapter is opened again."""
         is_last = self._losses + 1 >= self._options.planned_attempts
         if self.done or (is_last and not self.goes_on):
             return False
@@ -205,11 +204,11 @@ class UpgradeSession(Runner[Result]):
             try:
                 asked = yield from self._identified(self._identify)
             except SecondToolSeen as tool:
-                return self._end_early(Ending.SECOND_TOOL, tool.seen)
+                return self._end_early(Ending.SECOND_TOOL, tool.description)
             refused = self._refused(asked)
             if refused is not None:
                 return refused
-            previous = asked.seen.firmware_version
+            previous = asked.answers.firmware_version
             self._upgrade.announcement = asked.announcement
             self._identify = None
         self.limit_at = inf  # the upgrade observes its deadline itself
@@ -233,28 +232,30 @@ class UpgradeSession(Runner[Result]):
                 self._identify = identify = self._new_identify()
 
     def _refused(self, asked: IdentifyStage) -> Result | None:
-        """End the session if the identification requires it."""
+        """End the session if it was cancelled, or a second device or check forbids it."""
         if asked.cancelled:
             is_late = self.deadline_at is not None and self.now >= self.deadline_at
             return self._end_early(Ending.OUT_OF_TIME if is_late else Ending.CANCELLED, "")
         if asked.two_devices:
             return self._end_early(Ending.TWO_DEVICES, asked.two_devices)
-        if asked.seen != DeviceAnswers():
+        if asked.answers != DeviceAnswers():
             self._upgrade.in_session = False
         if self._identity is None:
             return None
-        return self._judge_device(self._identity, asked.seen, is_silent=asked.announcement is None)
+        return self._judge_device(
+            self._identity, asked.answers, is_silent=asked.announcement is None
+        )
 
     def _judge_device(
-        self, identity: Identity, seen: DeviceAnswers, *, is_silent: bool = False
+        self, identity: Identity, answers: DeviceAnswers, *, is_silent: bool = False
     ) -> Result | None:
-        findings = judge_device(self._plan.image, self._plan.target, identity, seen)
+        findings = judge_device(self._plan.image, self._plan.target, identity, answers)
         if is_silent and self._upgrade.in_session:
             return self._judge(map(self._postponed, findings))
         return self._judge(findings)
 
     def _postponed(self, finding: CheckResult) -> CheckResult:
-        """Postpone an uncheckable rule until a silent device shows its application."""
+        """Postpone a rule that a silent device cannot answer, until its application runs."""
         if finding.ending is None or not finding.is_unchecked:
             return finding
         self._upgrade.unchecked = finding
@@ -262,7 +263,7 @@ class UpgradeSession(Runner[Result]):
         return finding._replace(verdict=CheckVerdict.WARNED, text=sentence)
 
     def _judge(self, findings: Iterable[CheckResult]) -> Result | None:
-        """Report all findings; a refusing one ends the session."""
+        """Report all check results; the first refusal ends the session."""
         refused = None
         for finding in findings:
             self.emit(finding.event)
@@ -304,7 +305,7 @@ class UpgradeSession(Runner[Result]):
                 found = yield from check_memory(self, self._plan, running_version)
         except SecondToolSeen as tool:
             # The device has the image; its answers may be for the other tool.
-            return Verification(level, Verdict.SECOND_TOOL, None, tool.seen)
+            return Verification(level, Verdict.SECOND_TOOL, None, tool.description)
         if found.verdict is Verdict.INTERRUPTED and self.now >= (self.deadline_at or inf):
             return Verification(level, Verdict.NO_ANSWER, None, "the overall deadline passed")
         return found
@@ -312,7 +313,7 @@ class UpgradeSession(Runner[Result]):
     # -- beside the stages -----------------------------------------------------------------------
 
     def _watch_frame(self, frame: Frame) -> bool:
-        """Detect a second tool, and SHUTDOWN of the battery."""
+        """Detect a second tool and the battery's SHUTDOWN; True hides a frame from the stage."""
         if frame[0] == self._plan.target.answer_id:
             return False
         if frame[0] in self._application_ids and frame.is_payload:
@@ -325,7 +326,7 @@ class UpgradeSession(Runner[Result]):
         has_its_program = self._is_upgrading and not self._upgrade.has_begun_to_erase
         ends = self._identify is not None or has_its_program or not foreign.is_harmless
         if ends or self._upgrade.is_yielding:
-            self.interrupt(SecondToolSeen(foreign.seen))
+            self.interrupt(SecondToolSeen(foreign.description))
         elif foreign.query is not None and foreign.query not in self._foreign_queries:
             # It writes nothing, and CRC and repetition protect the data: ending here would leave a
             # device without an application.

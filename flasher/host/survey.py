@@ -1,7 +1,7 @@
-"""Bus survey: listens to all traffic and sends a few queries; an engine.
+"""Bus survey for `scan`: listens to all traffic, then queries the battery; an engine.
 
-It listens for a while, then sends its queries one after the other, and records the traffic of every
-node meanwhile. A silent node is not reported as absent: it may have nothing to send.
+The survey records the traffic of every node. A silent node is not reported as absent: it may have
+nothing to send.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage, Message
 
 _SENDERS: Final = {can_id(node, to): node for node in Node for to in (None, *Node)}
-"""Sender of each documented CAN id."""
+"""Sending node of each documented CAN id."""
 _UPGRADE: Final = {int(command): command.name.lower().replace("_", " ") for command in Command}
 _GIVE_UP_AFTER: Final = 3
-"""Unanswered queries after which a silent device is not asked any more."""
+"""Number of unanswered queries after which a silent device is not queried any more."""
 
 
 @dataclass
 class NodeTraffic:
-    """Traffic received from one node."""
+    """Traffic of one node."""
 
     node: Node
     frames: int = 0
     messages: Counter[str] = field(default_factory=Counter)
-    """Number of messages, by title with id and command."""
+    """Number of messages by title, which contains id and command."""
     last: dict[str, Content] = field(default_factory=dict)
     """Last content of each documented message."""
     damaged: int = 0
-    """Stretches of bytes that are not a message."""
+    """Number of damaged stretches of bytes."""
     boot_version: str = ""
-    """Announced name and version of its bootloader, escaped; may be empty."""
+    """Name and version in its boot versions, escaped; may be empty."""
     not_in_dialect: set[str] = field(default_factory=set)
     """Titles of messages that the chosen dialect lacks."""
 
 
 class Survey(Runner[None]):
-    """Listens for `listen_s`, then sends `requests`, unless another tool was detected, whose
-    upgrade they would disturb. `heard` is valid at any time.
+    """Listens for `listen_s` seconds, then sends `requests`, unless another tool was detected,
+    whose upgrade they would disturb. `heard` is valid at any time.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class Survey(Runner[None]):
         self.queries: list[Query] = []
         """Queries sent, in order."""
         self.foreign_frames = 0
-        """Frames with undocumented ids."""
+        """Number of frames with undocumented CAN ids."""
         self.cancelled = False
-        """It was cancelled while listening or during a query."""
+        """The survey was cancelled while listening or during a query."""
         self.other_tool_heard = False
-        """Another tool sent as CDL while listening, so that nothing was queried."""
+        """Another tool sent as CDL, so that no query was sent."""
         self._faults: Faults | None = None
         self._dialect = dialect
         self._ids: set[int] = set()
@@ -82,7 +82,7 @@ class Survey(Runner[None]):
 
     @property
     def faults(self) -> Faults | None:
-        """All faults reported by the BMS during the survey; None if none was reported."""
+        """Fault flags that the BMS sent during the survey; None if it sent none."""
         return self._faults
 
     def guess_dialect(self) -> tuple[Dialect | None, str]:
@@ -112,14 +112,14 @@ class Survey(Runner[None]):
                 return
         self.other_tool_heard = Node.CDL in self.heard
         if not self.other_tool_heard:
-            asking = ask_all(run, self._while_worth_it(requests), self.queries)
+            asking = ask_all(run, self._while_answered(requests), self.queries)
             yield from filtered(asking, self._take)
             yield from filtered(count_answers(run, self.queries), self._take)
             self.cancelled = any(query.cancelled for query in self.queries)
         report_two_devices(run)
 
-    def _while_worth_it(self, requests: Iterable[Request]) -> Iterable[Request]:
-        """Yield the requests until a device is silent to so many that it seems absent."""
+    def _while_answered(self, requests: Iterable[Request]) -> Iterable[Request]:
+        """Yield the requests until a device has left so many unanswered that it seems absent."""
         for count, request in enumerate(requests):
             node = request.item.receiver
             if count >= _GIVE_UP_AFTER and node is not None and node not in self.heard:
@@ -127,7 +127,7 @@ class Survey(Runner[None]):
             yield request
 
     def _count(self, frame: Frame) -> bool:
-        """Count a frame for its sender, and receive messages with its id from now on."""
+        """Count a frame for its sender, and receive messages with its CAN id from now on."""
         if frame.is_echo:
             return True
         node = _SENDERS.get(frame.can_id)

@@ -1,9 +1,9 @@
-"""State table of the upgrade, host side: action and next states for every event (appendix 3).
+"""State table of an upgrade, tool's side: action and next states for every event (appendix 3).
 
-The event is a received message or an expired timer. `TABLE[state][event]` names the action, a
-method of `flasher.host.upgrade.UpgradeStage`, and all states and endings to which it may lead.
-Guards (is it the current packet, is a try left) are in the actions, and so are the readings R1 to
-R28. A missing pair is a bug. The state diagram in the documentation is drawn from this table.
+An event is a received message or an expired timer. `TABLE[state][event]` names the action, a method
+of `flasher.host.upgrade.UpgradeStage`, and all states and endings to which it may lead. Guards (is
+it the current packet, is a try left) and readings (R1 to R28) are in the actions. A missing pair is
+a bug. The state diagram in the documentation is drawn from this table.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 
 class UpgradeState(Enum):
-    """States of the host; the value is the name in the documentation."""
+    """States of an upgrade on the tool's side; the value is the name in the documentation."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
 
@@ -32,7 +32,7 @@ class UpgradeState(Enum):
 
 
 class UpgradeEvent(Enum):
-    """Events of the upgrade; the value is the name in diagrams."""
+    """Events of an upgrade; the value is the name in diagrams."""
 
     __hash__ = object.__hash__
 
@@ -98,45 +98,45 @@ ENDED_BEFORE_START: Final = frozenset(
         Ending.UP_TO_DATE,
     }
 )
-"""Endings of a session before its upgrade begins: not in the table."""
+"""Endings of a session before its upgrade begins, which are not in the table."""
 
 
 class Reason(Enum):
-    """Why a message or the whole upgrade is repeated."""
+    """Reason why a message or the whole upgrade is repeated."""
 
     PACKET_REFUSED = "packet_refused"
     PACKET_UNANSWERED = "packet_unanswered"
     PACKET_GIVEN_UP = "packet_given_up"
-    """Refused or not answered: no try left, an attempt left."""
+    """The tries of a packet are exhausted, an attempt is left."""
     REQUEST_AGAIN = "request_again"
-    """Request transfer before ACK 1."""
+    """Request transfer came again before ACK 1."""
     REQUEST_LATE = "request_late"
-    """Request transfer during the transfer."""
+    """Request transfer came during the transfer."""
     REQUEST_GIVEN_UP = "request_given_up"
-    """No request transfer in time, an attempt left."""
+    """Request transfer did not come in time, an attempt is left."""
     RESTARTED = "restarted"
-    """Boot version of a restarted device."""
+    """The device sent a boot version, so it restarted."""
     BOOT_GIVEN_UP = "boot_given_up"
-    """No boot version from a device that received an update command, an attempt left."""
+    """A device that received an update command sent no boot version, an attempt is left."""
     BOOT_SILENT = "boot_silent"
-    """Neither boot version nor answer to the reset for the erase limit: an update command is
-    sent."""
+    """The device sent neither boot version nor feedback for the erase limit; it gets an update
+    command."""
     END_REFUSED = "end_refused"
-    """First NAK after end of transfer."""
+    """The device answered end of transfer by NAK for the first time."""
     END_UNANSWERED = "end_unanswered"
     SECOND_TOOL = "second_tool"
     """Another tool wrote to the device and is silent now."""
     LINK_BACK = "link_back"
-    """The adapter was lost and is back."""
+    """The adapter was lost and opened again."""
     QUERY_UNANSWERED = "query_unanswered"
 
 
 class UpgradeTransition(NamedTuple):
-    """Action after an event, and its possible results."""
+    """Action of an event in a state, and its possible next states and endings."""
 
     action: str
     leads_to: tuple[UpgradeState | Ending, ...]
-    """Besides the same state, which is always possible."""
+    """Next states and endings besides the same state, which is always possible."""
 
 
 def _do(action: str, *leads_to: UpgradeState | Ending) -> UpgradeTransition:
@@ -279,4 +279,4 @@ TIMERS: Final[Mapping[UpgradeState, UpgradeEvent]] = {
     _S.CONFIRMING: _E.VERSION_UNANSWERED,
     _S.YIELDING: _E.TOOL_QUIET,
 }
-"""Event of the one timer of each state."""
+"""Event of each state's timer."""

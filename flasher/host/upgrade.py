@@ -1,4 +1,4 @@
-"""The upgrade of appendix 3, host side: a stage of `flasher.host.runner`; pure.
+"""Upgrade engine of the tool: reset, update command, packets, end of transfer (appendix 3); pure.
 
 A message, an expired timer or a cancellation becomes an event, `table.TABLE` names the action, and
 the actions are the methods below, in the order of the states. An action checks the guards and
@@ -49,7 +49,7 @@ from flasher.protocol.text import boot_version_number, printable
 from flasher.protocol.wire import Damage, Message, encode, split
 
 ReceivedContent = UpgradeMessage | Malformed | Unknown | Content | None
-"""Message of an event; None for a timer or a cancellation."""
+"""Content of the message of an event; None for a timer or a cancellation."""
 
 _EVENTS: Final[dict[type, UpgradeEvent]] = {
     Ack: UpgradeEvent.ACK,
@@ -59,7 +59,7 @@ _EVENTS: Final[dict[type, UpgradeEvent]] = {
     Complete: UpgradeEvent.COMPLETE,
     GeneralFeedbackMessage: UpgradeEvent.FEEDBACK,
 }
-"""Events of messages; all others are unexpected."""
+"""Event of each message type; other messages are unexpected."""
 _PHASES: Final = {
     UpgradeState.RESETTING: Phase.RESET,
     UpgradeState.AWAITING_BOOT: Phase.BOOT,
@@ -70,17 +70,17 @@ _PHASES: Final = {
     UpgradeState.ENDING: Phase.END,
     UpgradeState.CONFIRMING: Phase.CONFIRM,
 }
-"""Reported phase of each state; other states keep the phase."""
+"""Phase that each state reports; other states keep the phase."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
-"""Reasons for an attempt that begins with the update command, because the bootloader is present."""
+"""Reasons for an attempt that begins with the update command, not with a reset."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
-_LEFT_SO: Final = {
+_DEVICE_LEFT: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
     Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
     Ending.REFUSED: DeviceLeft.NO_APPLICATION,
     Ending.RESTARTED: DeviceLeft.NO_APPLICATION,
 }
-"""Endings that determine the state of the device."""
+"""State of the device after endings that determine it."""
 
 
 class LinkRestored(Exception):  # noqa: N818  not an error
@@ -88,11 +88,11 @@ class LinkRestored(Exception):  # noqa: N818  not an error
 
 
 class SecondToolSeen(Exception):  # noqa: N818  not an error
-    """Another tool sent a frame that only the tool may send; `seen` describes it."""
+    """Another tool sent a frame with the tool's CAN id; `description` names it."""
 
-    def __init__(self, seen: str) -> None:
-        super().__init__(seen)
-        self.seen = seen
+    def __init__(self, description: str) -> None:
+        super().__init__(description)
+        self.description = description
 
 
 @dataclass
@@ -100,9 +100,9 @@ class _Attempt:
     """State of one attempt; times in seconds on the runner's clock."""
 
     feedback_came: bool = False
-    """The reset was answered: an application runs."""
+    """The reset was answered, so an application runs."""
     boot: BootVersion | None = None
-    """The first boot version."""
+    """First boot version of the attempt."""
     was_reset_again: bool = False
     watched_since: float = 0.0
     watched_until: float = 0.0
@@ -110,13 +110,13 @@ class _Attempt:
     request_at: float = 0.0
 
     packet: int = 0
-    """Number of the current packet, from 1."""
+    """Current packet number, from 1."""
     tries: int = 0
-    """Number of transmissions begun."""
+    """Number of transmissions of the packet that have begun."""
     copies_unanswered: int = 0
-    """Copies sent but not answered."""
+    """Number of sent copies of the packet without an answer."""
     accepted: bool = False
-    """One of its copies was acknowledged."""
+    """A copy of the packet was acknowledged."""
 
     end_tries: int = 0
     end_copies_left: int = 0
@@ -128,8 +128,8 @@ class _Attempt:
 
 
 class UpgradeStage:
-    """One upgrade of one device. Begins with a reset, or, after an `announcement` of the device's
-    boot version, with the answer to that.
+    """Upgrade of one device as a stage. It begins with a reset, or, if `announcement` has a boot
+    version, with the answer to that.
     """
 
     def __init__(self, run: Runner[Any], plan: Plan, options: UpgradeOptions) -> None:
@@ -148,15 +148,15 @@ class UpgradeStage:
             for move in row.values()
         }
         self.announcement: Message | None = None
-        """Boot version received before the beginning."""
+        """Boot version received before the upgrade."""
         self.in_session = options.in_session
-        """An earlier upgrade may have left the device in its session (R26): no application was
+        """An earlier upgrade may have left the device in its transfer (R26): no application was
         detected, and no update command was sent yet."""
         self.unchecked: CheckResult | None = None
-        """Rule that the silent device could not answer. It refuses the device, unless the device
-        turns out to be in an open session and so to have no application."""
+        """Rule of the manifest that the silent device could not answer. It refuses the device,
+        unless the device turns out to be in its transfer and so to have no application."""
         self.state = UpgradeState.RESETTING
-        """Current row of the table."""
+        """Current state in the table."""
         self._state_since = 0.0
         self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
         self._asks_for_power = options.at_power_up
@@ -171,25 +171,25 @@ class UpgradeStage:
         self._at = _Attempt()
         self._attempt = 1
         self._heard_at = -inf
-        """When the device last sent something, or may have while the adapter was lost."""
+        """Time at which the device last sent something, or may have while the adapter was lost."""
         self._update_left_at = -inf
-        """When the last update command was sent."""
+        """Time at which the last update command was sent."""
         self._silence_was_answered = False
         """An update command was sent to a silent device (R26)."""
         self._attempts = options.planned_attempts
-        """Maximum number of attempts, without those that look for an open session."""
+        """Maximum number of attempts, without those for a device left in its transfer."""
         self._last_boot: BootVersion | None = None
         self._erasures = self._whole_transfers = 0
-        """Number of request transfers (the old application is then gone), and of attempts that sent
-        end of transfer."""
+        """Number of request transfers, after each of which the old application is gone, and of
+        attempts that sent end of transfer."""
         self._failure: tuple[Ending, ReceivedContent] | None = None
-        """How an earlier attempt would have ended the upgrade as the last one."""
+        """Ending of an earlier attempt if it had been the last one."""
         self._failed_packet: int | None = None
-        """Packet that ended an earlier attempt."""
+        """Packet at which an earlier attempt failed."""
         self._nak_next_seen = False
-        """A repeated packet n was answered with NAK n+1, which was not accepted as ACK."""
+        """A repeated packet n was answered by NAK n+1, which was not accepted as ACK."""
         self._second_tool = ""
-        """Description of a frame of a second tool."""
+        """Description of a second tool's frame."""
 
         self._acknowledged = self._repetitions = self._naks = self._timeouts = 0
         self._transfer_s: float | None = None
@@ -198,7 +198,7 @@ class UpgradeStage:
 
     @property
     def progress(self) -> str:
-        """Describe phase, packet and attempt."""
+        """Phase, packet and attempt, as text."""
         return describe_progress(self._phase, self._packet, self._plan.total_packets, self._attempt)
 
     @property
@@ -215,7 +215,7 @@ class UpgradeStage:
 
     @property
     def _update_was_sent(self) -> bool:
-        """True if an update command was sent: the device may have erased its application."""
+        """True once an update command was sent: the device may have erased its application."""
         return self._update_left_at > -inf
 
     @property
@@ -226,7 +226,7 @@ class UpgradeStage:
 
     @property
     def device_left(self) -> DeviceLeft:
-        """State of the device if nothing more were sent."""
+        """State of the device if the upgrade ended now."""
         if self._at.end_copies_left:
             return DeviceLeft.UNKNOWN
         if self._erased:
@@ -235,7 +235,7 @@ class UpgradeStage:
 
     @property
     def may_begin_again(self) -> bool:
-        """True if an attempt is left, or none is needed to continue after the adapter was lost."""
+        """True if the upgrade can continue after a lost adapter is opened again."""
         return not self._is_last_attempt or self._ending is not None or self._is_updating
 
     @property
@@ -245,8 +245,8 @@ class UpgradeStage:
 
     @property
     def goes_on(self) -> bool:
-        """True if only the overall deadline limits the attempts: the device has no application to
-        lose, as far as is known, and the user set no limit.
+        """True if only the overall deadline limits the number of attempts: the device has no
+        application to lose, as far as is known, and the user set no limit.
         """
         options = self._options
         if options.attempts is not None or self._erasures >= ERASURES_MAX:
@@ -270,7 +270,7 @@ class UpgradeStage:
 
     @property
     def _has_begun(self) -> bool:
-        """True if the device received an update command, and not only into its silence."""
+        """True if a device that had sent something got an update command."""
         was_heard = self._last_boot is not None or self._erased
         return was_heard and self._update_was_sent
 
@@ -290,7 +290,7 @@ class UpgradeStage:
     # -- the stage -------------------------------------------------------------------------------
 
     def stage(self, deadline_at: float | None = None) -> Stage[Outcome]:
-        """Run the upgrade; `deadline_at` is the overall deadline, None computes it."""
+        """Run the upgrade; `deadline_at` is the overall deadline, computed if None."""
         self._began_at = self._state_since = self._run.now
         if deadline_at is None:
             deadline_at = self._run.now + overall_timeout_s(self._plan, self._options)
@@ -321,7 +321,7 @@ class UpgradeStage:
             except SecondToolSeen as tool:
                 # Send nothing more, not even the rest of a message.
                 self._tx.abandon(self._run.now)
-                self._second_tool = tool.seen
+                self._second_tool = tool.description
                 self._dispatch(UpgradeEvent.SECOND_TOOL)
             else:
                 self._take(came)
@@ -374,15 +374,15 @@ class UpgradeStage:
         if move is None:
             raise RuntimeError(f"{event} cannot happen in {before}")
         self._actions[move.action](row)
-        led_to = self._led_to
-        if led_to is not before and led_to not in move.leads_to:
-            raise RuntimeError(f"{event} led from {before} to {led_to}")
+        reached = self._state_or_ending
+        if reached is not before and reached not in move.leads_to:
+            raise RuntimeError(f"{event} led from {before} to {reached}")
 
     @property
-    def _led_to(self) -> UpgradeState | Ending:
+    def _state_or_ending(self) -> UpgradeState | Ending:
         return self.state if self._ending is None else self._ending[0]
 
-    def _go(self, state: UpgradeState) -> None:
+    def _enter(self, state: UpgradeState) -> None:
         """Enter another state, and its phase."""
         if state is self.state:
             return
@@ -402,7 +402,7 @@ class UpgradeStage:
         self._run.send(frames, not_before=not_before, tag=row.COMMAND)
 
     def _send_reset(self) -> None:
-        """Send the reset of the document or of the product."""
+        """Send the reset, the documented one or the product's own."""
         options, request_id = self._options, self._plan.target.request_id
         reset = Message(request_id, Mode.WRITE, options.reset_command, options.reset_data)
         self._timer_at = inf
@@ -431,9 +431,9 @@ class UpgradeStage:
     def _message_left(self) -> None:
         at, tag, left_at = self._at, self._tx.left_tag, self._tx.left_at
         if tag is Command.READ_VERSION and self._version_item is not None:
-            self._duplicates.asked(self._version_item.key, self._run.now, self._version_item)
+            self._duplicates.request_sent(self._version_item.key, self._run.now, self._version_item)
         elif isinstance(tag, Command):
-            self._duplicates.left(tag, self._run.now, at.packet)
+            self._duplicates.upgrade_message_sent(tag, self._run.now, at.packet)
         match tag:
             case Command.PACKET:
                 at.copies_unanswered += 1
@@ -449,7 +449,7 @@ class UpgradeStage:
             self._timer_at = left_at + wait_s
 
     def _wait_after(self, tag: object) -> float | None:
-        """How long to wait in this state for the answer to a message."""
+        """Return the time to wait for the answer to a message in this state; None without one."""
         timings = self._timings
         match tag, self.state:
             case _, UpgradeState.WATCHING:
@@ -489,7 +489,7 @@ class UpgradeStage:
         self._run.emit(events.Reported(what))
 
     def _fail(self, ending: Ending, row: ReceivedContent, reason: Reason) -> None:
-        """Begin another attempt, or end if none is left."""
+        """Begin another attempt, or end the upgrade if none is left."""
         if self._is_last_attempt:
             self._end(ending, row)
             return
@@ -506,16 +506,16 @@ class UpgradeStage:
             self._send_reset()  # this attempt has not begun
             return
         self._next_attempt(reason)
-        self._go(UpgradeState.RESETTING)
+        self._enter(UpgradeState.RESETTING)
         self._send_reset()
 
     def _start_over(self, row: ReceivedContent, reason: Reason) -> None:
-        """Begin another attempt with the update command: the bootloader is present."""
+        """Begin another attempt with the update command: the device is in its bootloader."""
         self._next_attempt(reason)
         if isinstance(row, BootVersion):
             self._note_boot(row)
         if row is None:
-            self._go(UpgradeState.AWAITING_REQUEST)
+            self._enter(UpgradeState.AWAITING_REQUEST)
             self._send_update()
         else:
             self._watch()
@@ -533,7 +533,7 @@ class UpgradeStage:
         self._run.emit(events.MessageRepeated(what, reason.value, tries))
 
     def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
-        """Handle a device that lost the transfer."""
+        """Handle a device that restarted during the transfer."""
         self._fail(Ending.RESTARTED, row, reason)
 
     # -- actions: up to the update command --------------------------------------------------------
@@ -545,7 +545,7 @@ class UpgradeStage:
             self._send_reset()
 
     def _await_boot(self, row: ReceivedContent) -> None:
-        self._go(UpgradeState.AWAITING_BOOT)
+        self._enter(UpgradeState.AWAITING_BOOT)
         self._wait_for_boot()
 
     def _wait_for_boot(self) -> None:
@@ -559,7 +559,7 @@ class UpgradeStage:
             self._run.emit(events.PowerCycleAwaited(wait_s))
 
     def _wait_or_begin_again(self, row: ReceivedContent) -> None:
-        """Send nothing to a device that has not announced itself at power-up."""
+        """Send nothing to a device that has not sent a boot version at power-up."""
         if self._asks_for_power and not self._has_begun:
             self._wait_for_boot()
         else:
@@ -579,15 +579,17 @@ class UpgradeStage:
             self._watch()
 
     def _watch(self) -> None:
-        """Wait for evidence of a second device: its announcement, its answer to an earlier message
-        (`_message_left`), or, if an application next to the bootloader answered the reset, the
-        announcements that follow.
+        """Wait for evidence of a second device: its boot version, its answer to an earlier message
+        (`_message_left`), or, if an application next to the bootloader answered the reset, the boot
+        versions that follow.
         """
         now, timings, at = self._run.now, self._timings, self._at
-        self._go(UpgradeState.WATCHING)
+        self._enter(UpgradeState.WATCHING)
         self._tx.drop_unstarted()
         wait_s = (
-            timings.boot_version_timeout_s if self._duplicates.is_beside else timings.boot_watch_s
+            timings.boot_version_timeout_s
+            if self._duplicates.application_beside
+            else timings.boot_watch_s
         )
         at.watched_since, at.watched_until = now, now + wait_s
         if self._tx.idle:
@@ -599,11 +601,13 @@ class UpgradeStage:
             self._end(Ending.WRONG_DEVICE, row)
             return
         answer_id = self._plan.target.answer_id
-        if not self._duplicates.is_beside and not self._duplicates.has_announced(answer_id):
+        if not self._duplicates.application_beside and not self._duplicates.has_announced(
+            answer_id
+        ):
             # Announcements before the reset have ended: an application is present and restarts.
             self._await_boot(row)
             return
-        if self._duplicates.is_beside:
+        if self._duplicates.application_beside:
             wait_s = timings.boot_version_timeout_s
             at.watched_until = max(at.watched_until, at.watched_since + wait_s)
         elif self._duplicates.overlap(answer_id):
@@ -614,20 +618,20 @@ class UpgradeStage:
 
     @property
     def _burst_s(self) -> float:
-        """Silence that ends the announcements of a bootloader."""
+        """Silence after which a bootloader has ended its announcement, in seconds."""
         return BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
 
     def _answer_boot(self, row: ReceivedContent) -> None:
-        """Send the update command: no evidence of a second device."""
+        """Send the update command, as there is no evidence of a second device."""
         at = self._at
         has_ended = self._run.now < at.watched_until
-        if self._duplicates.is_beside and has_ended and not at.was_reset_again:
+        if self._duplicates.application_beside and has_ended and not at.was_reset_again:
             # The announcements have ended, and an application is present: reset it.
             at.was_reset_again = True
-            self._go(UpgradeState.RESETTING)
+            self._enter(UpgradeState.RESETTING)
             self._send_reset()
         else:
-            self._go(UpgradeState.AWAITING_REQUEST)
+            self._enter(UpgradeState.AWAITING_REQUEST)
             self._send_update()
 
     def _is_foreign(self, boot: BootVersion) -> bool:
@@ -647,7 +651,7 @@ class UpgradeStage:
             self._run.emit(events.CheckMade("boot-version", "passed", text))
 
     def _miss_boot(self, row: ReceivedContent) -> None:
-        """Handle a missing boot version; an open session gets an update command (R26)."""
+        """Handle a missing boot version; an interrupted transfer gets an update command (R26)."""
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
@@ -692,7 +696,7 @@ class UpgradeStage:
             self._send_update()
 
     def _miss_hearing(self, boot: BootVersion) -> None:
-        """Handle a device that keeps announcing itself for the whole erase limit."""
+        """Handle a device that sends boot versions for the whole erase limit."""
         if self._erased:
             self._fail(Ending.UNHEARING, boot, Reason.REQUEST_GIVEN_UP)
         else:
@@ -721,7 +725,7 @@ class UpgradeStage:
         if self._at.first_update_left_at is None:
             self._report(row)  # late answer to another update command
             return
-        self._go(UpgradeState.TRANSFERRING)
+        self._enter(UpgradeState.TRANSFERRING)
         self._tx.drop_unstarted()
         minimum = self._options.minimum_boot_version
         if minimum is not None and not self._has_begun:
@@ -741,7 +745,7 @@ class UpgradeStage:
         self._send_packet()
 
     def _take_answer(self, answer: Ack | Nak) -> None:
-        """Find out which copy was answered (R10)."""
+        """Find the copy of the packet that an ACK or NAK answers (R10)."""
         at, accepts = self._at, isinstance(answer, Ack)
         if answer.number > at.packet:
             # Some bootloaders answer a repeated n with NAK n+1: "I want n+1".
@@ -769,7 +773,7 @@ class UpgradeStage:
             self._settle(answer)
 
     def _settle(self, row: ReceivedContent) -> None:
-        """Continue after every copy of the packet was answered, or the wait for answers ended."""
+        """Continue once every copy of the packet was answered, or the wait for answers ended."""
         at, total = self._at, self._plan.total_packets
         if not at.accepted:
             self._repeat_packet(row, Reason.PACKET_REFUSED)
@@ -778,11 +782,11 @@ class UpgradeStage:
         self._tx.limit_left_at(self._run.now)
         self._run.emit(events.PacketAcknowledged(at.packet, total, at.tries))
         if at.packet < total:
-            self._go(UpgradeState.TRANSFERRING)
+            self._enter(UpgradeState.TRANSFERRING)
             self._next_packet(at.packet + 1)
             return
         self._transfer_s = self._run.now - at.request_at
-        self._go(UpgradeState.ENDING)
+        self._enter(UpgradeState.ENDING)
         at.end_tries += 1
         self._send(EndOfTransfer(), self._after_packet_gap())
 
@@ -795,7 +799,7 @@ class UpgradeStage:
         if self._is_last_try:
             self._packet_lost(row)
             return
-        self._go(UpgradeState.TRANSFERRING)
+        self._enter(UpgradeState.TRANSFERRING)
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
 
@@ -807,7 +811,7 @@ class UpgradeStage:
         self._repeated(f"packet {self._at.packet}", Reason.LINK_BACK, self._at.tries)
 
     def _await_quiet(self, row: ReceivedContent) -> None:
-        self._go(UpgradeState.SETTLING)
+        self._enter(UpgradeState.SETTLING)
         # While a copy is being sent, the time starts at its end (see _message_left).
         if self._tx.idle:
             quiet_s = self._timings.quiet_after_repeat_s
@@ -827,7 +831,7 @@ class UpgradeStage:
             self._repeat_packet(row, Reason.REQUEST_AGAIN)
 
     def _take_boot_in_transfer(self, boot: BootVersion) -> None:
-        """Handle a leftover of the announcements, or a restart of the device (R11)."""
+        """Handle a boot version during the transfer: left over, or from a restart (R11)."""
         if self._run.now - self._at.request_at <= self._timings.leftover_boot_version_s:
             self._report(boot, "leftover boot version")
         elif self._is_foreign(boot):
@@ -847,7 +851,7 @@ class UpgradeStage:
             self._end(Ending.REFUSED, nak)
             return
         self._run.listen()
-        self._go(UpgradeState.ENDING)
+        self._enter(UpgradeState.ENDING)
         self._repeat_end(Reason.END_REFUSED)
 
     def _repeat_end(self, reason: Reason) -> None:
@@ -866,19 +870,19 @@ class UpgradeStage:
         elif self._version_item is None:
             self._end(Ending.UNCONFIRMED, row)
         else:
-            self._go(UpgradeState.CONFIRMING)
+            self._enter(UpgradeState.CONFIRMING)
             self._run.listen(self._version_item.can_id)
             self._query_version(row)
 
     def _complete(self, row: ReceivedContent) -> None:
-        was_told = self._at.end_copies_left > 0
-        self._end(Ending.COMPLETED if was_told else Ending.BROKEN_PROTOCOL, row)
+        has_sent_end = self._at.end_copies_left > 0
+        self._end(Ending.COMPLETED if has_sent_end else Ending.BROKEN_PROTOCOL, row)
 
     def _take_boot_after_end(self, boot: BootVersion) -> None:
-        """Handle announcements after the end: a burst comes from the new application's start; a
-        device that continues to announce itself did not accept.
+        """Handle boot versions after end of transfer: one burst comes from the start of the new
+        application; a device that continues to send them did not accept the image.
 
-        Judged by time, not by count: a doubled frame must not erase a good image.
+        The decision is by time, not by count: a doubled frame must not erase a good image.
         """
         at, now = self._at, self._run.now
         if not at.end_copies_left and not self._tx.begun:
@@ -935,7 +939,7 @@ class UpgradeStage:
             return
         if not self.is_yielding:
             self._run.emit(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
-        self._go(UpgradeState.YIELDING)
+        self._enter(UpgradeState.YIELDING)
         self._yield_on(row)
 
     def _yield_on(self, row: ReceivedContent) -> None:
@@ -971,7 +975,7 @@ class UpgradeStage:
         self._end(Ending.CANCELLED, row)
 
     def _end(self, ending: Ending, row: ReceivedContent, detail: str = "") -> None:
-        """End as soon as a partly sent message is complete; device text is escaped."""
+        """End the upgrade as soon as a partly sent message is complete; device text is escaped."""
         if isinstance(row, BootVersion):
             detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
         elif ending is Ending.PACKET_FAILED and self._nak_next_seen:
@@ -997,7 +1001,7 @@ class UpgradeStage:
         self._outcome = Outcome(
             ending=ending,
             phase=phase,
-            device_left=_LEFT_SO.get(ending, self.device_left),
+            device_left=_DEVICE_LEFT.get(ending, self.device_left),
             target=self._plan.target,
             total_packets=self._plan.total_packets,
             packet=packet,
@@ -1019,7 +1023,7 @@ class UpgradeStage:
 
 
 class Upgrade(Runner[Outcome]):
-    """One upgrade as an engine, without identification and verification."""
+    """Engine of one upgrade, without identification and verification."""
 
     def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
         chosen = options or UpgradeOptions()
@@ -1033,12 +1037,12 @@ class Upgrade(Runner[Outcome]):
 
     @property
     def outcome(self) -> Outcome:
-        """Raises RuntimeError before the end."""
+        """Outcome of the upgrade. Raises RuntimeError before its end."""
         return self.result
 
     @property
     def state(self) -> UpgradeState:
-        """Current row of the table."""
+        """Current state in the table."""
         return self._upgrade.state
 
     def link_back(self, now: float) -> None:
@@ -1046,7 +1050,7 @@ class Upgrade(Runner[Outcome]):
         self.now = now
         self.interrupt(LinkRestored())
 
-    def second_tool(self, seen: str, now: float) -> None:
-        """Handle a frame of a second tool; `seen` describes it."""
+    def second_tool(self, description: str, now: float) -> None:
+        """Handle a frame of a second tool, described by `description`."""
         self.now = now
-        self.interrupt(SecondToolSeen(seen))
+        self.interrupt(SecondToolSeen(description))

@@ -1,7 +1,7 @@
-"""Verification after an upgrade, as stages and engines.
+"""Verification after an upgrade: version query, or reading the memory back.
 
-`version`: the new application answers with the version named in the image. `memory`: every byte of
-the image is read back.
+`version`: the new application reports the firmware version named in the image. `memory`: every byte
+of the image is read back.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from flasher.wording import wording
 
 
 class Level(Enum):
-    """How far an upgrade is verified after the device has confirmed it."""
+    """Level of the verification after the device has confirmed an upgrade."""
 
     NONE = "none"
     VERSION = "version"
@@ -61,7 +61,7 @@ GOOD: Final = frozenset(
 
 @dataclass(frozen=True)
 class Verification:
-    """Requested level, verdict, and the version answered by the application (escaped)."""
+    """Level and verdict of a verification, and the reported firmware version (escaped)."""
 
     level: Level
     verdict: Verdict
@@ -70,7 +70,7 @@ class Verification:
 
     @property
     def ok(self) -> bool:
-        """True unless something contradicts the new image."""
+        """True unless an answer contradicts the new image, or is missing."""
         return self.verdict in GOOD
 
     def error(self, target: Target) -> FlasherError | None:
@@ -117,8 +117,8 @@ NOT_ASKED: Final = Verification(Level.NONE, Verdict.NOT_ASKED)
 
 
 def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tuple[Level, ...]:
-    """Return the possible levels for a target: the document has queries for the BMS only; a product
-    may have its own version query.
+    """Return the verification levels of a target: the document has queries for the BMS only; a
+    product may have its own version query.
     """
     levels = [Level.NONE]
     if (options or UpgradeOptions()).version_request_for(target) is not None:
@@ -129,7 +129,7 @@ def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tu
 
 
 def as_level(level: Level | str) -> Level:
-    """Return the level of this name. Raises UsageError."""
+    """Return the verification level of this name. Raises UsageError."""
     try:
         return Level(level)
     except ValueError:
@@ -140,12 +140,12 @@ def as_level(level: Level | str) -> Level:
 
 
 def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
-    """Default level of a target: by version if it has a version query."""
+    """Default verification level: by version for a target with a version query."""
     return Level.VERSION if Level.VERSION in possible_levels(target, options) else Level.NONE
 
 
 def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None) -> None:
-    """Raise UsageError if this level is impossible for the upgrade."""
+    """Raise UsageError if an upgrade cannot be verified at this level."""
     if level not in possible_levels(plan.target, options):
         raise UsageError(
             f"A {plan.target.node.name} cannot be verified by {level.value}.",
@@ -161,7 +161,7 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
 
 
 def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
-    """Create an engine that waits for the new application and asks for its version."""
+    """Create an engine that waits for the new application and queries its version."""
     return Runner(
         lambda run: check_version(run, plan, options),
         bitrate_bps=plan.bitrate_bps,
@@ -172,7 +172,7 @@ def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
 def memory_check(
     plan: Plan, options: UpgradeOptions, running_version: str | None
 ) -> Runner[Verification]:
-    """Create an engine that reads the image back. Raises ValueError without a base."""
+    """Create an engine that reads the image back. Raises ValueError for an image without base."""
     if plan.image.base is None:
         raise ValueError("an image without a base cannot be read back")
     return Runner(
@@ -183,7 +183,7 @@ def memory_check(
 
 
 def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stage[Verification]:
-    """Wait for the application and ask for its version. Raises ValueError without a query."""
+    """Wait for the application and query its version. Raises ValueError without a version query."""
     request = options.version_request_for(plan.target)
     if request is None:
         raise ValueError("this target has no version query")
@@ -211,7 +211,7 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
 
 
 def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:
-    """Read the whole image back and compare it; the image must have a base."""
+    """Read the whole image back and compare it; the image must have a base address."""
     data, base = plan.image.data, plan.image.base or 0
 
     def found(verdict: Verdict, detail: str = "") -> Verification:

@@ -1,4 +1,4 @@
-"""Checks before an upgrade that the user can waive, by name."""
+"""Waivable checks of an upgrade, with the risk of waiving each."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from flasher.i18n import text
 
 
 class Waiver(NamedTuple):
-    """A check that can be waived."""
+    """Texts of a waivable check: the upgrade that a waiver permits, and its risk."""
 
-    lets_through: str
+    permits: str
     risk: str
     """Possible consequence if the check was right."""
 
@@ -66,5 +66,5 @@ OF_IMAGE: Final[Mapping[str, Waiver]] = {
         text("The device may jump to where no program is, and does not start any more then."),
     ),
 }
-"""Checks while the file is read."""
+"""Checks of the file that is read."""
 WAIVERS: Final[Mapping[str, Waiver]] = {**OF_DEVICE, **OF_IMAGE}

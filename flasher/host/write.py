@@ -1,4 +1,4 @@
-"""Write plan and result for one item.
+"""Write of a data item: plan, result and read-back comparison.
 
 A write succeeds if general feedback confirms it and the item reads back as written.
 """
@@ -18,7 +18,7 @@ from flasher.validation import json_keys
 @json_keys("old new read_back")
 @dataclass(frozen=True)
 class FieldChange:
-    """A field of a write; null where a value is not known."""
+    """Field of a write: old, new and read-back value; null if unknown."""
 
     name: str
     unit: str
@@ -29,13 +29,13 @@ class FieldChange:
 
     @property
     def differs(self) -> bool:
-        """True if the value read back differs from the one written."""
+        """True if the field reads back differently than written."""
         return self.read_back is not None and self.read_back != self.new
 
 
 @dataclass(frozen=True)
 class WritePlan:
-    """Item and content to write; made without a bus."""
+    """Item and content to write, planned without a bus."""
 
     target: Target
     dialect: Dialect
@@ -59,11 +59,11 @@ class WriteResult:
 
     @property
     def differences(self) -> tuple[FieldChange, ...]:
-        """Fields that read back differently."""
+        """Fields that read back differently than written."""
         return tuple(change for change in self.changes if change.differs)
 
     def error(self) -> FlasherError | None:
-        """Create the error for the result; None if it was confirmed and reads back correctly."""
+        """Create the error for the result; None if it was confirmed and reads back as written."""
         name, node = self.plan.writable.name, self.plan.target.node.name
         different = self.differences
         if different:

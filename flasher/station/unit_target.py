@@ -106,7 +106,7 @@ class UnitTarget:
                 single_session=not goes_on,
             ),
             # Units without an application are flashed too.
-            identity=loaded.profile.identity(release=loaded.release, goes_on_unchecked=True),
+            identity=loaded.profile.identity(release=loaded.release, reports_unchecked=True),
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
         """Its version request; None without a known one."""
@@ -136,7 +136,7 @@ class UnitTarget:
         self.run(asking)
         asked = asking.result
         announced = asked.announcement is not None or self.watcher.announcements > before
-        return Identified(asked.seen, announced, asked.two_devices)
+        return Identified(asked.answers, announced, asked.two_devices)
 
     def is_silent(self, identified: Identified) -> bool:
         """True when it did not answer a version request."""

@@ -163,7 +163,7 @@ def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
     options: UpgradeOptions,
 ) -> None:
     stage = left_in_session()
-    identity = Identity(with_hardware("V1r2r0_*"), goes_on_unchecked=options.at_power_up)
+    identity = Identity(with_hardware("V1r2r0_*"), reports_unchecked=options.at_power_up)
     result = stage.flash(options=options, identity=identity)
     assert result.exit_code == ExitCode.OK
     (check,) = (each for each in stage.seen(events.CheckMade) if each.check == "hardware")
@@ -185,7 +185,7 @@ def test_an_application_that_tells_no_hardware_is_refused_as_without_the_option(
 
 def test_hardware_that_does_not_fit_refuses_a_battery_that_answers() -> None:
     stage = Stage(profile=SMALL)
-    identity = Identity(with_hardware("V9r9r9_*"), goes_on_unchecked=True)
+    identity = Identity(with_hardware("V9r9r9_*"), reports_unchecked=True)
     result = stage.flash(options=RESCUE, identity=identity)
     assert result.outcome.ending is Ending.NOT_FOR_DEVICE
     assert updates(stage) == 0

@@ -70,36 +70,38 @@ class Watch:
         return self
 
     def asks(self, item: Item = VERSION) -> Watch:
-        self.duplicates.asked(item.key, self.now, item)
+        self.duplicates.request_sent(item.key, self.now, item)
         return self
 
     def answers(self, content: Content | None = None, item: Item = VERSION) -> Watch:
         """A tick later."""
         self.now += TICK_S
-        self.duplicates.heard(catalogue.encode(item, content or version()), self.now)
+        self.duplicates.received(catalogue.encode(item, content or version()), self.now)
         return self
 
     def sends(self, command: Command, packet: int = 0) -> Watch:
         self.now += TICK_S
-        self.duplicates.left(command, self.now, packet)
+        self.duplicates.upgrade_message_sent(command, self.now, packet)
         return self
 
     def hears(self, *rows: UpgradeMessage, can_id: int = 0x725) -> Watch:
         """Each a tick after the one before."""
         for row in rows:
             self.now += TICK_S
-            self.duplicates.heard(row.to_message(can_id), self.now)
+            self.duplicates.received(row.to_message(can_id), self.now)
         return self
 
     def announces(self, *ticks: float, boot: BootVersion = BOOT, can_id: int = 0x725) -> Watch:
         """Announcements, each so much later than what was before."""
         for each_ticks in ticks:
             self.wait(each_ticks)
-            self.duplicates.heard(boot.to_message(can_id), self.now)
+            self.duplicates.received(boot.to_message(can_id), self.now)
         return self
 
     def sees(self, can_id: int, *, remote: bool = False) -> Watch:
-        self.duplicates.see(Frame(can_id, b"" if remote else b"\x05", is_remote=remote), self.now)
+        self.duplicates.frame_received(
+            Frame(can_id, b"" if remote else b"\x05", is_remote=remote), self.now
+        )
         return self
 
     def transfers(self, count: int = 0) -> Watch:
@@ -114,8 +116,8 @@ class Watch:
         return self.duplicates.evidence
 
     @property
-    def doubts(self) -> list[Item]:
-        return self.duplicates.doubts
+    def ambiguous_queries(self) -> list[Item]:
+        return self.duplicates.ambiguous_queries
 
 
 def asked(*, answers: int, item: Item = VERSION) -> Watch:
@@ -135,9 +137,9 @@ def at(now: float) -> Watch:
 
 
 def test_a_question_with_two_answers_is_asked_again_and_says_nothing_yet() -> None:
-    assert asked(answers=1).doubts == []
+    assert asked(answers=1).ambiguous_queries == []
     watch = asked(answers=2)
-    assert watch.doubts == [VERSION]
+    assert watch.ambiguous_queries == [VERSION]
     assert watch.evidence == ""
     assert asked(answers=5).evidence == "", "they are all in one round"
     watch.wait(100).asks().answers().answers()
@@ -146,9 +148,9 @@ def test_a_question_with_two_answers_is_asked_again_and_says_nothing_yet() -> No
 
 def test_a_round_with_one_answer_ends_the_doubt() -> None:
     watch = asked(answers=2).wait(100).asks().answers().wait(100).asks()
-    assert watch.doubts == []
+    assert watch.ambiguous_queries == []
     assert watch.answers().answers().evidence == ""
-    assert watch.doubts == [VERSION]
+    assert watch.ambiguous_queries == [VERSION]
 
 
 @each(
@@ -171,25 +173,25 @@ def test_a_repetition_belongs_to_the_round_until_its_time_is_over(
         # The third and fourth answer: to two copies in a round that was odd already, or to one.
         assert watch.evidence == ("" if is_same_round else TWO_ANSWERED)
     else:
-        assert watch.doubts == ([] if is_same_round else [VERSION])
+        assert watch.ambiguous_queries == ([] if is_same_round else [VERSION])
 
 
 def test_each_copy_of_a_question_may_have_its_answer() -> None:
     watch = Watch().asks().wait(200).asks().wait(200).asks().answers().answers().answers()
-    assert watch.doubts == []
-    assert watch.answers().doubts == [VERSION]
+    assert watch.ambiguous_queries == []
+    assert watch.answers().ambiguous_queries == [VERSION]
 
 
 def test_a_question_that_is_half_answered_stays_open_until_it_is_given_up() -> None:
     watch = Watch().asks().wait(200).asks().answers().wait(100).asks()
-    assert watch.answers().answers().doubts == [], "three copies, three answers"
+    assert watch.answers().answers().ambiguous_queries == [], "three copies, three answers"
 
 
 @each("ticks, counts", [(1023, True), (1024, False)])
 def test_an_answer_counts_until_its_question_is_given_up(ticks: int, *, counts: bool) -> None:
     watch = asked(answers=1)
     watch.now = 512.0 + ticks * TICK_S
-    assert watch.answers().doubts == ([VERSION] if counts else [])
+    assert watch.answers().ambiguous_queries == ([VERSION] if counts else [])
 
 
 @each("apart_s, is_second", [(0.0002, False), (0.0003, True)])
@@ -198,10 +200,10 @@ def test_the_same_message_at_once_was_doubled_by_the_link(
 ) -> None:
     """On the wire two messages take longer."""
     watch = at(-TICK_S).asks().answers()
-    watch.duplicates.heard(catalogue.encode(VERSION, version()), apart_s)
-    assert watch.doubts == ([VERSION] if is_second else [])
+    watch.duplicates.received(catalogue.encode(VERSION, version()), apart_s)
+    assert watch.ambiguous_queries == ([VERSION] if is_second else [])
     watch = at(-2 * TICK_S).sends(Command.RESET).hears(GeneralFeedbackMessage())
-    watch.duplicates.heard(GeneralFeedbackMessage().to_message(0x725), apart_s)
+    watch.duplicates.received(GeneralFeedbackMessage().to_message(0x725), apart_s)
     assert watch.evidence == (CONFIRMED_TWICE if is_second else "")
 
 
@@ -235,8 +237,8 @@ def test_eight_different_answers_are_kept() -> None:
 
 def test_an_answer_of_another_size_counts_and_is_not_read() -> None:
     watch = asked(answers=1).wait(1)
-    watch.duplicates.heard(Message(*VERSION.key[:1], 0x0C, VERSION.key[1], b"\1"), watch.now)
-    assert watch.doubts == [VERSION]
+    watch.duplicates.received(Message(*VERSION.key[:1], 0x0C, VERSION.key[1], b"\1"), watch.now)
+    assert watch.ambiguous_queries == [VERSION]
     assert watch.duplicates.contents[VERSION.key] == [version()]
 
 
@@ -244,24 +246,24 @@ def test_a_write_that_is_confirmed_twice_is_two_devices_at_once() -> None:
     watch = Watch().asks(WRITTEN).hears(GeneralFeedbackMessage())
     assert watch.evidence == ""
     assert watch.hears(GeneralFeedbackMessage()).evidence == CONFIRMED_TWICE
-    assert watch.doubts == [WRITTEN]
+    assert watch.ambiguous_queries == [WRITTEN]
 
 
 def test_a_question_of_somebody_else_has_an_answer_of_its_own() -> None:
     display = Message(0x732, 0x11, 0x5100, b"")
     watch = asked(answers=1)
-    watch.duplicates.heard(display, watch.now)
-    assert watch.answers().doubts == []
-    assert watch.answers().doubts == [VERSION]
+    watch.duplicates.received(display, watch.now)
+    assert watch.answers().ambiguous_queries == []
+    assert watch.answers().ambiguous_queries == [VERSION]
     other_mode = display._replace(mode=0x16)
     watch = asked(answers=1)
-    watch.duplicates.heard(other_mode, watch.now)
-    assert watch.answers().doubts == [VERSION], "that was no question"
+    watch.duplicates.received(other_mode, watch.now)
+    assert watch.answers().ambiguous_queries == [VERSION], "that was no question"
 
 
 def test_what_nobody_asked_for_is_no_answer() -> None:
     watch = Watch().answers().answers()
-    assert watch.doubts == []
+    assert watch.ambiguous_queries == []
     assert watch.duplicates.contents == {}
 
 
@@ -286,19 +288,19 @@ def test_an_answer_that_was_begun_counts_unless_its_frame_was_doubled(
     damage: Damage, *, counts: bool
 ) -> None:
     watch = asked(answers=1).wait(1)
-    watch.duplicates.heard(damage, watch.now)
-    assert watch.doubts == ([VERSION] if counts else [])
+    watch.duplicates.received(damage, watch.now)
+    assert watch.ambiguous_queries == ([VERSION] if counts else [])
 
 
 def test_a_confirmation_that_was_spoilt_counts() -> None:
     watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(1)
-    watch.duplicates.heard(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
+    watch.duplicates.received(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
     assert watch.evidence == CONFIRMED_TWICE
     watch = Watch().announces(0).sends(Command.RESET).wait(1)
-    watch.duplicates.heard(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
-    assert watch.duplicates.is_beside
+    watch.duplicates.received(garbled(GeneralFeedbackMessage().to_message(0x725)), watch.now)
+    assert watch.duplicates.application_beside
     watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(1)
-    watch.duplicates.heard(garbled(Ack(1).to_message(0x725)), watch.now)
+    watch.duplicates.received(garbled(Ack(1).to_message(0x725)), watch.now)
     assert watch.evidence == ""
 
 
@@ -306,7 +308,7 @@ def test_an_update_command_ends_all_questions() -> None:
     """Another application will answer."""
     watch = asked(answers=2).sends(Command.UPDATE).wait(100).asks().answers(version("W2"))
     assert watch.answers(version("W2")).evidence == ""
-    assert watch.doubts == [VERSION]
+    assert watch.ambiguous_queries == [VERSION]
 
 
 # -- before the transfer --------------------------------------------------------------------------
@@ -323,35 +325,38 @@ def test_a_confirmation_before_anything_was_sent_is_somebody_elses() -> None:
     assert watch.hears(GeneralFeedbackMessage()).evidence == ""
 
 
-@each("after_ticks, is_beside", [(79, True), (80, False)])
+@each("after_ticks, application_beside", [(79, True), (80, False)])
 def test_a_reset_that_is_confirmed_while_a_bootloader_announces_itself(
-    after_ticks: int, *, is_beside: bool
+    after_ticks: int, *, application_beside: bool
 ) -> None:
     """A bootloader does not know the reset."""
     watch = Watch().announces(0).sends(Command.RESET).wait(after_ticks - 1)
     assert watch.duplicates.announces(0x725, watch.now)
     assert not watch.duplicates.announces(0x720, watch.now)
     watch.hears(GeneralFeedbackMessage())
-    assert watch.duplicates.is_beside is is_beside
+    assert watch.duplicates.application_beside is application_beside
     assert (
-        watch.wait(500).sends(Command.RESET).hears(GeneralFeedbackMessage()).duplicates.is_beside
+        watch.wait(500)
+        .sends(Command.RESET)
+        .hears(GeneralFeedbackMessage())
+        .duplicates.application_beside
         is False
     )
 
 
 def test_it_stays_so_until_the_next_reset_or_update_command() -> None:
-    assert not Watch().duplicates.is_beside
+    assert not Watch().duplicates.application_beside
     for command in (Command.RESET, Command.UPDATE):
         watch = Watch().announces(0).sends(Command.RESET).hears(GeneralFeedbackMessage()).wait(500)
         assert (
             watch.sends(Command.END_OF_TRANSFER)
             .hears(GeneralFeedbackMessage())
-            .duplicates.is_beside
+            .duplicates.application_beside
         )
         watch.sends(command)
-        assert not watch.duplicates.is_beside
+        assert not watch.duplicates.application_beside
     watch.announces(1).hears(GeneralFeedbackMessage())
-    assert not watch.duplicates.is_beside, "a bootloader may confirm the update command"
+    assert not watch.duplicates.application_beside, "a bootloader may confirm the update command"
 
 
 def test_an_announcement_counts_since_the_last_reset_or_update_command() -> None:
@@ -524,7 +529,7 @@ def test_one_packet_with_two_acks_is_two_devices_where_they_are_clearly_apart(
 ) -> None:
     watch = at(-4 * TICK_S).transfers(1)
     assert watch.now == 0.0
-    watch.duplicates.heard(Ack(1).to_message(0x725), apart_s)
+    watch.duplicates.received(Ack(1).to_message(0x725), apart_s)
     expected = "packet 1 was acknowledged more often than it was sent"
     assert watch.evidence == (expected if is_second else "")
 
@@ -687,7 +692,7 @@ def test_a_check_code_that_another_node_asks_for_has_its_answer() -> None:
     watch = Watch()
     for _ in range(2):
         watch.wait(100)
-        watch.duplicates.heard(Message(0x712, 0x11, 0x3200, b""), watch.now)
+        watch.duplicates.received(Message(0x712, 0x11, 0x3200, b""), watch.now)
         watch.answers(CheckCode(bytes(12)), code)
-    assert watch.doubts == []
-    assert watch.answers(CheckCode(bytes(12)), code).doubts == [code]
+    assert watch.ambiguous_queries == []
+    assert watch.answers(CheckCode(bytes(12)), code).ambiguous_queries == [code]

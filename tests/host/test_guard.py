@@ -47,8 +47,8 @@ def test_echoes_of_which_some_are_missing_are_nobody(step: int) -> None:
 def test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex() -> None:
     found = sent(OWN).see(OTHER, 1.01)
     assert found is not None
-    assert "55 aa 16 07" in found.seen
-    assert "0x752" in found.seen
+    assert "55 aa 16 07" in found.description
+    assert "0x752" in found.description
     assert found.query is None
 
 

@@ -86,10 +86,10 @@ def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
     asked.run(asked.now + SECOND_DEVICE_WAIT_S)
     assert asked.engine.done
     assert asked.commands == [0x3300, 0x3400]
-    assert asked.told.seen.version == version()
-    assert asked.told.seen.running == BATTERY
-    assert asked.told.seen.hardware_version == "V1r2r0_20220512"
-    assert asked.told.seen.firmware_version == "V1r0r0_20220512"
+    assert asked.told.answers.version == version()
+    assert asked.told.answers.running == BATTERY
+    assert asked.told.answers.hardware_version == "V1r2r0_20220512"
+    assert asked.told.answers.firmware_version == "V1r0r0_20220512"
     assert asked.told.two_devices == ""
 
 
@@ -100,7 +100,7 @@ def test_who_has_no_query_is_not_asked(target: Target) -> None:
     asked.run(10.0)
     assert asked.engine.done
     assert asked.engine.next_frame(10.0) is None
-    assert asked.told.seen.version is None
+    assert asked.told.answers.version is None
 
 
 def test_a_products_own_query_is_asked_too() -> None:
@@ -115,7 +115,7 @@ def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
     asked.run(20.0)
     assert asked.engine.done
     assert set(asked.commands) == {0x3300}
-    assert asked.told.seen.version is None
+    assert asked.told.answers.version is None
     assert asked.told.announcement is None
     assert not asked.told.cancelled
 
@@ -174,11 +174,11 @@ def test_other_frames_on_its_ids_are_nothing() -> None:
     for can_id in (0x720, 0x725):
         asked.hear([Frame(can_id, b"\x05"), Frame(can_id, b"", is_remote=True)])
         asked.hear([Frame(can_id, b"\x55\xaa\x0c", is_extended=True)])
-    assert asked.told.seen.version is None
+    assert asked.told.answers.version is None
     assert asked.told.announcement is None
     asked.now = 10.2
     asked.say(VERSION, version())
-    assert asked.told.seen.version == version()
+    assert asked.told.answers.version == version()
 
 
 def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:

@@ -217,9 +217,9 @@ def test_an_image_that_is_no_program_is_refused_and_why(
 
 def test_a_manifest_vouches_for_its_very_bytes_only() -> None:
     odd = Image.from_bytes(bytes(4) + VECTORS)
-    assert Identity(release_of(odd, BMS)).vouches_for(odd)
-    assert not Identity().vouches_for(odd)
-    assert not Identity(release()).vouches_for(odd)
+    assert Identity(release_of(odd, BMS)).matches_bytes(odd)
+    assert not Identity().matches_bytes(odd)
+    assert not Identity(release()).matches_bytes(odd)
     found = judged(odd, Identity(release_of(odd, BMS)))[IdentityCheck.PLAUSIBLE]
     assert found.verdict is UNKNOWN
     assert found.text.endswith("the manifest was made for these very bytes")
@@ -268,7 +268,7 @@ def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
     assert found.is_unchecked
     assert found.ending is Ending.UNCHECKED
     assert found.detail == f"{found.text}; --allow-hardware waives this"
-    rescued = judged(IMAGE, Identity(release(**stated), goes_on_unchecked=True))[
+    rescued = judged(IMAGE, Identity(release(**stated), reports_unchecked=True))[
         IdentityCheck.HARDWARE
     ]
     assert rescued.verdict is UNKNOWN

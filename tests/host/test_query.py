@@ -228,8 +228,8 @@ def test_an_answer_of_another_length_is_kept_as_a_misfit() -> None:
     bench = ask()
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1530, VERSION[:0x30])
-    assert bench.query.misfit is not None
-    assert (bench.query.misfit.command, len(bench.query.misfit.data)) == (0x1530, 48)
+    assert bench.query.misformatted is not None
+    assert (bench.query.misformatted.command, len(bench.query.misformatted.data)) == (0x1530, 48)
 
 
 def test_a_damaged_answer_is_reported_and_the_question_repeated() -> None:

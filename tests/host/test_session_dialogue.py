@@ -170,7 +170,7 @@ def test_an_image_that_is_refused_by_itself_ends_it_before_anybody_is_asked() ->
 def test_a_device_that_is_waited_for_cannot_be_asked_for_a_rule(*, goes_on: bool) -> None:
     rules = release_of(IMAGE, BMS, hardware_versions=["V1*"])
     dialogue = Dialogue(
-        UpgradeOptions(at_power_up=True), identity=Identity(rules, goes_on_unchecked=goes_on)
+        UpgradeOptions(at_power_up=True), identity=Identity(rules, reports_unchecked=goes_on)
     )
     dialogue.wait(1.0)
     assert dialogue.sent == []

@@ -89,7 +89,7 @@ _EXIT_CODES: Final = (
 def _waiver_option(name: str) -> Decorator:
     return option(
         f"--allow-{name}", is_flag=True, panel="checks before the first write",
-        help=f"let through {OF_DEVICE[name].lets_through}",
+        help=f"let through {OF_DEVICE[name].permits}",
     )  # fmt: skip
 
 
@@ -279,7 +279,7 @@ class _Upgrade:
                 release=release,
                 waived=choices.waived_checks(),
                 skip_same_version=skip_same_version,
-                goes_on_unchecked=at_power_up,
+                reports_unchecked=at_power_up,
             ),
             at_power_up=at_power_up,
             waived=waived,
