@@ -1,1 +1,1 @@
-"""Device model, written from the documents: shares only `flasher.protocol` with the host."""
+"""Device model: bootloader, flash and applications, written from the documents alone."""

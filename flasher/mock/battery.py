@@ -1,6 +1,6 @@
-"""Battery model: charge, cells, temperature and current as functions of time.
+"""Battery model: charge, cell voltages, temperature and current as functions of time.
 
-Deterministic: the same time gives the same values. Time counts from the first call.
+Deterministic: the same time, counted from the first call, gives the same values.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ CELLS_FITTED: Final = 10
 DESIGN_CAPACITY_MAH: Final = 10_000
 DESIGN_VOLTAGE_V: Final = 36
 FULL_CAPACITY_MAH: Final = 9_800
-"""Remaining part of the design capacity."""
+"""Less than the design capacity, by ageing."""
 STATE_OF_HEALTH_PERCENT: Final = 98
 RESTING_CURRENT_MA: Final = -8
-"""Consumption of its own electronics: below either dialect's limit for an idle bus."""
+"""Consumption of the battery's electronics: below either dialect's limit for an idle bus."""
 
 Use = Literal["riding", "resting"]
 
@@ -27,7 +27,7 @@ _CHARGE_S: Final = 3 * 3600
 _RIDES_FROM, _RIDES_TO = 0.85, 0.25
 """Share of the full capacity at the beginning and the end of a ride."""
 _SWAY_S: Final = 20.0
-"""Period of the current's variation, as on hills."""
+"""Period of the current's variation in seconds, as on hills."""
 _SWAY: Final = 0.6
 _FIRST_RIDE_AT_S: Final = 900.0
 """The first call is a quarter of an hour into a ride."""
@@ -41,7 +41,7 @@ _WARMING_C: Final = 11.0
 
 @dataclass(frozen=True)
 class BatteryReading:
-    """State of the battery at one time; a discharging current is negative."""
+    """State of the battery at one time; a discharge current is negative."""
 
     elapsed_s: float
     current_ma: int
@@ -49,21 +49,21 @@ class BatteryReading:
     temperature_c: int
     status: BatteryStatus
     cells_mv: tuple[int, ...]
-    """One voltage per cell of the messages; absent cells are 0."""
+    """Cell voltages; absent cells are 0."""
 
     @property
     def voltage_mv(self) -> int:
-        """Of all cells."""
+        """Sum of the cell voltages."""
         return sum(self.cells_mv)
 
     @property
     def state_of_charge_percent(self) -> int:
-        """Share of the full capacity."""
+        """Remaining charge in percent of the full capacity."""
         return round(100 * self.remaining_mah / FULL_CAPACITY_MAH)
 
 
 class Battery:
-    """Alternates between riding and charging, or rests; `seed` varies its cells."""
+    """Battery that is ridden and charged alternately, or rests; `seed` varies its cells."""
 
     def __init__(self, use: Use = "riding", seed: int = 1) -> None:
         self._use = use
@@ -71,7 +71,7 @@ class Battery:
         self._began_at: float | None = None
 
     def at(self, now: float) -> BatteryReading:
-        """Return the state at `now` (seconds)."""
+        """Return the state of the battery at `now` (seconds)."""
         if self._began_at is None:
             self._began_at = now
         elapsed_s = now - self._began_at
@@ -115,7 +115,7 @@ class Battery:
 
 
 def _spread(seed: int) -> list[int]:
-    """Deviation of each cell from the mean, determined by the seed."""
+    """Deviation of each cell from the mean in mV, determined by the seed."""
     spread_mv, state = [], seed
     for _ in range(CELLS_FITTED):
         state = (state * 1_103_515_245 + 12_345) % 2**31

@@ -1,5 +1,4 @@
-"""BMS application: answers all queries and writes of chapter 3, reports faults, and runs the
-shutdown handshake.
+"""BMS application: answers queries and writes (chapter 3), reports faults, shuts down.
 
 Formats and answers of messages come from the catalogue. Written data survive power cuts and
 upgrades.
@@ -46,36 +45,36 @@ from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
 
 SHUTDOWN_PERIOD_S: Final = 0.2
-"""Interval of the announcement until all other nodes are ready."""
+"""Interval of SHUTDOWN until all other nodes are ready."""
 SHUTDOWN_DELAY_S: Final = 1.0
-"""From the first announcement to the opening of the discharge switch, regardless of answers."""
+"""From the first SHUTDOWN to the opening of the discharge switch, whatever the answers."""
 FAULT_PERIOD_S: Final = 0.2
-"""Interval of fault messages while any fault is set (5.1)."""
+"""Interval of fault messages while any fault is set (table 5)."""
 IDLE_SHUTDOWN_S: Final = 30 * 60.0
-"""A bus idle for this long, with a small pack current throughout, switches the battery off
-(5.1)."""
+"""The battery switches off when the bus was idle, and the pack current small, for this time (table
+5)."""
 IDLE_CURRENT_MA: Final = {WELLING: 50, MOTINOVA: 20}
-"""Limit of a small current (section 6)."""
+"""Limit of a small pack current in mA, by dialect."""
 CURRENT_PERIOD_S: Final = 1.0
-"""Interval of current checks meanwhile."""
+"""Interval at which the pack current of an idle bus is checked."""
 _FEEDBACK_IDS: Final = {
     can_id(node, Node.BMS): can_id(Node.BMS, node) for node in Node if node is not Node.BMS
 }
-"""Id of the confirmation, by id of the write: it goes to the sender (2.2.1(2))."""
+"""CAN id of general feedback by the id of the write: it goes to the sender (2.2.1 (2))."""
 _WRITE: Final = "write "
 _CELL_MODEL: Final = "21700A"
 _ID_FILLER: Final = b"\x01"
-"""R13."""
+"""Filler of a short physical ID (R13)."""
 _NO_STATE_OF_HEALTH: Final = 0
 _NEWER_QUERIES: Final = frozenset(
     {(Node.OBC, contents.CellVoltages), (Node.HMI, contents.CellVoltages)}
 )
-"""Queries, by sender and content of the answer, that an older battery does not answer (section
-6)."""
+"""Queries, by sender and content of the answer, that an older battery does not answer (document
+revisions)."""
 
 
 class ShutdownSequence:
-    """Shutdown handshake (5.1): announce, collect the answers, switch off."""
+    """Shutdown of the battery (table 5): sends SHUTDOWN, collects READY, switches off."""
 
     def __init__(self, dialect: Dialect, port: ApplicationPort, why: str, now: float) -> None:
         self._port = port
@@ -98,7 +97,7 @@ class ShutdownSequence:
                 self.due_at = self._off_at
 
     def tick(self, now: float) -> None:
-        """Repeat the announcement, or switch off."""
+        """Repeat SHUTDOWN, or switch off."""
         if now >= self._off_at:
             self._port.emit(ShutdownEnded(_names(self._answered), _names(self._missing)))
             self._port.switch_off(now)
@@ -109,7 +108,7 @@ class ShutdownSequence:
 
 
 class BmsApplication(Application):
-    """BMS application; `kept` has the writable items by their names in the catalogue."""
+    """BMS application; `kept` contains the writable items by their names in the catalogue."""
 
     def __init__(self, profile: DeviceProfile, memory: MemoryMap) -> None:
         super().__init__(Node.BMS, DIALECTS[profile.dialect])
@@ -122,8 +121,7 @@ class BmsApplication(Application):
         self._shutdown: ShutdownSequence | None = None
         self._fault_due_at = inf
         self._idle_since: float | None = None
-        """Time since which there was no frame and the current was small; None before the first
-        tick."""
+        """Time since which the bus was idle and the current small; None before the first tick."""
         self._current_due_at = -inf
         self._faults_item = _sent_item(contents.Faults, self.dialect)
         self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
@@ -167,14 +165,13 @@ class BmsApplication(Application):
             self._idle_since = now  # its own frames count as traffic
             self._fault_due_at = due_again(self._fault_due_at, FAULT_PERIOD_S, now)
         if self._idle_due_at <= now:
-            self._look_at_current(now)
+            self._check_current(now)
         if self._shutdown is not None:
             self._shutdown.tick(now)
 
     # -- faults and shutdown ----------------------------------------------------------------------
 
     def set_faults(self, faults: BatteryFault, now: float) -> None:
-        """Set exactly these faults."""
         self.faults = faults
         if not faults:
             self._fault_due_at = inf
@@ -182,7 +179,7 @@ class BmsApplication(Application):
             self._fault_due_at = now
 
     def hold_key(self, now: float) -> None:
-        """Announce shutdown after the key was held for 3 s, then switch off."""
+        """Start the shutdown: the key was held for 3 s."""
         self._announce_shutdown("key held", now)
 
     def _announce_shutdown(self, why: str, now: float) -> None:
@@ -198,7 +195,7 @@ class BmsApplication(Application):
         since = self._idle_since
         return -inf if since is None else min(self._current_due_at, since + IDLE_SHUTDOWN_S)
 
-    def _look_at_current(self, now: float) -> None:
+    def _check_current(self, now: float) -> None:
         self._current_due_at = now + CURRENT_PERIOD_S
         is_small = abs(self.battery.at(now).current_ma) < IDLE_CURRENT_MA[self.dialect]
         if self._idle_since is None or not is_small:
@@ -209,7 +206,7 @@ class BmsApplication(Application):
     # -- messages ---------------------------------------------------------------------------------
 
     def take(self, message: Message, now: float) -> None:
-        """Answer a query or a write; ignore anything else."""
+        """Answer a query or a write; ignore other messages."""
         decoded = decode(message, self.dialect)
         if decoded is None:
             # A write outside the dialect is confirmed too, and changes nothing: every write is
@@ -251,7 +248,7 @@ class BmsApplication(Application):
         return None if reader is None else reader(now)
 
     def _read_memory(self, wanted: contents.ReadMemory) -> Content | None:
-        """Return the requested memory; None if there is none, or for more than fits (R5)."""
+        """Return the requested memory; None for addresses outside, or over 128 bytes (R5)."""
         found = None
         if 0 < wanted.end - wanted.start <= contents.MEMORY_PIECE_SIZE:
             found = self._memory.read(wanted.start, wanted.end)
@@ -314,7 +311,7 @@ class BmsApplication(Application):
 
 
 def _factory_settings(profile: DeviceProfile) -> dict[str, Content]:
-    """Initial items, by the title of the message that reads or, without "write", writes them."""
+    """Initial items by the title of the message that reads or writes them."""
     design = contents.DesignInformation(
         DESIGN_CAPACITY_MAH, DESIGN_VOLTAGE_V, _text(_CELL_MODEL, 8)
     )
@@ -339,14 +336,14 @@ def _text(text: str, size_bytes: int = VERSION_FIELD_SIZE) -> WireText:
 
 
 def _version_text(text: str) -> WireText:
-    """Encode a text; one that fills the field has no terminator, a longer one is cut (R20)."""
+    """Encode a version; one of full length has no terminator, a longer one is truncated (R20)."""
     if len(text) < VERSION_FIELD_SIZE:
         return _text(text)
     return WireText(text.encode("ascii")[:VERSION_FIELD_SIZE])
 
 
 def _sent_item(content: type[Content], dialect: Dialect) -> Item:
-    """Row of a message that the BMS sends without a query."""
+    """Catalogue row of a message that the BMS sends without a query."""
     return next(
         item
         for item in ITEMS

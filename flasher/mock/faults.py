@@ -1,8 +1,7 @@
-"""Power cuts of a device at a given moment.
+"""Power cuts of a device at a chosen moment, also during a flash operation.
 
-An interesting cut occurs during a flash operation, at a moment that is not visible on the bus. So
-it is scheduled in advance (`FaultInjector.set`), and the injector, an engine around the device,
-executes it.
+Such a moment is not visible on the bus. So the cut is scheduled in advance (`FaultInjector.set`),
+and the injector, an engine around the device, executes it.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ POWER_OFF_S: Final = 0.5
 
 @dataclass(frozen=True)
 class InOperation:
-    """Moment when `share` (0 to 1) of a flash operation is done; `operation` counts from 0 those
-    that begin from now on. 0.0 is just before any change, 1.0 at the end.
+    """Moment at which `share` (0 to 1) of a flash operation is done; `operation` counts the
+    operations that begin from now on, from 0. Share 0.0 is just before any change, 1.0 at the end.
     """
 
     operation: int
@@ -29,7 +28,7 @@ class InOperation:
 
 @dataclass(frozen=True)
 class AtTime:
-    """Time in seconds on the clock of all calls."""
+    """Moment in seconds on the clock of all calls."""
 
     at_s: float
 
@@ -39,18 +38,18 @@ Moment = InOperation | AtTime
 
 @dataclass(frozen=True)
 class PowerCut:
-    """Power loss of `off_s` seconds; permanent with None."""
+    """Power loss of `off_s` seconds; None is permanent."""
 
     off_s: float | None = POWER_OFF_S
 
 
 class FaultInjector:
-    """Engine (`flasher.protocol.engine`) around `device` with one scheduled power cut at a time."""
+    """Engine (`flasher.protocol.engine`) around `device` that executes one power cut at a time."""
 
     def __init__(self, device: MockDevice) -> None:
         self.device = device
-        self.happened = 0
-        """Number of cuts so far."""
+        self.cuts_done = 0
+        """Number of power cuts so far."""
         self._cut: PowerCut | None = None
         self._moment: Moment | None = None
         self._operations_before = 0
@@ -59,20 +58,20 @@ class FaultInjector:
         self.cancel, self.take_events = device.cancel, device.take_events
 
     def set(self, cut: PowerCut, moment: Moment) -> None:
-        """Schedule a cut at `moment`, replacing a pending one."""
+        """Schedule a power cut at `moment`, replacing a pending one."""
         self._cut, self._moment = cut, moment
         self._operations_before = self.device.operations_done
         self._due_at = moment.at_s if isinstance(moment, AtTime) else inf
-        self._look_at_flash()
+        self._watch_operation()
 
     def clear(self) -> None:
-        """Cancel a pending cut; power that is off still comes back."""
+        """Cancel a pending power cut; power that is off still comes back."""
         self._cut = self._moment = None
         self._due_at = inf
 
     @property
     def is_set(self) -> bool:
-        """True while a cut is pending."""
+        """True while a power cut is pending."""
         return self._cut is not None
 
     # -- the engine interface ---------------------------------------------------------------------
@@ -82,16 +81,16 @@ class FaultInjector:
         return self.device.done
 
     def receive(self, frame: Frame, now: float) -> None:
-        self._happen(now)
+        self._cut_when_due(now)
         self.device.receive(frame, now)
-        self._look_at_flash()
-        self._happen(now)
+        self._watch_operation()
+        self._cut_when_due(now)
 
     def tick(self, now: float) -> None:
-        self._happen(now)
+        self._cut_when_due(now)
         self.device.tick(now)
-        self._look_at_flash()
-        self._happen(now)
+        self._watch_operation()
+        self._cut_when_due(now)
 
     def deadline(self) -> float | None:
         wanted = self.device.deadline()
@@ -100,8 +99,8 @@ class FaultInjector:
 
     # -- execution --------------------------------------------------------------------------------
 
-    def _look_at_flash(self) -> None:
-        """Determine the time of a cut during an operation once that has begun."""
+    def _watch_operation(self) -> None:
+        """Determine the time of a cut during an operation, once that has begun."""
         moment = self._moment
         if isinstance(moment, InOperation):
             begun = self.device.operations_done - self._operations_before
@@ -109,7 +108,7 @@ class FaultInjector:
             is_under_way = begun == moment.operation
             self._due_at = inf if reached_at is None or not is_under_way else reached_at
 
-    def _happen(self, now: float) -> None:
+    def _cut_when_due(self, now: float) -> None:
         if self._power_due_at <= now:
             at_s, self._power_due_at = self._power_due_at, inf
             self.device.power_on(at_s)
@@ -118,6 +117,6 @@ class FaultInjector:
         # Cut at the scheduled time, so that exactly that share of the operation is done.
         cut, at_s = self._cut, self._due_at
         self.clear()
-        self.happened += 1
+        self.cuts_done += 1
         self.device.power_cut(at_s)
         self._power_due_at = inf if cut.off_s is None else at_s + cut.off_s

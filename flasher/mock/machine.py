@@ -1,4 +1,4 @@
-"""Base of all nodes of the device model: reception, sending, one timer, an application.
+"""Base of all simulated nodes: reception, transmission, a timer, an application.
 
 `MockDevice` (`model`) adds the bootloader; a `Unit` is a node without one. One timer is enough,
 because a bootloader waits for one thing in every state; the application has its own.
@@ -19,19 +19,19 @@ from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
 
 _UNUSED_WIRE_S: Final = 0.0
-"""Nothing here depends on the time on the wire, so it is not computed."""
+"""The time on the wire is not needed here, so it is not computed."""
 BUS_OFF_S: Final = 0.02
-"""Default duration of bus-off: longer than the 128 times 11 bits of the standard, because software
-must react first."""
+"""Default duration of bus-off in seconds: longer than the standard's 128 times 11 bits, because
+software must react first."""
 
 
 class Machine(ABC):
-    """Engine (`flasher.protocol.engine`) that receives the ids of its application and its own
+    """Engine (`flasher.protocol.engine`) that receives the CAN ids of its application and
     `own_ids`; base of `MockDevice` and `Unit`.
     """
 
     reassembler_type: ClassVar[type[Reassembler]] = Reassembler
-    """Reassembles messages on each id."""
+    """Reassembler class of every CAN id."""
 
     def __init__(
         self,
@@ -61,11 +61,11 @@ class Machine(ABC):
 
     @property
     def done(self) -> bool:
-        """True once it was cancelled and the current message was sent."""
+        """True once the machine was cancelled and the current message was sent."""
         return self._is_cancelled and self._transmitter.idle
 
     def receive(self, frame: Frame, now: float) -> None:
-        """Process a frame; only payload on the ids of this device matters."""
+        """Process a frame; only payload on the machine's CAN ids matters."""
         if self._off_bus_until is not None:
             self._rejoin_bus(now)
         if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
@@ -125,7 +125,7 @@ class Machine(ABC):
         return self._transmitter.idle
 
     def send(self, message: Message) -> None:
-        """Queue a message. Off the bus, it is lost."""
+        """Queue a message. It is lost while the machine is bus-off."""
         if self._off_bus_until is not None:
             return
         frames = split(message.can_id, encode(message))
@@ -145,17 +145,16 @@ class Machine(ABC):
     # -- the bus's faults -------------------------------------------------------------------------
 
     def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
-        """Leave the bus for `off_s` seconds.
+        """Go bus-off for `off_s` seconds.
 
-        Unsent messages are lost, a partly sent one included, and so is everything sent meanwhile by
-        others or by the device.
+        Unsent messages are lost, a partly sent one included, and so is everything that others or
+        the device send meanwhile.
         """
         self._transmitter = Transmitter(self._bitrate_bps)
         self._off_bus_until = now + off_s
 
     @property
     def is_off_bus(self) -> bool:
-        """True from `bus_off` until it is back."""
         return self._off_bus_until is not None
 
     def _rejoin_bus(self, now: float) -> None:
@@ -171,7 +170,7 @@ class Machine(ABC):
 
     @abstractmethod
     def power_cut(self, now: float) -> None:
-        """Lose power, and with it everything but flash and stored data."""
+        """Lose power and all memory except flash and stored data."""
 
     @abstractmethod
     def power_on(self, now: float) -> None:
@@ -183,14 +182,14 @@ class Machine(ABC):
 
     @abstractmethod
     def _take_damage(self, damage: Damage, now: float) -> None:
-        """Process bytes that are not a message."""
+        """Process damaged bytes."""
 
     @abstractmethod
     def _expire(self, now: float) -> None:
         """Handle the expired timer: restart or stop it."""
 
     def _run_timer(self, now: float) -> None:
-        """Let the timer expire as often as it is due; times of 0 follow each other at once."""
+        """Expire the timer as often as it is due; delays of 0 follow each other at once."""
         while self._due_at <= now:
             self._expire(now)
 
@@ -206,7 +205,7 @@ class Machine(ABC):
             reassembler.reset()
 
     def _lose_memory(self) -> None:
-        """Drop everything received, and all unsent messages, a partly sent one included."""
+        """Drop everything received, and all unsent messages, even a partly sent one."""
         self._forget_received()
         self._transmitter = Transmitter(self._bitrate_bps)
         self._off_bus_until = None
@@ -229,7 +228,7 @@ class Machine(ABC):
 
 
 class Unit(Machine):
-    """Node without a bootloader: its application runs while there is power."""
+    """Node without bootloader: its application runs while it has power."""
 
     def __init__(self, application: Application, *, bitrate_bps: int, timings: Timings) -> None:
         super().__init__(application, bitrate_bps=bitrate_bps, timings=timings)

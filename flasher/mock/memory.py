@@ -1,4 +1,4 @@
-"""Flash memory that is as strict as a real part, and the controller that operates it in time.
+"""Flash memory model as strict as a real part, and its controller with erase and program times.
 
 Operations that a real part does not allow are errors: programming without erasing, off the program
 unit, or outside. An operation can be interrupted (`tear_...`), as by a power cut; torn memory must
@@ -19,26 +19,26 @@ ERASED: Final = 0xFF
 
 
 class FlashError(FlasherError):
-    """Flash was used in a way that a real part does not allow: a bug of the bootloader."""
+    """The bootloader used the flash in a way that a real part does not allow: a bug."""
 
 
 class FlashRangeError(FlashError):
-    """Address outside the memory."""
+    """The address is outside the flash."""
 
 
 class FlashAlignmentError(FlashError):
-    """Address or size does not match the page or the program unit."""
+    """Address or size are not those of whole pages or program units."""
 
 
 class FlashNotErasedError(FlashError):
-    """A unit was programmed, or torn, since its page was erased."""
+    """A program unit was programmed, or torn, since its page was erased."""
 
 
 class FlashMemory:
     """`size_bytes` of flash from address `start`, erased by page, programmed by unit.
 
     A unit counts as programmed even if it was programmed with FF, as in parts with ECC. Raises
-    ValueError if the sizes do not divide each other.
+    ValueError unless memory is whole pages, and a page whole program units.
     """
 
     def __init__(
@@ -51,16 +51,16 @@ class FlashMemory:
         self.page_size_bytes = page_size_bytes
         self.program_unit_bytes = program_unit_bytes
         self.erase_count = 0
-        """Completely erased pages."""
+        """Number of completely erased pages."""
         self.program_count = 0
-        """Completed program operations."""
+        """Number of completed program operations."""
         self._erased_page = bytes((ERASED,)) * page_size_bytes
         self._pages: dict[int, bytearray] = {}
-        """Pages that are not erased, by offset; of megabytes, few are ever used."""
+        """Pages that are not erased, by offset: few of the megabytes are ever used."""
         self._used_units: set[int] = set()
 
     def read(self, address: int, size_bytes: int) -> bytes:
-        """Raises FlashRangeError."""
+        """Read bytes. Raises FlashRangeError."""
         offset = self._offset(address, size_bytes)
         first = offset - offset % self.page_size_bytes
         pages = range(first, offset + size_bytes, self.page_size_bytes)
@@ -78,7 +78,7 @@ class FlashMemory:
         self.erase_count += 1
 
     def program(self, address: int, data: bytes) -> None:
-        """Program `data`, whole units.
+        """Program `data`, whole program units.
 
         Raises FlashRangeError, FlashAlignmentError, FlashNotErasedError.
         """
@@ -88,14 +88,14 @@ class FlashMemory:
         self.program_count += 1
 
     def execute(self, operation: Operation) -> None:
-        """Complete an erase or program operation. Raises as these do."""
+        """Complete an erase or program operation. Raises FlashError."""
         if operation.data is None:
             self.erase_page(operation.address)
         else:
             self.program(operation.address, operation.data)
 
     def tear(self, operation: Operation, fraction: float) -> None:
-        """Interrupt an operation after `fraction` of its time (0 to 1). Raises as `execute`."""
+        """Interrupt an operation after `fraction` of its time (0 to 1). Raises FlashError."""
         if operation.data is None:
             self.tear_erase(operation.address, fraction)
         else:
@@ -105,7 +105,7 @@ class FlashMemory:
         """Interrupt the erasing of a page after `fraction` of its time (0 to 1).
 
         That part of the page reads as erased, the rest as before; none of it can be programmed.
-        Raises as `erase_page`.
+        Raises FlashRangeError, FlashAlignmentError.
         """
         offset = self._page_offset(address)
         done_bytes = int(fraction * self.page_size_bytes)
@@ -114,7 +114,7 @@ class FlashMemory:
 
     def tear_program(self, address: int, data: bytes, fraction: float) -> None:
         """Interrupt programming after `fraction` of its time (0 to 1): earlier units are
-        programmed, the current one half, the rest not. Raises as `program`.
+        programmed, the current one half, the rest not. Raises FlashError.
         """
         offset = self._programmable_offset(address, data)
         unit = self.program_unit_bytes
@@ -156,7 +156,7 @@ class FlashMemory:
         return offset
 
     def _put(self, offset: int, data: bytes) -> None:
-        """Store `data` without any check."""
+        """Store `data` without checks."""
         while data:
             place = offset % self.page_size_bytes
             page = self._pages.setdefault(offset - place, bytearray(self._erased_page))
@@ -165,23 +165,23 @@ class FlashMemory:
             offset, data = offset + len(part), data[len(part) :]
 
     def _units(self, offset: int, size_bytes: int) -> range:
-        """Program units of this range."""
+        """Numbers of the program units in a range."""
         unit = self.program_unit_bytes
         return range(offset // unit, (offset + size_bytes) // unit)
 
 
 class Operation(NamedTuple):
-    """Flash operation: program `data` at `address`, or erase that page (no data)."""
+    """Flash operation: program `data` at `address`, or erase that page if `data` is None."""
 
     address: int
     data: bytes | None = None
 
 
 class FlashController:
-    """Executes operations one after another, each with its duration.
+    """Executes flash operations one after another, each with its duration.
 
     An operation changes the memory at its end. If interrupted, it leaves a partial change; with
-    times of 0 nothing can be interrupted.
+    durations of 0 no operation can be interrupted.
     """
 
     def __init__(self, flash: FlashMemory, *, erase_time_s: float, program_time_s: float) -> None:
@@ -194,24 +194,24 @@ class FlashController:
 
     @property
     def ends_at(self) -> float:
-        """End of the current operation; infinite without one."""
+        """End time of the current operation; infinite without one."""
         reached_at = self.reached_at(1.0)
         return inf if reached_at is None else reached_at
 
     def reached_at(self, share: float) -> float | None:
-        """Time when `share` (0 to 1) of the current operation is done; None without one."""
+        """Time at which `share` (0 to 1) of the current operation is done; None without one."""
         if self._under_way is None:
             return None
         return self._began_at + share * self._duration_s(self._under_way)
 
     def run(self, operations: Iterable[Operation], now: float) -> None:
-        """Queue `operations` after the current one; others that wait are dropped."""
+        """Queue `operations` after the current one, replacing those that wait."""
         self._waiting = deque(operations)
         if self._under_way is None:
             self._begin_next(now)
 
     def advance(self, now: float) -> bool:
-        """Finish operations that are over; True if nothing is left.
+        """Finish the operations that are over at `now`; True if none is left.
 
         Raises FlashError for an operation that the flash refuses.
         """
@@ -224,7 +224,7 @@ class FlashController:
         return True
 
     def abort(self, now: float) -> None:
-        """Stop without power or clock: tear the current operation, drop the rest."""
+        """Lose power or clock: tear the current operation, drop the rest."""
         self.advance(now)
         self._waiting.clear()
         operation, self._under_way = self._under_way, None

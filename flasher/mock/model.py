@@ -1,12 +1,10 @@
-"""Device model: a bootloader with its flash, and the application that it starts, written from the
-documents alone.
+"""Device model: a bootloader with its flash, and its application; written from the documents alone.
 
 A message or an expired timer becomes an event (`_classify`, `_elapsed`), the table names the action
 and the next state, and the actions are the methods below, in the order of the states. An action may
-change everything but the state, and returns a short description.
-
-Flash operations take time in the controller. Meanwhile the device receives, but a packet before the
-answer to the previous one is out of turn.
+change everything but the state, and returns a short description. Flash operations take time in the
+controller. Meanwhile the device receives, but a packet before the answer to the previous one is out
+of turn.
 """
 
 from __future__ import annotations
@@ -47,19 +45,19 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
-"""Firmware version of an image without one."""
+"""Firmware version of an image that contains none."""
 AnyMessage = messages.UpgradeMessage | messages.Malformed | messages.Unknown
-"""Message as processed by the bootloader."""
+"""Decoded message for the bootloader."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 _DEAF: Final = frozenset((BootloaderState.OFF, BootloaderState.RESTARTING))
 _WORKS_ON_FLASH: Final = frozenset(
     (BootloaderState.ERASING, BootloaderState.PROGRAMMING, BootloaderState.CHECKING)
 )
-_UNTOLD: Final = (
+_UNREPORTED: Final = (
     (BootloaderState.TRANSFER, BootloaderState.PROGRAMMING),
     (BootloaderState.PROGRAMMING, BootloaderState.TRANSFER),
 )
-"""Unreported changes of state, which occur with every packet."""
+"""Transitions without an event, because they occur with every packet."""
 _DURING_END: Final = frozenset((BootloaderState.CHECKING, BootloaderState.STARTING))
 _AFTER_END: Final = _DURING_END | {BootloaderState.REFUSED}
 _WAITS_FOR_UPDATE: Final = frozenset((BootloaderState.ANNOUNCING, BootloaderState.REFUSED))
@@ -69,7 +67,7 @@ _TIMER_EVENTS: Final = {
     BootloaderState.REFUSED: BootloaderEvent.HOLD_OVER,
     **dict.fromkeys(_WORKS_ON_FLASH, BootloaderEvent.FLASH_DONE),
 }
-"""Event of the expired timer, for states with only one."""
+"""Timer event of each state that has only one."""
 _UPGRADE: Final = frozenset((Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER))
 _PACKET_HEAD: Final = (
     HEADER
@@ -78,13 +76,13 @@ _PACKET_HEAD: Final = (
     + Command.PACKET.to_bytes(COMMAND_SIZE, "big")
 )
 _NUMBER_AT: Final = PREFIX_SIZE + COMMAND_SIZE + 1
-"""Position of the packet number, after the start byte."""
+"""Position of the packet number in a message, after the start byte."""
 _NUMBER_END: Final = _NUMBER_AT + 2
 
 
 @dataclass
 class ReceivedTransfer:
-    """Image being received: its size, and the number of stored packets."""
+    """Transfer in progress: image size, and number of stored packets."""
 
     size_bytes: int
     stored: int = 0
@@ -94,8 +92,8 @@ class ReceivedTransfer:
         return packet_count(self.size_bytes)
 
     @property
-    def wanted(self) -> int:
-        """Number of the next packet; of the last one when all are stored."""
+    def next_number(self) -> int:
+        """Number of the next packet, or of the last one when all are stored."""
         return min(self.stored + 1, self.total)
 
 
@@ -105,17 +103,17 @@ def is_damaged_packet(damage: Damage) -> bool:
 
 
 class MockDevice(Machine):
-    """One upgradable device as an engine (`flasher.protocol.engine`).
+    """Upgradable device as an engine (`flasher.protocol.engine`).
 
     It starts powered: its application runs, or, without one, its bootloader announces itself from
     the first call on. A BMS has an answering application, others a silent one unless another is
-    given. Raises UsageError for timings that would make it announce itself without a pause.
+    given. Raises UsageError for boot versions without a pause between them.
     """
 
     store_type: ClassVar[type[ApplicationStore]] = ApplicationStore
     transfer_type: ClassVar[type[ReceivedTransfer]] = ReceivedTransfer
     burst: ClassVar[int] = BOOT_VERSION_BURST
-    """Number of announcements before it starts the application."""
+    """Number of boot versions before the application starts."""
     in_ram: ClassVar[tuple[str, ...]] = ()
     """Attributes that a power cut resets to the class's values."""
 
@@ -174,28 +172,28 @@ class MockDevice(Machine):
 
     @property
     def erase_count(self) -> int:
-        """Pages erased since construction."""
+        """Number of pages erased since construction."""
         return self.store.flash.erase_count
 
     @property
     def program_count(self) -> int:
-        """Program operations (a packet, or the final record) completed since construction."""
+        """Number of program operations (a packet, or the final record) since construction."""
         return self.store.flash.program_count
 
     @property
     def operations_done(self) -> int:
-        """Erase and program operations completed since construction."""
+        """Number of erase and program operations completed since construction."""
         return self.erase_count + self.program_count
 
     def readback(self, size_bytes: int | None = None) -> bytes:
-        """First `size_bytes` (None: all) of the application area, complete or torn."""
+        """First `size_bytes` of the application area, complete or torn; None for the whole area."""
         return self.store.read(
             self.profile.application_area_bytes if size_bytes is None else size_bytes
         )
 
     def operation_reaches(self, share: float) -> float | None:
-        """Time when `share` (0 to 1) of the current flash operation is done, for a power cut during
-        it. None without one.
+        """Time at which `share` (0 to 1) of the current flash operation is done, for a power cut
+        during it; None without one.
         """
         return self._controller.reached_at(share)
 
@@ -206,7 +204,7 @@ class MockDevice(Machine):
         return self.state is not BootloaderState.OFF
 
     def power_cut(self, now: float) -> None:
-        """Lose everything but the flash; the current operation stays torn."""
+        """Lose everything but the flash; a current flash operation stays torn."""
         self._handle(BootloaderEvent.POWER_CUT, now)
 
     def power_on(self, now: float) -> None:
@@ -243,8 +241,8 @@ class MockDevice(Machine):
             self._handle(BootloaderEvent.PACKET_BAD, now)
 
     def _classify(self, row: AnyMessage) -> BootloaderEvent:
-        """Event of a message. Choices of the profile that change the state are applied here; those
-        that only change the answer are in the action.
+        """Return the event of a message. Profile options that change the state are applied here;
+        those that only change the answer are applied in the action.
         """
         if self.state is BootloaderState.APPLICATION:
             return _in_application(row)
@@ -309,7 +307,7 @@ class MockDevice(Machine):
         return BootloaderEvent.END_WHOLE if self._accepts_image() else BootloaderEvent.END_WRONG
 
     def _accepts_image(self) -> bool:
-        """False if the product's images have a checksum and this one's is wrong (R7)."""
+        """False if images of this profile have a checksum, and this image's is wrong (R7)."""
         if self.profile.image_checksum == "none":
             return True
         return checksum_fits(self.store.read(self._transfer.size_bytes))
@@ -321,7 +319,7 @@ class MockDevice(Machine):
             self._handle(self._elapsed(), now)
 
     def _elapsed(self) -> BootloaderEvent:
-        """Event of the expired timer."""
+        """Return the event of the expired timer."""
         if self.state is BootloaderState.ANNOUNCING:
             if self._announced < self.burst or not self._has_whole_application:
                 return BootloaderEvent.ANNOUNCEMENT_DUE
@@ -346,7 +344,7 @@ class MockDevice(Machine):
         if before is BootloaderState.APPLICATION and not self._runs_application:
             self.application.stop()
         detail = getattr(self, f"_{move.action}")(now)
-        if self.state is not before and (self.state, before) not in _UNTOLD:
+        if self.state is not before and (self.state, before) not in _UNREPORTED:
             self._events.append(DeviceStateEntered(self.state.value, detail))
 
     # -- actions: application, reset, announcements -----------------------------------------------
@@ -370,7 +368,7 @@ class MockDevice(Machine):
         return "reset"
 
     def _restart(self, now: float) -> str:
-        """Restart without general feedback, which is the application's (R15)."""
+        """Restart without general feedback, which only the application sends (R15)."""
         self._transmitter.drop_unstarted()
         self._await_restart(now)
         return "into the bootloader"
@@ -381,7 +379,7 @@ class MockDevice(Machine):
         self._due_at = now + self.profile.reset_delay_s
 
     def _boot(self, now: float) -> str:
-        """Only a complete application is started; without one the announcements continue (R14)."""
+        """Announce, then start a complete application; else go on announcing (R14)."""
         self._has_whole_application = self.store.image() is not None
         self._announced = 0
         self._due_at = now
@@ -409,7 +407,7 @@ class MockDevice(Machine):
         return f"version {firmware}"
 
     def _firmware(self) -> str:
-        """Version in the image of the application."""
+        """Firmware version in the application's image."""
         return find_firmware_version(self.store.image() or b"") or NO_VERSION
 
     # -- actions: update command and transfer -----------------------------------------------------
@@ -422,7 +420,7 @@ class MockDevice(Machine):
         return ""
 
     def _erase(self, now: float) -> str:
-        """Erase the record first, then the pages."""
+        """Erase the completeness record first, then the pages."""
         self._transmitter.drop_unstarted()
         self._transfer = self.transfer_type(self._offered_bytes)
         self._work(self.store.erasing(self._offered_bytes), now)
@@ -448,7 +446,7 @@ class MockDevice(Machine):
 
     def _store(self, now: float) -> str:
         transfer = self._transfer
-        operation = self.store.storing(transfer.wanted, self._payload, transfer.size_bytes)
+        operation = self.store.storing(transfer.next_number, self._payload, transfer.size_bytes)
         self._work([operation], now)
         return ""
 
@@ -459,7 +457,7 @@ class MockDevice(Machine):
         return self._reply(messages.Ack(transfer.stored), now)
 
     def _answer_repeated(self, now: float) -> str:
-        """Keep the first copy, whatever the second contains (TX-05)."""
+        """Keep the first copy, whatever the second one contains (TX-05)."""
         stored = self._transfer.stored
         if self.profile.repeated_packet == "ack":
             return self._reply(messages.Ack(stored), now)
@@ -469,14 +467,14 @@ class MockDevice(Machine):
         if self.profile.older_packet == "ack" and self._number is not None:
             return self._reply(messages.Ack(self._number), now)
         refused = self.profile.older_packet == "nak"
-        return self._reply(messages.Nak(self._transfer.wanted) if refused else None, now)
+        return self._reply(messages.Nak(self._transfer.next_number) if refused else None, now)
 
     def _answer_bad(self, now: float) -> str:
         choice = self.profile.bad_packet
         if choice == "nak_received" and self._number is not None:
             return self._reply(messages.Nak(self._number), now)
         return self._reply(
-            None if choice == "silence" else messages.Nak(self._transfer.wanted), now
+            None if choice == "silence" else messages.Nak(self._transfer.next_number), now
         )
 
     # -- actions: end -----------------------------------------------------------------------------
@@ -498,8 +496,8 @@ class MockDevice(Machine):
         return ""
 
     def _refuse_end(self, now: float) -> str:
-        """Send NAK with the number of the next packet, or the last one when all are stored."""
-        self._send(messages.Nak(self._transfer.wanted))
+        """Send NAK with the number of the next packet, or of the last one when all are stored."""
+        self._send(messages.Nak(self._transfer.next_number))
         if self.state is BootloaderState.REFUSED:
             self._due_at = now + self.profile.refused_hold_s
         else:
@@ -508,7 +506,7 @@ class MockDevice(Machine):
 
     def _refuse_end_again(self, now: float) -> str:
         if self.profile.repeated_end == "same_answer":
-            self._send(messages.Nak(self._transfer.wanted))
+            self._send(messages.Nak(self._transfer.next_number))
         return ""
 
     def _switch_off(self, now: float) -> str:
@@ -524,7 +522,7 @@ class MockDevice(Machine):
 
 
 def _in_application(row: AnyMessage) -> BootloaderEvent:
-    """Event of a message to the running application."""
+    """Return the event of a message to the running application."""
     match row:
         case messages.ResetCommand():
             return BootloaderEvent.RESET

@@ -1,4 +1,4 @@
-"""Device profile: the choices of a device where the documents leave them open.
+"""Device profile: choices of the device model where the documents leave them open.
 
 Cases of the conformance suite marked P name these choices. An option's type gives its allowed
 values, the docstring after it its help; `flasher.settings.device_model` sets options from texts.
@@ -55,7 +55,7 @@ NumberOrNone = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceProfile:
-    """Choices of one product; the defaults are this project's readings.
+    """Options of a device model; the defaults are this project's readings.
 
     Raises UsageError for an invalid value.
     """
@@ -144,13 +144,13 @@ class DeviceProfile:
 
     @property
     def image_limit_bytes(self) -> int:
-        """Maximum size of an accepted image."""
+        """Maximum size of an accepted image, in bytes."""
         limit = self.largest_image_bytes
         area = min(self.application_area_bytes, IMAGE_MAX_SIZE)
         return area if limit is None else min(limit, area)
 
     def speaking(self, dialect: Dialect) -> Self:
-        """Return the same product with an application of this dialect."""
+        """Return the same profile with an application of this dialect."""
         return replace(self, dialect=dialect.name)  # type: ignore[arg-type]
 
     def is_silent_to(self, can_id: int, command: int) -> bool:
@@ -201,13 +201,13 @@ class DeviceProfile:
 
 @cache  # evaluating the types takes longer than all that is checked by them
 def _choices() -> dict[str, tuple[str, ...]]:
-    """Words of every option that is a choice."""
+    """Allowed words of every option that is a choice."""
     hints = get_type_hints(DeviceProfile).items()
     return {key: get_args(hint) for key, hint in hints if get_origin(hint) is Literal}
 
 
 def _parse_query(text: str) -> tuple[int | None, int]:
-    """Parse `COMMAND` or `ID:COMMAND`, both in hexadecimal, as (id or None, command)."""
+    """Parse `COMMAND` or `ID:COMMAND`, in hexadecimal, as (CAN id or None, command)."""
     can_id, _, command = text.strip().rpartition(":")
     try:
         return (int(can_id, 16) if can_id else None), int(command, 16)

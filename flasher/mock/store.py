@@ -1,8 +1,7 @@
-"""Memory layout of a device: the application, the record that marks it complete, and other memory
-for memory reads (0x4308).
+"""Memory layout of the device model: application area, completeness record, ROM and RAM.
 
-One page for the record follows the application area. The record is erased before everything else
-and written last, its magic at the end, so that a power cut at any moment leaves either a complete
+The record is on its own page after the application area. It is erased before everything else and
+written last, its magic at the end, so that a power cut at any moment leaves either a complete
 application or none.
 """
 
@@ -24,25 +23,25 @@ _CHECKSUM: Final = Struct("<I")
 _FACTORY_IMAGE_BYTES: Final = 500
 _ROM_START: Final = 0x0800_0000
 _ROM_SIZE_BYTES: Final = AREA_START - _ROM_START
-"""The bootloader, up to the application area."""
+"""The bootloader's memory, up to the application area."""
 _RAM_START: Final = 0x2000_0000
 _RAM_SIZE_BYTES: Final = 0x5000
 
 
 def checksum_fits(image: bytes) -> bool:
-    """True if the last four bytes are the CRC-32 of those before, little-endian (R7)."""
+    """True if the last four bytes of an image are the CRC-32 of the rest, little-endian (R7)."""
     body = image[: -_CHECKSUM.size]
     return len(image) > _CHECKSUM.size and _CHECKSUM.pack(zlib.crc32(body)) == image[len(body) :]
 
 
 def with_checksum(body: bytes, size_bytes: int) -> bytes:
-    """Return `body`, filled up with varying bytes, and with the checksum of R7 appended."""
+    """Fill `body` up to `size_bytes` with varying bytes and the checksum of R7 at the end."""
     body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM.size))
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
 def factory_image(profile: DeviceProfile) -> bytes:
-    """Initial application: its version among filler, with the checksum of R7."""
+    """Create the initial application: its version among filler, with the checksum of R7."""
     size_bytes = min(_FACTORY_IMAGE_BYTES, profile.application_area_bytes)
     body = b"factory application " + profile.factory_version.encode("ascii") + b"\x00"
     body += bytes(index % 251 for index in range(size_bytes - len(body) - _CHECKSUM.size))
@@ -50,7 +49,7 @@ def factory_image(profile: DeviceProfile) -> bytes:
 
 
 class ApplicationStore:
-    """Application area and its record, on their own flash."""
+    """Application area and completeness record, on their own flash."""
 
     flash_type: ClassVar[type[FlashMemory]] = FlashMemory
 
@@ -66,7 +65,7 @@ class ApplicationStore:
         )
 
     def image(self) -> bytes | None:
-        """Return the image described by the record; None unless it is intact."""
+        """Return the complete image in the area; None if there is none, or if it is damaged."""
         size_bytes, crc, magic = _RECORD.unpack(self.flash.read(self._record_address, _RECORD.size))
         if magic != _MAGIC or not 0 < size_bytes <= self._area_bytes:
             return None
@@ -77,11 +76,11 @@ class ApplicationStore:
         return zlib.crc32(image) == crc
 
     def read(self, size_bytes: int) -> bytes:
-        """Return the first bytes of the area, complete or not."""
+        """Read the first bytes of the area, complete or not."""
         return self.flash.read(AREA_START, size_bytes)
 
     def erasing(self, size_bytes: int) -> list[Operation]:
-        """Operations that erase memory for an image: the record first, then the pages."""
+        """Operations that erase the area for an image: the record first, then the pages."""
         area_bytes = self._area_bytes if self._erases_all else size_bytes
         pages = range(AREA_START, AREA_START + area_bytes, self.flash.page_size_bytes)
         return [Operation(self._record_address), *(Operation(page) for page in pages)]
@@ -95,12 +94,12 @@ class ApplicationStore:
         return Operation(AREA_START + offset, self._units(payload[: size_bytes - offset]))
 
     def recording(self, size_bytes: int) -> Operation:
-        """Operation that records the first `size_bytes` of the area as a complete application."""
+        """Operation that marks the first `size_bytes` of the area as a complete application."""
         record = _RECORD.pack(size_bytes, zlib.crc32(self.read(size_bytes)), _MAGIC)
         return Operation(self._record_address, self._units(record))
 
     def load(self, image: bytes) -> None:
-        """Program an image and its record like a factory: no time, no operation counted."""
+        """Program an image and its record without operation times and counts, as in a factory."""
         self.flash.program(AREA_START, self._units(image))
         self.flash.execute(self.recording(len(image)))
         self.flash.program_count = 0
@@ -112,17 +111,17 @@ class ApplicationStore:
 
 
 class MemoryMap:
-    """Bootloader, flash and RAM; contents of bootloader and RAM are invented, but constant."""
+    """Memory for memory reads (0x4308): flash, and constant invented contents of ROM and RAM."""
 
     def __init__(self, flash: FlashMemory) -> None:
         self._areas = (
-            (_ROM_START, _ROM_SIZE_BYTES, _made_up),
+            (_ROM_START, _ROM_SIZE_BYTES, _invented),
             (flash.start, flash.size_bytes, flash.read),
-            (_RAM_START, _RAM_SIZE_BYTES, _made_up),
+            (_RAM_START, _RAM_SIZE_BYTES, _invented),
         )
 
     def read(self, start: int, end: int) -> bytes | None:
-        """Return the bytes from `start` up to `end`, exclusive; None if any is outside memory."""
+        """Read from `start` up to `end`, exclusive; None if a byte is outside memory."""
         found = b""
         while start < end:
             area = next((each for each in self._areas if 0 <= start - each[0] < each[1]), None)
@@ -135,6 +134,6 @@ class MemoryMap:
         return found
 
 
-def _made_up(start: int, size_bytes: int) -> bytes:
+def _invented(start: int, size_bytes: int) -> bytes:
     addresses = range(start, start + size_bytes)
     return bytes((address * 167 + (address >> 8) * 13) & 0xFF for address in addresses)

@@ -1,7 +1,7 @@
-"""A whole bicycle as one engine: BMS, WMC, OBC and, in the MOTINOVA dialect, HMI communicate on the
-bus, and each of the first three can be upgraded.
+"""Model of a whole bicycle: BMS, WMC, OBC and, in the MOTINOVA dialect, HMI on one bus.
 
-The battery supplies the others: when it switches off, they are off.
+BMS, WMC and OBC can be upgraded. The battery supplies the others: when it switches off, they are
+off.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ _DEFAULT_PROFILE: Final = DeviceProfile()
 
 
 class System:
-    """Engine (`flasher.protocol.engine`) made of several engines that also receive each other.
-    `profile` and `has_application` apply to `device`, the one named by `target`; `profile` also to
+    """Engine (`flasher.protocol.engine`) of several nodes that also receive each other.
+
+    `profile` and `has_application` apply to `device`, the node named by `target`; `profile` also to
     the BMS. Events are those of `device`. Attach it to a simulated bus, or drive it on a link:
-    frames of its members take turns.
+    nodes send in turn.
     """
 
     def __init__(
@@ -41,7 +42,6 @@ class System:
         own_profile = profile.speaking(dialect)
         plain_profile = _DEFAULT_PROFILE.speaking(dialect)
         self.members: dict[Node, Machine] = {}
-        """Machine of each node."""
         for node in dialect.nodes:
             if node is Node.CDL:
                 continue
@@ -62,7 +62,7 @@ class System:
         if not isinstance(device, MockDevice):
             raise TypeError(f"{target.name} cannot be upgraded")
         self.device = device
-        """Device to upgrade."""
+        """Node to upgrade."""
         self._battery = self.members[Node.BMS]
         self._turns = list(self.members.values())
         self._sending: Machine | None = None
@@ -83,7 +83,7 @@ class System:
                 member.power_cut(now)
 
     def power_on(self, now: float) -> None:
-        """Restore the power; devices restart through their bootloaders (R19)."""
+        """Restore the power; nodes restart through their bootloaders (R19)."""
         for member in self._turns:
             if not member.has_power:
                 member.power_on(now)
@@ -95,7 +95,7 @@ class System:
         return all(member.done for member in self._turns)
 
     def receive(self, frame: Frame, now: float) -> None:
-        """Process a frame from outside, or the adapter's echo of an own one."""
+        """Process a frame of another node, or an echo of an own frame."""
         if frame.is_echo:
             return  # the members already received it
         for member in self._turns:
@@ -125,7 +125,7 @@ class System:
         return None
 
     def frame_sent(self, now: float) -> None:
-        """The adapter accepted it: pass it to the other members, whose turn it is."""
+        """Pass the accepted frame to the other nodes; the sender's next turn is after theirs."""
         sender, self._sending = self._sending, None
         frame = sender.next_frame(now) if sender is not None else None
         if sender is None or frame is None:
@@ -141,7 +141,6 @@ class System:
             member.cancel(now)
 
     def take_events(self) -> Sequence[object]:
-        """Return the events of `device` since the last call."""
         for member in self._turns:
             if member is not self.device:
                 member.take_events()

@@ -1,4 +1,4 @@
-"""The upgrade as a table, seen from the device: what it does on every event in every state.
+"""State table of an upgrade on the device's side: action and next state for every event.
 
 A received message or an expired timer becomes a `BootloaderEvent` (see `model`, which also applies
 the profile's choices). `TABLE[state][event]` names the action, a method of
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 
 class BootloaderState(Enum):
-    """States of the device; the value is the name in the documentation."""
+    """States of the device model; the value is the name in the documentation."""
 
     __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
 
@@ -72,11 +72,11 @@ MESSAGE_EVENTS: Final = frozenset(BootloaderEvent) - {
     _E.RESTART_DUE, _E.ANNOUNCEMENT_DUE, _E.WINDOW_OVER, _E.FLASH_DONE, _E.PAUSE_OVER,
     _E.HOLD_OVER, _E.START_DUE, _E.START_BY_RESTART_DUE, _E.POWER_CUT, _E.POWER_ON,
 }  # fmt: skip
-"""Events of messages."""
+"""Events that are caused by messages."""
 
 
 class BootloaderTransition(NamedTuple):
-    """Action after an event, and the next state (None: the same)."""
+    """Action of an event in a state, and the next state (None for the same)."""
 
     action: str
     state: BootloaderState | None = None

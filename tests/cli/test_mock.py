@@ -546,7 +546,7 @@ def test_variants_are_listed_with_their_clauses_without_target_or_adapter(flashe
     lines = run.out.splitlines()
     assert len(lines) == len(VARIANTS)
     assert all(len(line) <= 120 for line in lines)
-    assert "no-crc-check                  CR-01  takes a message with any CRC" in lines
+    assert "no-crc-check                  CR-01  accepts a message with any CRC" in lines
 
 
 def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:
@@ -557,7 +557,7 @@ def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:
         "name": "no-crc-check",
         "clause": "CR-01",
         "also": list(VARIANTS["no-crc-check"].also),
-        "summary": "takes a message with any CRC",
+        "summary": "accepts a message with any CRC",
         "upgrade_works": True,
     } in document["variants"]
 

@@ -96,7 +96,7 @@ def test_a_power_cut_in_any_operation_leaves_the_old_image_none_or_the_new_and_a
     injector = FaultInjector(device)
     injector.set(PowerCut(), InOperation(operation, share))
     world.upgrade(injector, image=IMAGE)
-    assert injector.happened == 1
+    assert injector.cuts_done == 1
     assert not injector.is_set
     assert device.stored_image in {factory, None, IMAGE}
     assert upgrade(injector).ok
@@ -123,7 +123,7 @@ def test_a_moment_that_never_comes_cuts_nothing() -> None:
     injector.set(PowerCut(), InOperation(OPERATIONS))
     assert world.upgrade(injector, image=IMAGE).ok
     assert injector.is_set
-    assert injector.happened == 0
+    assert injector.cuts_done == 0
     injector.clear()
     assert not injector.is_set
 
@@ -156,7 +156,7 @@ def test_a_power_cut_at_a_received_frame_is_survived(frames: int) -> None:
     device = make_device()
     injector = AfterFrame(device, frames, lambda it, now: it.set(PowerCut(), AtTime(now + 0.0002)))
     world.upgrade(injector, image=IMAGE)
-    assert injector.happened == 1
+    assert injector.cuts_done == 1
     assert upgrade(injector).ok
     assert device.stored_image == IMAGE
 

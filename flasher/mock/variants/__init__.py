@@ -1,7 +1,7 @@
 """Deliberately wrong bootloaders: each violates one clause and is otherwise correct.
 
-They measure a conformance suite: every case has one that fails it. `make` creates one like a
-`MockDevice`; `VARIANTS` has all by name.
+They measure a conformance suite: every case has a bootloader that fails it. `make` creates one like
+a `MockDevice`; `VARIANTS` contains all by name.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ VARIANTS: Final[Mapping[str, Variant]] = MappingProxyType(
         for variant in sorted(DECLARED, key=lambda one: (_GROUPS.index(one.clause[:2]), one.clause))
     }
 )
-"""By name, in the order of the clauses."""
+"""Variants by name, in the order of the clauses."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 
 
@@ -58,8 +58,8 @@ def make(
     timings: Timings = DEFAULT_TIMINGS,
     **others: Any,
 ) -> MockDevice:
-    """Create a wrong device, with the keywords of `MockDevice`. The variant's own choices and
-    timings override the given ones. Raises UsageError for an unknown name and as `MockDevice` does.
+    """Create a variant with the keywords of `MockDevice`. Its own profile options and timings
+    override the given ones. Raises UsageError for an unknown name and for an invalid profile.
     """
     chosen = find(variant) if isinstance(variant, str) else variant
     choices: dict[str, Any] = dict(chosen.profile)

@@ -1,4 +1,4 @@
-"""Base classes of deliberately wrong bootloaders."""
+"""Base classes and declaration of deliberately wrong bootloaders (variants)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WrongT = TypeVar("_WrongT", bound=type[object])
 
 
 def bad_write(row: AnyMessage, command: Command) -> Message | None:
-    """Return a malformed write of this command; None for anything else."""
+    """Return a malformed write of this command; None for other messages."""
     if not isinstance(row, Malformed):
         return None
     message = row.message
@@ -32,28 +32,28 @@ def bad_write(row: AnyMessage, command: Command) -> Message | None:
 @json_keys("name clause also summary upgrade_works")
 @dataclass(frozen=True)
 class Variant:
-    """A deliberately wrong device model."""
+    """Deliberately wrong bootloader: its clause, summary and device class."""
 
     # It violates one clause, and is right in everything else.
 
     name: str  # in lower case, parted by hyphens
     clause: str
-    """The case that it fails."""
+    """Case of the conformance suite that it fails."""
     summary: str  # what it does, in a line
     device_type: type[MockDevice] = MockDevice
     also: tuple[str, ...] = ()
     """Other cases that it may fail."""
-    # What it does wrong is part of their stimulus too. Where no upgrade works, any case that needs
-    # a transfer may fail as well.
+    # Their stimulus triggers the fault too. Where no upgrade works, any case that needs a transfer
+    # may fail as well.
     everywhere: bool = False
     """Every transfer triggers the fault, so that any case with one may fail."""
     unseen: str = ""
-    """Why no case detects it on a bench."""
+    """Reason why no case detects it on a bench."""
     upgrade_works: bool = True
-    """False when not even an undisturbed upgrade to an ordinary image ends well."""
+    """False when not even an undisturbed upgrade to an ordinary image succeeds."""
     # Ordinary: of some 1000 bytes, no multiple of 128. Well: with that image running.
     profile: Mapping[str, object] = field(default_factory=dict)
-    """Choices of the device profile that show the fault; set when it is created."""
+    """Profile options that are needed to show the fault."""
     timings: Mapping[str, float] = field(default_factory=dict)
     """Timings that are the fault."""
 
@@ -63,8 +63,8 @@ DECLARED: Final[list[Variant]] = []
 
 
 def variant(name: str, clause: str, *, also: str = "", **more: Any) -> Callable[[_WrongT], _WrongT]:
-    """Declare a class as the fault of a `Variant`: a device, or one of its parts. The first
-    sentence of its docstring is the summary. The cases in `also` are separated by spaces; "*" means
+    """Declare a class as the faulty device, or part of a device, of a `Variant`. The first sentence
+    of its docstring is the summary. The cases in `also` are separated by spaces; "*" means
     `everywhere`; `more` are further fields of the variant.
     """
 
@@ -128,6 +128,6 @@ class PlainFlash(FlashMemory):
 
 
 class PlainStore(ApplicationStore):
-    """Application on a flash without checks."""
+    """Application store on a flash without checks."""
 
     flash_type = PlainFlash

@@ -14,7 +14,7 @@ from flasher.protocol import messages
 from flasher.protocol.spec import Command
 
 _DARK_BOOTS: Final = 2
-"""Power-ups in a row without an application after which one is spent in the dark."""
+"""Number of power-ups in a row without an application after which it hangs."""
 
 
 @variant("announces-after-complete", "EN-01", also="EN-07 EN-08", upgrade_works=False)
@@ -63,7 +63,6 @@ class KeepsLongerRest(PlainStore):
     """Does not erase the page where a smaller image ends: a mixture with the old one."""
 
     def erasing(self, size_bytes: int) -> list[Operation]:
-        """All but the page where the new image ends, when the old one reaches beyond it."""
         old = self.image()
         operations = super().erasing(size_bytes)
         if old is None or len(old) <= size_bytes:
@@ -129,7 +128,9 @@ class AckBeforeWrite(MockDevice):
     def _store(self, now: float) -> str:
         self._flush()
         transfer = self._transfer
-        self._buffered = self.store.storing(transfer.wanted, self._payload, transfer.size_bytes)
+        self._buffered = self.store.storing(
+            transfer.next_number, self._payload, transfer.size_bytes
+        )
         self._due_at = now + self.profile.program_time_s
         return ""
 

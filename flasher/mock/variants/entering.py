@@ -15,10 +15,10 @@ from flasher.protocol.spec import PACKET_DATA_SIZE, Command
 from flasher.protocol.wire import Message, Reassembler
 
 _PATIENCE: Final = 8
-"""Announcements after which a device without an application gives up."""
+"""Number of announcements after which a device without an application gives up."""
 _LISTENS_UNTIL: Final = 3
 LOOP_S: Final = 0.005
-"""Until the bootloader looks into its queue again."""
+"""Interval at which the bootloader reads its queue."""
 _POINTER_BYTES: Final = 4
 _BYTE_MAX: Final = 0xFF
 _SIXTEEN_BITS: Final = 0xFFFF
@@ -93,7 +93,7 @@ class TwoRestarts(MockDevice):
     "SE-04",
 )
 class StaysInBootloader(MockDevice):
-    """Without an update command, waits silently for ever."""
+    """Waits silently forever if no update command comes."""
 
     def _announce(self, now: float) -> str:
         detail = super()._announce(now)
@@ -104,7 +104,7 @@ class StaysInBootloader(MockDevice):
 
 @variant("gives-up-without-application", "RS-03", also="TX-07 TX-12 PW-01 PW-02 SE-01")
 class GivesUp(HangingDevice):
-    """Without an application, announces itself eight times and hangs."""
+    """Hangs after eight announcements if it has no application."""
 
     def _announce(self, now: float) -> str:
         detail = super()._announce(now)
@@ -114,7 +114,7 @@ class GivesUp(HangingDevice):
 
 @variant("resets-at-any-text", "RS-04")
 class ResetByAnyText(MockDevice):
-    """Takes a reset with a wrong text."""
+    """Accepts a reset with a wrong text."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         super()._take_row(messages.ResetCommand() if bad_write(row, Command.RESET) else row, now)
@@ -122,7 +122,7 @@ class ResetByAnyText(MockDevice):
 
 @variant("resets-on-read", "RS-04")
 class ResetByRead(MockDevice):
-    """Takes a reset that is a read."""
+    """Accepts a reset that is a read."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         message = row.message if isinstance(row, messages.Malformed) else None
@@ -154,7 +154,7 @@ class SilentPowerUp(MockDevice):
 
 @variant("full-last-packet-fails", "UP-01", also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12")
 class FullPacketsFail(ReceivedTransfer):
-    """Wants a packet more when the size is a multiple of 128."""
+    """Expects one packet more when the size is a multiple of 128."""
 
     @property
     def total(self) -> int:
@@ -184,14 +184,14 @@ class ErasesFromApplication(MockDevice):
 
 
 def _erase_at_once(device: MockDevice) -> None:
-    """The record and the first page are gone; the time that it takes is not modelled."""
+    """Erase the record and the first page, without modelling the time that it takes."""
     for operation in device.store.erasing(1)[:2]:
         device.store.flash.execute(operation)
 
 
 @variant("listens-until-third-version", "UP-04", also="UP-05")
 class StopsListening(MockDevice):
-    """Takes no update command from its third announcement on. Listens between its first
+    """Accepts no update command from its third announcement on. Listens between its first
     announcements only, when it has an application to start.
     """
 
@@ -230,7 +230,7 @@ class QueuesUpdates(MockDevice):
 
 @variant("any-target-name", "UP-06")
 class AnyTargetName(MockDevice):
-    """Takes the update command of any target."""
+    """Accepts the update command of any target."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
@@ -240,7 +240,7 @@ class AnyTargetName(MockDevice):
 
 @variant("mixes-transfers", "UP-08", also="FR-07 UP-01 TX-12 TM-05")
 class MixesTransfers(MockDevice):
-    """Goes on with what is stored when an update command comes in the midst."""
+    """Continues with the stored packets when an update command comes during the transfer."""
 
     store_type = PlainStore
 
@@ -280,7 +280,7 @@ class UpdateTextOfFour(MockDevice):
 
 @variant("reset-from-any-node", "RS-04")
 class ResetFromAnyNode(MockDevice):
-    """Takes a reset that another node than the tool sends. Checks only the receiver."""
+    """Accepts a reset that another node than the tool sends. Checks only the receiver."""
 
     def _take_message(self, message: Message, now: float) -> None:
         if messages.decode(message) == messages.ResetCommand():
@@ -290,7 +290,7 @@ class ResetFromAnyNode(MockDevice):
 
 @variant("dies-after-255-announcements", "RS-03")
 class DiesAfter255(HangingDevice):
-    """Without an application, hangs after 255 announcements."""
+    """Hangs after 255 announcements if it has no application."""
 
     def _announce(self, now: float) -> str:
         return self._hang() if self._announced >= _BYTE_MAX else super()._announce(now)

@@ -30,7 +30,7 @@ from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler, en
 
 _CRC_AT: Final = slice(-CRC_SIZE - len(TAIL), -len(TAIL))
 _BACK_TO_BACK_S: Final = 0.0007
-"""Maximum distance of frames without a pause; at 250 kbit/s one takes 0.4 to 0.55 ms."""
+"""Maximum interval of frames without a pause; at 250 kbit/s a frame takes 0.4 to 0.55 ms."""
 _KNOWN_COMMANDS: Final = frozenset(Command) | {item.command for item in ITEMS}
 _KNOWN_MODES: Final = frozenset(Mode)
 _WRITTEN: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
@@ -68,7 +68,7 @@ class HeaderRestarts(Reassembler):
 
 @variant("ignores-tail", "FR-04", also="CR-01")
 class TailIgnored(Reassembler):
-    """Takes a message with any last byte."""
+    """Accepts a message with any last byte."""
 
     def _judge_message(self, size: int, found: list[Message | Damage]) -> None:
         self._buffer[size - len(TAIL) : size] = TAIL
@@ -85,7 +85,7 @@ class LengthTrusted(Reassembler):
         return found
 
     def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
-        """Give up all that the length covers, not its header only."""
+        """Skip the whole length of a damaged message, not only its header."""
         found.append(Damage(self.can_id, reason, bytes(self._buffer[:size])))
         del self._buffer[:size]
 
@@ -134,8 +134,8 @@ class BackToBackLost(MockDevice):
 
 @variant("every-frame-is-payload", "FR-09")
 class EveryFrameIsPayload(MockDevice):
-    """Takes remote, extended, error and empty frames between for payload. Copies its receive buffer
-    at every frame with its id, of whatever kind.
+    """Mistakes remote, extended, error and empty frames for payload. Copies its receive buffer at
+    every frame with its id, of whatever kind.
     """
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -158,7 +158,7 @@ class UnknownRestarts(MockDevice):
 
 
 def _with_mirrored_crc(wire: bytes) -> bytes:
-    """`wire` with its CRC the other way round."""
+    """Return a message with its CRC in reverse byte order."""
     changed = bytearray(wire)
     changed[_CRC_AT] = changed[_CRC_AT][::-1]
     return bytes(changed)
@@ -166,7 +166,7 @@ def _with_mirrored_crc(wire: bytes) -> bytes:
 
 @variant("no-crc-check", "CR-01", also="CR-02 CR-03 TX-01 BU-01")
 class CrcIgnored(Reassembler):
-    """Takes a message with any CRC."""
+    """Accepts a message with any CRC."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         return True
@@ -174,8 +174,8 @@ class CrcIgnored(Reassembler):
 
 @variant("short-packet-filled", "CR-02", also="TX-01 TM-02 BU-01 BU-02")
 class ShortPacketFilled(MockDevice):
-    """Fills a packet that lost a frame with FF and stores it. Takes a packet that ends early for a
-    whole one: it has no CRC, so none is looked at.
+    """Fills a packet that lost a frame with FF and stores it. Mistakes a truncated packet for a
+    whole one: it has no CRC, so none is checked.
     """
 
     def _take_damage(self, damage: Damage, now: float) -> None:
@@ -190,7 +190,7 @@ class ShortPacketFilled(MockDevice):
 
 @variant("either-crc-order", "CR-03")
 class EitherCrcOrder(Reassembler):
-    """Takes a little-endian CRC as well."""
+    """Accepts a little-endian CRC as well."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or super()._crc_fits(_with_mirrored_crc(wire))
@@ -198,7 +198,7 @@ class EitherCrcOrder(Reassembler):
 
 @variant("crc-without-id", "CR-03")
 class CrcWithoutId(Reassembler):
-    """Takes a CRC that leaves the id out as well."""
+    """Accepts a CRC that is computed without the CAN id as well."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         crc = int.from_bytes(wire[_CRC_AT], "big")
@@ -219,7 +219,7 @@ class FeedbackCrcMirrored(MockDevice):
 
 @variant("crc-zero-accepted", "CR-03")
 class CrcZeroAccepted(Reassembler):
-    """Takes a message whose CRC is 00000000. Kept for bench tests."""
+    """Accepts a message whose CRC is 00000000. Kept for bench tests."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or wire[_CRC_AT] == bytes(CRC_SIZE)
@@ -227,7 +227,7 @@ class CrcZeroAccepted(Reassembler):
 
 @variant("crc-ones-accepted", "CR-03")
 class CrcOnesAccepted(Reassembler):
-    """Takes a message whose CRC is FFFFFFFF."""
+    """Accepts a message whose CRC is FFFFFFFF."""
 
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or wire[_CRC_AT] == b"\xff" * CRC_SIZE
@@ -235,8 +235,8 @@ class CrcOnesAccepted(Reassembler):
 
 @variant("long-commands-accepted", "FR-06", also="RS-04 UP-06")
 class LongCommandsAccepted(Reassembler):
-    """Takes a reset or update command with more data than its command states. Goes by the length
-    byte, and looks at as much of the data as it needs.
+    """Accepts a reset or update command with more data than its command states. Goes by the length
+    byte, and reads as much of the data as it needs.
     """
 
     def _judge_head(self, found: list[Message | Damage]) -> bool:
@@ -253,8 +253,8 @@ class LongCommandsAccepted(Reassembler):
 
 @variant("tail-in-crc", "FR-03", also="FR-02 TX-07 TM-05")
 class TailInCrc(Reassembler):
-    """Takes F0 in the first byte of a CRC for the tail. Looks for the tail from the end of the data
-    on: the CRC before it may hold the same byte.
+    """Mistakes F0 in the first byte of a CRC for the tail. Searches the tail from the end of the
+    data on: the CRC before it may contain the same byte.
     """
 
     def _crc_fits(self, wire: bytes) -> bool:
@@ -274,7 +274,7 @@ class AnswersPadded(MockDevice):
 
 @variant("ignores-mode", "FR-10", also="RS-04 UP-06")
 class IgnoresMode(MockDevice):
-    """Takes reset, update command, packet and end with any mode."""
+    """Accepts reset, update command, packet and end of transfer with any mode."""
 
     def _take_message(self, message: Message, now: float) -> None:
         if message.can_id == self.target.request_id and message.command in _WRITTEN:

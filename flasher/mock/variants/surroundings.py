@@ -25,12 +25,12 @@ _WORD: Final = 0xFFFF_FFFF
 _BUSY_S: Final = 0.001
 _PACKETS_A_PAGE: Final = 16
 _SLOW_S: Final = DEFAULT_TIMINGS.ack_timeout_s + 0.1
-"""Later than a host waits for an ACK (R12)."""
+"""Longer than a host waits for an ACK (R12)."""
 _LOG_BYTES: Final = 4096
 _JUNK_BYTES: Final = 64
 _LOAD_WINDOW_S: Final = 0.1
 _LOAD_FRAMES: Final = 140
-"""Frames of others in that time that are too many: 250 kbit/s carries about 200 full ones."""
+"""Number of foreign frames in that time that is too many: 250 kbit/s carries about 200."""
 _WRONG_MESSAGE: Final = frozenset((DamageReason.BAD_CRC, DamageReason.BAD_TAIL))
 _APPLICATION_COMMANDS: Final = frozenset(item.command for item in ITEMS)
 _USELESS: Final = frozenset(
@@ -49,7 +49,7 @@ class SlowSixteenth(MockDevice):
 
     def _store(self, now: float) -> str:
         detail = super()._store(now)
-        if self._transfer.wanted % _PACKETS_A_PAGE == 0:
+        if self._transfer.next_number % _PACKETS_A_PAGE == 0:
             self._due_at = now + _SLOW_S
         return detail
 
@@ -89,8 +89,8 @@ class CollisionHangs(HangingDevice):
 
 @variant("logs-useless-messages", "SE-01", also="SE-03 CO-04")
 class LogsUseless(HangingDevice):
-    """Hangs after 4 KiB of messages of no use in a row. Keeps every message of no use until a
-    useful one comes, in a memory that is soon full.
+    """Hangs after 4 KiB of useless messages in a row. Keeps every useless message until a useful
+    one comes, in a memory that is soon full.
     """
 
     _log_bytes = 0
@@ -177,7 +177,7 @@ class SizeRoundedUp(MockDevice):
 
 @variant("any-message-is-life", "SE-01", also="CO-04")
 class AnyMessageIsLife(MockDevice):
-    """Window and pause begin anew with every message of no use."""
+    """Restarts its window and its transfer timeout with every useless message."""
 
     def _take_message(self, message: Message, now: float) -> None:
         before, due = self.state, self._due_at
@@ -192,13 +192,13 @@ class AnyMessageIsLife(MockDevice):
 
 @variant("load-hangs", "CO-01", also="CO-02")
 class LoadHangs(HangingDevice):
-    """Hangs when 140 frames of others come within 100 ms. Is interrupted by every frame on the bus:
+    """Hangs when 140 foreign frames come within 100 ms. Is interrupted by every frame on the bus:
     more than it can serve leave it hanging.
     """
 
     @cached_property
     def _foreign(self) -> deque[float]:
-        """When the last frames of others came."""
+        """Times of the last foreign frames."""
         return deque(maxlen=_LOAD_FRAMES)
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -213,7 +213,7 @@ class LoadHangs(HangingDevice):
 
 @variant("hears-other-targets", "CO-02", also="CO-04")
 class HearsOtherTargets(MockDevice):
-    """Takes packets for other targets during its own transfer."""
+    """Accepts packets for other targets during its own transfer."""
 
     @cached_property
     def _others(self) -> dict[int, Reassembler]:
@@ -248,7 +248,7 @@ class AnswersInBootloader(MockDevice):
 
 @variant("answer-lost-on-busy-bus", "CO-01", also="FR-09")
 class AnswerLostOnBusyBus(MockDevice):
-    """Loses an ACK that is due within 1 ms after a frame of others. Gives up when its transmit
+    """Loses an ACK that is due within 1 ms after a foreign frame. Gives up when its transmit
     mailbox is not free at once.
     """
 

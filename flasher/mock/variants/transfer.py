@@ -32,10 +32,10 @@ _WRAP_S: Final = 65.536
 
 @variant("nak-wrong-number", "TX-01", also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01")
 class NakWrongNumber(MockDevice):
-    """Asks for the next packet when one was damaged."""
+    """Requests the next packet when one was damaged."""
 
     def _answer_bad(self, now: float) -> str:
-        return self._reply(messages.Nak(min(self._transfer.wanted + 1, PACKET_COUNT_MAX)), now)
+        return self._reply(messages.Nak(min(self._transfer.next_number + 1, PACKET_COUNT_MAX)), now)
 
 
 @variant("swallows-after-bad", "TX-01", also="CR-01 CR-02 CR-03 FR-04 BU-01 CR-04 FR-05")
@@ -88,7 +88,7 @@ class WritesRepeated(MockDevice):
 
 @variant("accepts-skipped-number", "TX-03")
 class AcceptsSkipped(MockDevice):
-    """Takes a packet after a gap, and leaves the gap."""
+    """Accepts a packet after a gap, and leaves the gap."""
 
     def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
@@ -103,7 +103,7 @@ class AcceptsSkipped(MockDevice):
 
 @variant("ignores-total", "TX-04")
 class IgnoresTotal(MockDevice):
-    """Takes a packet with any total."""
+    """Accepts a packet with any total."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and self._transfer.total:
@@ -150,13 +150,13 @@ class ByteNumbers(MockDevice):
         )
 
     def _answer_bad(self, now: float) -> str:
-        return self._reply(messages.Nak(self._transfer.wanted & _BYTE), now)
+        return self._reply(messages.Nak(self._transfer.next_number & _BYTE), now)
 
 
 @variant("hangs-after-256-packets", "TX-07")
 class HangsAfter256(HangingDevice):
     """Hangs when packet 257 is stored, until power is cut. Has room for 256 packets in its list of
-    what was received.
+    received ones.
     """
 
     def _acknowledge(self, now: float) -> str:
@@ -179,7 +179,7 @@ class FillerChecked(MockDevice):
 
 @variant("never-times-out", "TX-12", also="SE-01 SE-03")
 class NeverTimesOut(MockDevice):
-    """After a pause in the transfer, takes only the next packet until power is cut."""
+    """Accepts only the next packet after a pause in the transfer, until power is cut."""
 
     _waits_on = False
     in_ram = ("_waits_on",)
@@ -276,7 +276,7 @@ class OlderOverwrites(MockDevice):
 
 @variant("total-looked-at-once", "TX-04")
 class TotalLookedAtOnce(MockDevice):
-    """Looks at the total of packet 1 only."""
+    """Checks the total of packet 1 only."""
 
     def _classify(self, row: AnyMessage) -> BootloaderEvent:
         event = super()._classify(row)
@@ -288,10 +288,10 @@ class TotalLookedAtOnce(MockDevice):
 
 @variant("sixteen-bit-offsets", "TX-07")
 class SixteenBitOffsets(PlainStore):
-    """Writes what lies beyond 64 KiB over the beginning."""
+    """Writes bytes beyond 64 KiB over the beginning."""
 
     def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
-        """Offsets are counted in 16 bits."""
+        """Count offsets in 16 bits."""
         operation = super().storing(number, payload, size_bytes)
         offset = (operation.address - AREA_START) % _BANK_BYTES
         return operation._replace(address=AREA_START + offset)
@@ -299,12 +299,12 @@ class SixteenBitOffsets(PlainStore):
 
 @variant("numbers-modulo-256", "TX-03")
 class NumbersModulo256(MockDevice):
-    """Looks at the low byte of a packet's number only."""
+    """Compares only the low byte of packet numbers."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and self.state is BootloaderState.TRANSFER:
             transfer = self._transfer
-            for number in (transfer.stored, transfer.wanted):
+            for number in (transfer.stored, transfer.next_number):
                 if number and (row.number - number) & _BYTE == 0:
                     row = dataclasses.replace(row, number=number)
         super()._take_row(row, now)
@@ -312,7 +312,7 @@ class NumbersModulo256(MockDevice):
 
 @variant("totals-modulo-256", "TX-04")
 class TotalsModulo256(MockDevice):
-    """Looks at the low byte of a packet's total only."""
+    """Compares only the low byte of packet totals."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         if isinstance(row, messages.Packet) and (row.total - self._transfer.total) & _BYTE == 0:
@@ -322,7 +322,7 @@ class TotalsModulo256(MockDevice):
 
 @variant("number-zero-is-first", "TX-03", also="SE-04")
 class NumberZeroIsFirst(MockDevice):
-    """Takes packet 0 for packet 1 at the beginning."""
+    """Accepts packet 0 as packet 1 at the beginning."""
 
     def _take_row(self, row: AnyMessage, now: float) -> None:
         message = bad_write(row, Command.PACKET)
@@ -334,8 +334,8 @@ class NumberZeroIsFirst(MockDevice):
 
 @variant("acks-damaged-repetition", "TX-01", also="CR-01")
 class AcksDamagedRepetition(MockDevice):
-    """Acknowledges a damaged packet that names the number stored last. Looks at the number before
-    the checksum.
+    """Acknowledges a damaged packet with the number stored last. Checks the number before the
+    checksum.
     """
 
     def _answer_bad(self, now: float) -> str:
@@ -364,8 +364,8 @@ class AcksTwice(MockDevice):
 
 @variant("blank-packet-unanswered", "FR-03", also="TX-07")
 class BlankPacketUnanswered(MockDevice):
-    """Does not acknowledge a packet of nothing but FF until it is repeated. Has nothing to program
-    for a blank packet, and forgets to answer it.
+    """Does not acknowledge a packet of FF only until it is repeated. Has nothing to program for a
+    blank packet, and forgets to answer it.
     """
 
     def _acknowledge(self, now: float) -> str:
@@ -391,7 +391,7 @@ class PauseCountsFromStart(MockDevice):
 
 @variant("timer-wraps", "TX-12")
 class TimerWraps(MockDevice):
-    """Gives a transfer up 65.536 s after its start, where its clock of 16 bits wraps."""
+    """Gives up a transfer 65.536 s after its start, where its clock of 16 bits wraps."""
 
     _booted_at = 0.0
 
