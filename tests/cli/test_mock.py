@@ -1,4 +1,6 @@
-"""`flasher mock` in this process: a host in another thread talks to it over a virtual bus."""
+"""`flasher mock` and `flasher conformance serve` in this process: a host in another thread talks to
+them over a virtual bus.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +21,7 @@ import pytest
 from flasher import api
 from flasher.bus.adapter import CanLink
 from flasher.cli.bench import mock as mock_command
+from flasher.cli.bench import serving
 from flasher.driver import drive
 from flasher.errors import BusError, ExitCode
 from flasher.host.outcome import Outcome
@@ -120,7 +123,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
         finally:
             beside.mock_runs = False
 
-    monkeypatch.setattr(mock_command, "drive", drive_and_tell)
+    monkeypatch.setattr(serving, "drive", drive_and_tell)
     is_quiet = mock_command._Tool.is_quiet
 
     def has_ended(tool: mock_command._Tool, now: float) -> bool:
@@ -257,7 +260,7 @@ def test_the_device_outlives_an_adapter_that_is_lost_and_comes_back(
 
     monkeypatch.setattr(CanLink, "receive", receive_or_fail)
     monkeypatch.setattr(CanLink, "reopen", reopen)
-    monkeypatch.setattr(mock_command, "_REOPEN_S", 0.01)
+    monkeypatch.setattr(serving, "_REOPEN_S", 0.01)
     host.do(upgrade_twice)
     run = serve("--upgrades", "2")
     assert run.code == ExitCode.OK
@@ -276,7 +279,7 @@ def test_ctrl_c_ends_the_wait_for_a_lost_adapter(
 
     monkeypatch.setattr(CanLink, "receive", fail)
     monkeypatch.setattr(CanLink, "reopen", fail)
-    monkeypatch.setattr(mock_command, "_REOPEN_S", 0.01)
+    monkeypatch.setattr(serving, "_REOPEN_S", 0.01)
     assert serve().code == ExitCode.OK
 
 
@@ -609,3 +612,69 @@ def test_in_the_motinova_dialect_the_application_answers_at_its_own_bit_rate(
     assert run.code == ExitCode.OK
     assert rates[0] == 125_000
     assert "the MOTINOVA document has no upgrade" in run.err
+
+
+# -- a compiled bootloader -------------------------------------------------------------------------
+
+
+@pytest.fixture
+def serve_bootloader(flasher: Flasher, host: Host) -> Callable[[str], Run]:
+    """Runs `flasher conformance serve -t bms` on the host's channel until it is interrupted."""
+
+    def run(subject: str) -> Run:
+        bus = ("-i", "virtual", "-c", host.channel)
+        return flasher("conformance", "serve", "-t", "bms", "--subject", subject, *bus)
+
+    return run
+
+
+def test_a_compiled_bootloader_is_upgraded_by_the_flash_host(
+    serve_bootloader: Callable[[str], Run], host: Host
+) -> None:
+    image = VECTORS + b"V2r0r1_20240131".ljust(200, b"-")
+    plan = api.make_plan(api.Image.from_bytes(image), "bms")
+    results: list[api.Result] = []
+
+    def upgrade() -> None:
+        with api.connect(interface="virtual", channel=host.channel) as connection:
+            results.append(connection.device().upgrade(plan, verify=api.Level.VERSION))
+        host.interrupt()
+
+    host.do(upgrade)
+    run = serve_bootloader("tests.peers.python_bootloader:PythonBootloader")
+    assert run.code == ExitCode.OK
+    assert [line for line in run.out.splitlines() if line.startswith("state:")] == [
+        "state:   bootloader: power on",
+        "state:   application: version V2r0r1_20240131",
+    ]
+    assert run.err.endswith(f" as BMS on virtual {host.channel}; Ctrl-C ends it\n")
+    host.join()
+    assert results[0].ok
+    assert results[0].running_version == "V2r0r1_20240131"
+
+
+def test_a_bootloader_that_crashes_is_reported_once_and_starts_again(
+    serve_bootloader: Callable[[str], Run], host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = iter(range(3))
+
+    def interrupt_at_last() -> None:
+        if next(starts, None) is None:
+            host.interrupt()
+
+    monkeypatch.setattr(host, "mock_listens", interrupt_at_last)
+    run = serve_bootloader("tests.conformance.test_subject:EndsAtOnce")
+    assert run.code == ExitCode.OK
+    assert run.out.count("state:   bootloader: reset\n") >= 2
+    assert run.err.splitlines()[1:] == [
+        "warning: the bootloader ended with status 3 in flasher_dut_start; the device restarts"
+    ]
+
+
+@pytest.mark.parametrize("words", [(), ("-t", "bms"), ("--subject", "boot")])
+def test_a_served_bootloader_needs_a_target_and_a_subject(
+    flasher: Flasher, words: tuple[str, ...]
+) -> None:
+    run = flasher("conformance", "serve", *words, "-i", "virtual", "-c", "none")
+    assert run.code == ExitCode.USAGE
+    assert "-t/--target and --subject are required" in run.err

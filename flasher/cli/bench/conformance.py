@@ -15,7 +15,7 @@ from typing import Annotated, Final
 import click
 
 from flasher.cli import values
-from flasher.cli.bench import conformance_explore, conformance_init
+from flasher.cli.bench import conformance_explore, conformance_init, conformance_serve
 from flasher.cli.bench.conformance_bench import (
     OUTPUT_OPTIONS,
     bench_options,
@@ -26,6 +26,7 @@ from flasher.cli.bench.conformance_bench import (
 )
 from flasher.cli.bench.conformance_explore import explore
 from flasher.cli.bench.conformance_init import init
+from flasher.cli.bench.conformance_serve import serve
 from flasher.cli.bench.conformance_text import (
     ListedCase,
     difference_lines,
@@ -155,7 +156,7 @@ class HeaderDocument:
 DOCUMENTS: Final = (
     ConformanceDocument, CaseListDocument, Difference, SideBySide, ProfileKeysDocument,
     HeaderDocument,
-    *conformance_explore.DOCUMENTS, *conformance_init.DOCUMENTS,
+    *conformance_explore.DOCUMENTS, *conformance_init.DOCUMENTS, *conformance_serve.DOCUMENTS,
 )  # fmt: skip
 
 
@@ -531,3 +532,4 @@ def header(output: Output, *, folder: Path) -> int:
 
 conformance.add_command(explore, "explore")
 conformance.add_command(init, "init")
+conformance.add_command(serve, "serve")

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from flasher import api, events
-from flasher.api import Connection
+from flasher import api
 from flasher.cli import values
-from flasher.cli.documents import to_json
+from flasher.cli.bench.serving import DeviceWatcher, serve
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, bus_options, target_option
-from flasher.cli.output import Output, byte_count
+from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
-from flasher.driver import drive
-from flasher.errors import BusError, ExitCode, UsageError
-from flasher.log import BY_DEVICE, log_event
+from flasher.errors import ExitCode, UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
@@ -31,13 +27,10 @@ from flasher.protocol.spec import Dialect, Target
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.device_model import describe_options, set_options
-from flasher.wording import wording_of
 
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
 """After this silence the tool has finished verifying."""
-_REOPEN_S: Final = 0.25
-"""Interval between attempts to reopen a lost adapter."""
 _EXAMPLES: Final = """\
 examples:
   flasher mock -t bms -i socketcan -c vcan0
@@ -143,8 +136,13 @@ def mock(
     engine, device = _served(
         target, dialect, profile, variant, is_system=system, has_application=not no_app
     )
-    watcher = _Watcher(device, save_image, output)
-    output.shows = lambda event: type(event) in {*BY_DEVICE, events.BytesDamaged}
+
+    def save() -> None:
+        if save_image is not None and device.stored_image is not None:
+            write_whole(save_image, device.stored_image, _SAVE_IMAGE)
+            output.result(f"saved:   {printable(str(save_image))}")
+
+    watcher = DeviceWatcher(output, save)
     tool = _Tool(target)
     with (
         api.connect(dialect, holder=None, fallback=bus.fallback, **bus.config) as connection,
@@ -161,24 +159,16 @@ def mock(
             served = f"{served} that is wrong ({found.clause}: {found.summary})"
         output.progress(f"{served} on {connection.name}; Ctrl-C ends it")
         clock = connection.clock
-        is_over = False
-        while not is_over:
-            try:
-                drive(
-                    engine,
-                    connection.link,
-                    clock,
-                    taps=[tool],
-                    on_event=watcher,
-                    cancelled=lambda: (
-                        stopped() or (watcher.images == upgrades and tool.is_quiet(clock.now()))
-                    ),
-                )
-                is_over = True
-            except BusError as error:
-                output.error_line(f"warning: {error.what} Waiting for the adapter; Ctrl-C ends it")
-                is_over = not _is_back(connection, stopped, output)
-                device.bus_off(clock.now(), off_s=0.0)
+        serve(
+            engine,
+            device,
+            connection,
+            output,
+            taps=[tool],
+            on_event=watcher,
+            stopped=stopped,
+            is_over=lambda: watcher.images == upgrades and tool.is_quiet(clock.now()),
+        )
     return output.document(MockDocument(images=watcher.images))
 
 
@@ -210,25 +200,6 @@ def _served(
     return device, device
 
 
-def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output) -> bool:
-    """Wait until the adapter opens again; False when the user stops. A device outlives faults of
-    its bus. Each reason is reported once.
-    """
-    reported = ""
-    while not stopped():
-        try:
-            connection.link.reopen()
-        except BusError as error:
-            if str(error) != reported:
-                reported = str(error)
-                output.progress(f"not yet: {error.what} {error.remedy}".rstrip())
-            connection.clock.wait_until(connection.clock.now() + _REOPEN_S)
-        else:
-            output.progress("the adapter is back")
-            return True
-    return False
-
-
 class _Tool:
     """Tap that detects when the tool has finished with the target."""
 
@@ -243,48 +214,3 @@ class _Tool:
     def is_quiet(self, now: float) -> bool:
         """True once even a repeated query would have arrived."""
         return now - self._last_at >= _QUIET_S
-
-
-class _Watcher:
-    """Prints the events of the device model, and saves received images."""
-
-    def __init__(self, device: MockDevice, save_to: Path | None, output: Output) -> None:
-        self._device = device
-        self._save_to = save_to
-        self._output = output
-        self.images = 0
-
-    def __call__(self, event: object) -> None:
-        log_event(event)
-        match event:
-            case events.DeviceStateEntered(state, detail):
-                self._say("state", f"{state}{f': {detail}' if detail else ''}", event)
-            case events.PacketStored(number, total) if number == total:
-                self._say("packets", f"all {total:,} stored", event)
-            case events.PacketStored(number, total) if number == 1:
-                self._say("packets", f"first of {total:,} stored", event)
-            case events.ImageStored(size_bytes, sha256):
-                image = self._device.stored_image
-                if self._save_to and image is not None:
-                    write_whole(self._save_to, image, _SAVE_IMAGE)
-                    self._output.result(f"saved:   {printable(str(self._save_to))}")
-                self.images += 1
-                self._say("image", f"{byte_count(size_bytes)}, sha256 {sha256}", event)
-            case events.DeviceWritten(name, before, after):
-                self._say(
-                    "written", f"{name}: {after or 'empty'} (before: {before or 'empty'})", event
-                )
-            case events.ShutdownAnnounced(why):
-                self._say("power", f"SHUTDOWN sent: {why}", event)
-            case events.ShutdownEnded(ready, silent):
-                others = f"; no answer from {', '.join(silent)}" if silent else ""
-                self._say("power", f"off; ready: {', '.join(ready) or 'none'}{others}", event)
-            case events.DeviceReported(what):
-                self._say("note", what, event)
-            case events.BytesDamaged(can_id, reason, data):
-                why = wording_of("DamageReason", reason)
-                self._say("damage", f"0x{can_id:03X}: {why}: {data[:16].hex(' ')} ...", event)
-
-    def _say(self, kind: str, text: str, event: object) -> None:
-        self._output.result(f"{kind + ':':<9}{text}")
-        self._output.line({**to_json(event), "text": text})

@@ -11,12 +11,14 @@ from flasher.conformance.dut import CanFrame, pipes
 from flasher.conformance.dut.pipes import PipeMessage
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.errors import FlasherError
+from flasher.events import DeviceStateEntered
 from flasher.mock.application import Application
 from flasher.mock.bms import BmsApplication
 from flasher.mock.machine import Machine
 from flasher.mock.memory import FlashError, FlashMemory, Operation
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START, MemoryMap, checksum_fits, with_checksum
+from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.frame import Frame
@@ -201,7 +203,10 @@ class CompiledDevice(Machine):
             self._restart(RESET, now)
             self._due_at = inf
         self._has_power = True
+        cause = "power on" if self._cause == POWER_ON else "reset"
+        self.emit(DeviceStateEntered("bootloader", cause))
         self._process.start()
+        self._log.clear()
         self._call(PipeMessage.START, self._cause, now)
 
     # -- the running application -------------------------------------------------------------------
@@ -224,7 +229,9 @@ class CompiledDevice(Machine):
             raise FlasherError("the bootloader started an incomplete application")
         self._restart(RESET, inf)
         self._runs_application = True
-        self.application.start(find_firmware_version(area.rstrip(b"\xff")) or "unknown", now)
+        version = find_firmware_version(area.rstrip(b"\xff")) or "unknown"
+        self.emit(DeviceStateEntered(BootloaderState.APPLICATION.value, f"version {version}"))
+        self.application.start(version, now)
 
     # -- the bootloader ----------------------------------------------------------------------------
 
@@ -282,6 +289,7 @@ class CompiledDevice(Machine):
         if asked is PipeMessage.LOG:
             self._count_bytes(pipes.HEADER.size + len(data))
             self._log.append(data.decode(errors="replace"))
+            self._report(self._log[-1])
             return None
         try:
             return self._flash_operation(asked, data)
