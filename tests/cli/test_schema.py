@@ -23,6 +23,7 @@ from tests.cli.conftest import SAMPLES, Flasher
 
 MOCK = ("-t", "bms", "--mock", "--mock-speed", "0")
 OBC = SAMPLES / "obc.bin"
+BOOTLOADER = "tests.peers.python_bootloader:PythonBootloader"
 
 
 def hold(schema: Mapping[str, Any], name: str, instance: object) -> None:
@@ -109,6 +110,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("export", "csv", Path("upgrade.log"), "-o", Path("upgrade.csv")),
         ("export", "trace", Path("upgrade.log"), "-o", Path("upgrade.pcapng")),
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
+        ("conformance", "serve", "-t", "bms", "--subject", BOOTLOADER, "-i", "virtual", "-c", "s"),
         ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--case", "EN-04"),
         ("conformance", "--list"),
         ("conformance", "profile"),
@@ -143,7 +145,7 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
         for event in (*map(make, event_classes()), events.PacketStored(1, 9)):
             on_event(event)
 
-    monkeypatch.setattr("flasher.cli.bench.mock.drive", drive)
+    monkeypatch.setattr("flasher.cli.bench.serving.drive", drive)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +160,8 @@ def test_what_commands_print_is_as_described(
     run = flasher(*words, "--json")
     assert run.code == 0
     lines = hold_output(schema, run.out, 0)
-    assert bool(lines) == ("--events" in words or words[0] in ("monitor", "mock", "ui"))
+    always = {"monitor", "mock", "ui", "serve"}.intersection(map(str, words))
+    assert bool(lines) == ("--events" in words or bool(always))
 
 
 def test_every_command_is_among_them() -> None:
