@@ -170,6 +170,15 @@ class Bench:
         self.continued_at = found.at
         return found
 
+    def update_again(self, size_bytes: int) -> None:
+        """Get request transfer after a transfer that was broken off or refused: from the waiting
+        bootloader, or from the old application where the device kept it (rs_03_old).
+        """
+        within_s = self.waits.burst_s + self.limit("start_s")
+        if self.profile.allows("rs_03_old", "kept") and self.application_runs(within_s):
+            self.reset_to_bootloader()
+        self.update(size_bytes)
+
     def start_transfer(self, size_bytes: int) -> None:
         """Reset the running application and send the update command until request transfer."""
         self.reset_to_bootloader()
@@ -331,6 +340,10 @@ class Bench:
             why = "" if reports else ", and the device does not report which application runs"
             self.unsupported(expected, f"{missing}{why}")
             return
+        if differs_at is not None and not runs and self.is_kept_aside(image):
+            why = "the device keeps its old application until complete (rs_03_old)"
+            self.unsupported(expected, why)
+            return
         got = "the image"
         if differs_at is not None:
             got = f"different bytes from offset {differs_at}"
@@ -338,6 +351,17 @@ class Bench:
             total = packet_count(len(image))
             got = f"{min(total, _PIECES)} of {total} pieces, read over the bus"
         self.check(differs_at is None, expected, got)
+
+    def is_kept_aside(self, image: bytes) -> bool:
+        """True when the device stores a transfer in another place, so that its flash still holds
+        the old application and not the `image` received so far.
+        """
+        choice, size = self.choice("rs_03_old"), len(image)
+        if choice != "either" or not self.subject.has_readback:
+            return choice != "erased"
+        stored = self.subject.readback()[:size]
+        known = (self.good_image, self.subject.second_image or self.good_image)
+        return any(stored[: len(old)] == old[:size] for old in known)
 
     def difference(self, image: bytes, *, runs: bool = False) -> int | None:
         """Offset of the first byte in flash that differs from `image`, or None. `runs` says that
@@ -430,8 +454,3 @@ class Bench:
         elif self.wait_for(Reply.BOOT_VERSION, within_s=within_s) is None:
             self.power_cycle()
             self.await_message(Reply.BOOT_VERSION)
-
-    def erase_application(self) -> None:
-        """Erase the application and wait until the bootloader announces itself."""
-        self.start_transfer(len(self.good_image))
-        self.leave_transfer()

@@ -120,6 +120,7 @@ _FIXED_CHOICES: Final = {
     "fr_04": "rescanned",
     "fr_07": "ignored",
     "fr_10": "silence",
+    "rs_03_old": "erased",
     "up_02": "silence",
     "up_04": "rejected",
     "up_04_burst": "accepted",

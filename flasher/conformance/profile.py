@@ -146,6 +146,10 @@ class ProfileKeys(TomlTable):
     """Reset that reaches the announcing bootloader (R18)."""
     rs_03: Literal["either", "announces", "listens"] = "either"
     """After the burst, without an application: keeps announcing, or listens silently (R14)."""
+    rs_03_old: Literal["either", "erased", "kept"] = "either"
+    """The old application after a transfer that was broken off or refused: erased, or kept until
+    complete, as with two banks.
+    """
     up_02: Literal["either", "silence", "nak"] = "either"
     """Answer to an update command that is rejected."""
     up_03: Literal["either", "feedback", "silence"] = "either"

@@ -13,6 +13,7 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.explore import Explorer
+from flasher.conformance.init import ask_device
 from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
@@ -22,6 +23,7 @@ from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants.ending import RecordErasedLast
 from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
 from flasher.protocol import messages
+from tests.campaigns.dual_bank import CopiesImage, SwapsBanks
 from tests.campaigns.right_devices import (
     HELD,
     CountsFromPackets,
@@ -181,3 +183,77 @@ def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
     heard, _, sent, *_ = text.split()
     assert heard == sent
     assert int(sent) > 1
+
+
+# -- dual bank -------------------------------------------------------------------------------------
+
+_KEPT: dict[str, Value] = {"rs_03_old": "kept"}
+
+
+@each("kind", (SwapsBanks, CopiesImage))
+@each("old", ("kept", "either"))
+@each(
+    "case_ids",
+    (
+        ("EN-04",),
+        ("RS-03", "TX-12", "TX-13", "SE-01"),
+        ("UP-08", "FR-07", "TX-03", "EN-01", "EN-02", "EN-07"),
+    ),
+)
+def test_a_dual_bank_device_may_keep_its_old_application(
+    kind: type[MockDevice], old: str, case_ids: tuple[str, ...]
+) -> None:
+    device = dataclasses.replace(
+        MOCK_PROFILE, image_checksum="crc32", after_complete="restarts", transfer_timeout_s=3.0
+    )
+    assert blamed(*case_ids, kind=kind, device=device, given={"rs_03_old": old}) == []
+
+
+@pytest.mark.slow
+@each("kind", (SwapsBanks, CopiesImage))
+def test_power_cuts_leave_a_dual_bank_device_its_old_or_new_application(
+    kind: type[MockDevice],
+) -> None:
+    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts")
+    assert blamed("PW-01", "PW-02", kind=kind, device=device, given=_KEPT) == []
+
+
+class _StartsRefused(MockDevice):
+    """Starts an image whose checksum it rejected."""
+
+    def _boot(self, now: float) -> str:
+        if self._transfer.stored and self._transfer.stored == self._transfer.total:
+            self.store.flash.execute(self.store.recording(self._transfer.size_bytes))
+        return super()._boot(now)
+
+
+class _SwapsAnyway(SwapsBanks, _StartsRefused):
+    """Swaps the banks although the image was rejected."""
+
+
+@each("kind, old", ((_StartsRefused, "erased"), (_SwapsAnyway, "kept"), (_SwapsAnyway, "either")))
+def test_a_refused_image_must_not_run(kind: type[MockDevice], old: str) -> None:
+    device = dataclasses.replace(MOCK_PROFILE, image_checksum="crc32")
+    (found,) = blamed("EN-04", kind=kind, device=device, given={"rs_03_old": old})
+    assert found.startswith("EN-04 fail")
+
+
+def test_a_device_that_is_stated_to_erase_its_application_must_not_run_it() -> None:
+    device = dataclasses.replace(MOCK_PROFILE, image_checksum="crc32")
+    found = blamed("EN-04", kind=SwapsBanks, device=device, given={"rs_03_old": "erased"})
+    assert found
+
+
+@each("kind, value", ((MockDevice, "erased"), (SwapsBanks, "kept"), (CopiesImage, "kept")))
+def test_init_finds_whether_the_old_application_is_kept(kind: type[MockDevice], value: str) -> None:
+    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts")
+    result = ask_device(subject(kind, device), ConformanceProfile())
+    found = {answer.key: answer for answer in result.answers}
+    assert found["rs_03_old"].value == value
+    assert found["device.largest_image_bytes"].value == device.image_limit_bytes
+
+
+@each("old", ("kept", "either"))
+def test_walks_on_a_dual_bank_device_find_nothing(old: str) -> None:
+    profile = ConformanceProfile({**profile_of_mock().given, "rs_03_old": old})
+    assert Explorer(subject(SwapsBanks), profile, seed="4").explore(400).finding is None

@@ -13,8 +13,6 @@ _RESET_PERIOD_S: Final = 0.2
 """Interval at which a tool repeats a command (4.3)."""
 _WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
 """Values to send in place of 04."""
-_NO_APPLICATION_S: Final = 1.0
-"""How long to query an application that must not run."""
 _UPGRADE_KINDS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
 """Possible answers to end of transfer; a starting application may send other reports."""
 
@@ -142,14 +140,17 @@ def _check_second_end(bench: Bench, first_answer: Reply) -> None:
     "EN-04",
     "image with a wrong checksum",
     clause="Welling 5.1, figure 2 (end); R6; R7",
-    stimulus="the good image with another checksum, end of transfer twice; then the good image",
-    expectation="NAK, the second time too (en_02); it is not started, and the device is rescuable",
+    stimulus="a good image with another checksum, the second one where there is one; end of "
+    "transfer twice; then the good image",
+    expectation="NAK, the second time too (en_02); it is not started: no application runs, or the "
+    "old one (rs_03_old); the device is rescuable",
     requires={DESTRUCTIVE, Requirement.CHECKSUM},
-    choices=("en_02", "en_04", "rs_03"),
+    choices=("en_02", "en_04", "rs_03", "rs_03_old"),
 )
 def wrong_checksum(bench: Bench) -> None:
-    # The code is that of the good image, so a device that starts it anyway is not harmed.
-    image = bench.good_image[:-1] + bytes((bench.good_image[-1] ^ 0xFF,))
+    # The code is that of a good image, so a device that starts it anyway is not harmed.
+    code = bench.subject.second_image or bench.good_image
+    image = code[:-1] + bytes((code[-1] ^ 0xFF,))
     bench.start_transfer(len(image))
     bench.packets(image)
     bench.send(bench.encoder.end())
@@ -157,14 +158,25 @@ def wrong_checksum(bench: Bench) -> None:
     with bench.step("end of transfer again"):
         _check_second_end(bench, Reply.NAK)
     with bench.step("afterwards"):
-        within_s = bench.limit("refused_s")
+        within_s, old = bench.limit("refused_s"), bench.choice("rs_03_old")
         reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
-        if bench.choice("rs_03") == "announces":  # else it may listen silently
+        # Otherwise it may listen silently, or start its old application.
+        if bench.choice("rs_03") == "announces" and old == "erased":
             bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
         bench.wait(bench.waits.burst_s)
-        runs = bench.application_runs(_NO_APPLICATION_S)
-        bench.check(not runs, "no application runs", "it answers" if runs else "no answer")
+        runs = bench.application_runs()
+        expected = {"erased": "no application runs", "kept": "the old application runs"}
+        if old in expected:
+            got = "it answers" if runs else "no answer"
+            bench.check(runs == (old == "kept"), expected[old], got)
+        if runs and old != "erased":
+            bench.check_image(bench.good_image)
+            if bench.subject.second_image is None and not bench.subject.has_readback:
+                why = "the bench has neither a second good image nor readback"
+                bench.unsupported("the image that runs is not the refused one", why)
     with bench.step("the good image"):
+        if runs:
+            bench.reset_to_bootloader()
         bench.update(len(bench.good_image))
         bench.finish(bench.good_image)
 

@@ -249,6 +249,7 @@ def padded(bench: Bench) -> None:
             # Within a transfer where the device starts over, which allows no pause (UP-08).
             if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
+                bench.wait_until_listening()
             update = bench.encoder.update(len(probe.image))
             probe.enter(padded_to_frame(update, filler), choice, reset=not index)
             probe.send_next()

@@ -99,7 +99,7 @@ def reset_again(bench: Bench) -> None:
     stimulus="silence after the announcements, with an application and, for 16 s, without one",
     expectation="a valid application is started; without one the bootloader stays (rs_03)",
     requires={DESTRUCTIVE},
-    choices=("rs_03",),
+    choices=("rs_03", "rs_03_old"),
 )
 def no_update(bench: Bench) -> None:
     count = bench.number("versions")
@@ -108,7 +108,10 @@ def no_update(bench: Bench) -> None:
         bench.collect(bench.waits.burst_s)
         bench.check_application()
     with bench.step("without an application"):
-        bench.erase_application()
+        if not _erase_application(bench):
+            why = "the device keeps its old application until complete (rs_03_old)"
+            bench.unsupported("a bootloader without an application", why)
+            return
         if bench.choice("rs_03") == "either":
             more = _versions(bench.collect(_LISTENS_S))
             bench.info(f"without an application, {more + 1} boot versions in {_LISTENS_S:g} s")
@@ -200,6 +203,24 @@ def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
     wanted = " or ".join(map(str, (count, *others)))
     bench.check(_versions(replies) in (count, *others), f"{expected}: {wanted}", describe(replies))
     bench.check_only(replies, Reply.BOOT_VERSION, Reply.FEEDBACK, why="nothing but boot versions")
+
+
+def _erase_application(bench: Bench) -> bool:
+    """Erase the application by a transfer that is left, so that a burst begins. False when the
+    device keeps its application.
+    """
+    old, size = bench.choice("rs_03_old"), len(bench.good_image)
+    if old == "kept":
+        return False
+    bench.start_transfer(size)
+    bench.leave_transfer()
+    if old == "either":
+        bench.collect(bench.waits.burst_s)
+        if bench.application_runs():
+            return False
+        bench.update(size)
+        bench.leave_transfer()
+    return True
 
 
 def _versions(replies: list[Received]) -> int:

@@ -90,8 +90,8 @@ def endless(bench: Bench) -> None:
             reply = bench.wait_for(Reply.ACK, Reply.BOOT_VERSION)
             if reply is not None and reply.kind is Reply.ACK:
                 bench.finish(image, len(floods) + 2)
-            else:  # it gave the transfer up, and may announce itself or listen silently
-                bench.update(len(image))
+            else:  # it gave the transfer up
+                bench.update_again(len(image))
                 bench.finish(image)
         else:
             bench.finish(image, len(floods) + 1)

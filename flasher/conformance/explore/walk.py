@@ -152,7 +152,9 @@ class Walk:
         """Check that the flash holds `image`, where it is readable. Raises Violation."""
         if self.bench.subject.has_readback:
             at = self.bench.difference(image)
-            if at is not None:
+            if at is not None and not (
+                self.phase in _IN_TRANSFER and self.bench.is_kept_aside(image)
+            ):
                 raise Violation("flash", f"the flash differs from the image from offset {at} on")
 
     # -- received messages -------------------------------------------------------------------------
@@ -275,7 +277,8 @@ class Walk:
     def _begin_transfer(self, at: float) -> None:
         self.phase = DevicePhase.BEGUN
         self._image, self._expected_end = self._update_image
-        self.has_application, self.update_accepted = False, True
+        self.has_application = {"erased": False, "kept": True}.get(self.bench.choice("rs_03_old"))
+        self.update_accepted = True
         self._stored = 0
         self._requested_at = self._answered_at = at
         self._acks_due.clear()
@@ -500,7 +503,7 @@ class Walk:
             self._await_version()
             if self.phase is not DevicePhase.ANNOUNCING:
                 return
-        before = self.running_image if self.has_application else None
+        before = None if self.has_application is False else self.running_image
         after = self._image if is_end else None
         self._may_restart = self._may_send_partial = self._may_complete = True
         self._updates_unanswered += 1

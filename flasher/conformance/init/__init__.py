@@ -55,6 +55,7 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (transfer_questions.padded, ("fr_07",)),
     (transfer_questions.gaps, ("tm_02",)),
     (transfer_questions.end_again, ("en_02",)),
+    (entry_questions.old_application, ("rs_03_old",)),
     (entry_questions.without_application, ("rs_03",)),
     (transfer_questions.buffer, ("device.buffer_bytes",)),
     (entry_questions.largest_image, ("device.largest_image_bytes",)),

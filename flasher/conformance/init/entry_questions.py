@@ -313,12 +313,34 @@ def _why_no_exit(session: InitSession) -> str:
     return ""
 
 
+def old_application(session: InitSession) -> Findings:
+    """Determine whether the old application runs after a transfer that was broken off."""
+    bench = session.bench
+    why = _why_no_exit(session)
+    if why:
+        yield why
+        return
+    for _ in range(REPEATS):
+        session.begin()
+        session.packets(1)
+        bench.leave_transfer()
+        bench.collect(bench.waits.burst_s)
+        runs = bench.application_runs()
+        answer = "the application runs" if runs else "no application runs"
+        yield Trial("kept" if runs else "erased", answer, "a transfer that was broken off", "after")
+        session.begin() if runs else session.update()
+        session.finish()
+
+
 def without_application(session: InitSession) -> Findings:
     """Determine what a bootloader without an application does."""
     bench = session.bench
     why = _why_no_exit(session)
     if why:
         yield why
+        return
+    if bench.choice("rs_03_old") == "kept":
+        yield "the device keeps its old application until complete"
         return
     count = bench.number("versions")
     for _ in range(REPEATS):
@@ -342,6 +364,7 @@ def without_application(session: InitSession) -> Findings:
 def largest_image(session: InitSession) -> Findings:
     """Determine the largest size for which an update command is accepted."""
     bench = session.bench
+    keeps_old = bench.profile.allows("rs_03_old", "kept")
     restarts_at_once = bench.choice("up_08") == "starts_over"
     why = "" if restarts_at_once else _why_no_exit(session)
     if why:
@@ -358,6 +381,9 @@ def largest_image(session: InitSession) -> Findings:
         taken = _is_size_taken(session, bench.encoder.update(size_bytes), within_s)
         if taken and not restarts_at_once:
             bench.leave_transfer()
+        within_s = bench.waits.burst_s + bench.limit("start_s")
+        if not taken and keeps_old and bench.application_runs(within_s):
+            session.enter()  # its announcements ended meanwhile
         return taken
 
     low, high = len(session.image), 0
