@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -143,6 +144,16 @@ class Restarts(PythonBootloader):
         super()._store(data)
 
 
+class ErasesForEach(PythonBootloader):
+    """Erases for 6 s for each update command before packet 1, and requests the transfer again."""
+
+    facts = dataclasses.replace(PythonBootloader.facts, erase_us=3_000_000)
+
+    def _begin(self, size: int) -> None:
+        self._size = 0
+        super()._begin(size)
+
+
 def _run(subject: str, *cases: str) -> RunReport:
     with open_subject(subject, "bms", None, good_image=None, second_image=None) as (
         device,
@@ -161,6 +172,13 @@ def test_a_bootloader_that_follows_the_document_passes() -> None:
     report = _run(_HERE, "RS-01", "TX-01", "EN-07", "BU-02")
     assert [result.verdict for result in report.results] == [CaseVerdict.PASS] * 4
     assert report.ok
+
+
+def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_flash() -> None:
+    report = _run(_FLAWS + "ErasesForEach", "UP-05")
+    assert _failures(report) == ""
+    (result,) = report.results
+    assert result.verdict is CaseVerdict.PASS
 
 
 def test_time_passes_for_one_that_polls_the_clock() -> None:

@@ -89,7 +89,10 @@ class CompiledDevice(Machine):
         )
         self._has_power = False
         self._received: deque[CanFrame] = deque()
-        self._to_send: deque[Frame] = deque()
+        self._to_send: deque[tuple[Frame, float]] = deque()
+        """Frames in the controller, which sends them while the processor waits for the flash, and
+        the ends of the calls that handed them over.
+        """
         self._left_at = -inf
         """End of the frame that the bus took last."""
         self._is_full = False
@@ -128,19 +131,19 @@ class CompiledDevice(Machine):
         if self._process.is_running:
             wanted.append(self._busy_until if self._received else self._next_turn_at)
         if self._to_send and not self.is_off_bus:
-            wanted.append(self._busy_until)
+            wanted.append(self._to_send[0][1])
         due_at = min(wanted)
         return None if due_at == inf else due_at
 
     def next_frame(self, now: float) -> Frame | None:
         if self._to_send:
-            is_ready = now >= self._busy_until and not self.is_off_bus
-            return self._to_send[0] if is_ready else None
+            frame, ready_at = self._to_send[0]
+            return frame if now >= ready_at and not self.is_off_bus else None
         return super().next_frame(now)
 
     def frame_sent(self, now: float) -> None:
         if self._to_send:
-            self._left_at = now + frame_bits(self._to_send.popleft()) / self._bitrate_bps
+            self._left_at = now + frame_bits(self._to_send.popleft()[0]) / self._bitrate_bps
             if self._is_full:
                 self._tick_at = min(self._tick_at, self._left_at)
         else:
@@ -281,7 +284,7 @@ class CompiledDevice(Machine):
             size = pipes.FRAME.size
             for at in range(pipes.DONE.size, len(data), size):
                 made = pipes.unpack_frame(data[at : at + size])
-                self._to_send.append(Frame(*made[:4]))
+                self._to_send.append((Frame(*made[:4]), self._busy_until))
             self._is_full = self._pending(now) >= pipes.TRANSMIT_FRAMES
 
     def _hardware(self, asked: PipeMessage, data: bytes) -> bytes | None:
