@@ -37,7 +37,7 @@ from flasher.host.event_text import warning_text
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkMeter, LinkReport
-from flasher.trace.taps import FlightRecorder, Unechoed
+from flasher.trace.taps import EchoFilter, FlightRecorder
 
 if TYPE_CHECKING:
     from flasher.trace.recorder import Recorder
@@ -94,7 +94,7 @@ class Recording:
             self.recorders.append(self._meter)
         self.file: Recorder | None = None
         """The trace file, if requested."""
-        self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
+        self.taps: tuple[Tap, ...] = (EchoFilter(lambda: self.recorders),)
         """For the driver."""
         self.failure: BaseException | None = None
         self.bundle: Path | None = None

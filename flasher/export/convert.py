@@ -43,7 +43,7 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
         parts = (verdict.text, verdict.likely, verdict.remedy)
         writer = PcapngWriter(to, "\n".join(filter(None, parts)))
     else:
-        writer = writer_of(to, called=str(called))
+        writer = writer_of(to, name=str(called))
     damage: list[str] = []
     frames = remarked = 0
     start: float | None = None
@@ -73,7 +73,7 @@ def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
     """
     damage: list[str] = []
     frames = 0
-    writer = writer_of(to, called=str(called))
+    writer = writer_of(to, name=str(called))
     try:
         for message in joined_frames(frames_until_damage(trace_file(trace), damage)):
             writer(message)

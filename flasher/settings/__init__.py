@@ -1,1 +1,1 @@
-"""Settings files: one reader, with one style of error messages."""
+"""Settings files in TOML: target profiles, release manifests, adapters, with one reader."""

@@ -1,4 +1,4 @@
-"""Address range of the application in a device. The documents give no addresses."""
+"""Application area: address range of an application, which the documents do not give."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from flasher.settings.profile import Profile
 
 @dataclass(frozen=True)
 class Area:
-    """Range of addresses, `end` exclusive."""
+    """Address range; `end` is exclusive."""
 
     start: int
     end: int
     source: str
-    """Where the range comes from."""
+    """Origin of the range, for messages."""
 
     @property
     def size_bytes(self) -> int:
@@ -26,7 +26,7 @@ class Area:
 
 
 def area_of_image(image: Image) -> Area | None:
-    """Range of this image; None for a raw binary. Raises UsageError for an invalid range."""
+    """Address range of an image; None for a raw binary. Raises UsageError for an invalid range."""
     if image.base is None:
         return None
     end = image.base + image.size_bytes
@@ -35,7 +35,7 @@ def area_of_image(image: Image) -> Area | None:
 
 
 def area_of_profile(profile: Profile) -> Area | None:
-    """Application area of the profile, if any. Raises UsageError for an invalid range."""
+    """Application area of a profile; None if not set. Raises UsageError for an invalid range."""
     area = profile.application_area
     if area is None:
         return None

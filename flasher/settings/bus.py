@@ -1,4 +1,4 @@
-"""Adapter settings, table [bus] of a settings file, which may also contain a target profile.
+"""Adapter settings: table [bus] of a settings file, which may also contain a target profile.
 
 [bus]
 interface = "pcan"
@@ -24,11 +24,10 @@ from flasher.python_can import can
 from flasher.settings.toml_reader import Reader, TomlTable
 
 BUS: Final = "bus"
-"""Name of the table."""
 
 
 class BusTable(TomlTable):
-    """One adapter, by python-can's keywords."""
+    """Table [bus]: one adapter, by python-can's keywords."""
 
     interface: str
     """Back end of python-can for the adapter."""
@@ -72,14 +71,14 @@ READER: Final = Reader(BusTable, "profile")
 
 
 def bus_faults(table: object) -> list[Fault]:
-    """Return all problems of the table."""
+    """Return all problems of a table [bus]."""
     if not isinstance(table, dict):
         return [READER.fault((BUS,), f"is a table, [{BUS}].")]
     return READER.check(table, (BUS,))[1]
 
 
 def read_bus(table: object, path: str | os.PathLike[str]) -> Fallback:
-    """Read the table of the file `path`. Raises UsageError with all problems."""
+    """Read the table [bus] of the file `path`. Raises UsageError with all problems."""
     faults = bus_faults(table)
     if faults or not isinstance(table, dict):
         raise READER.refusal(path, faults)

@@ -25,14 +25,14 @@ def reader() -> Reader[DeviceProfile]:
 def set_option(profile: DeviceProfile, key: str, text: str) -> DeviceProfile:
     """Return `profile` with option `key` set from `text`.
 
-    Integers accept 0x and the suffixes K and M. Raises UsageError, with the known ones, for an
-    unknown key or an invalid value.
+    Integers accept 0x and the suffixes K and M. Raises UsageError for an unknown key, listing the
+    known ones, and for an invalid value.
     """
     return reader().read({**asdict(profile), key: text}, "--set")
 
 
 def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile:
-    """Return `profile` with options written as KEY=VALUE. Raises UsageError."""
+    """Return `profile` with options of the form KEY=VALUE. Raises UsageError."""
     for choice in choices:
         key, equals, value = choice.partition("=")
         if not equals:
@@ -42,7 +42,7 @@ def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile
 
 
 def describe_options() -> list[tuple[str, str, str]]:
-    """List all options as (key, allowed values with the default first, one line of help)."""
+    """List all options as (key, allowed values with the default first, help text)."""
     described = []
     for key in reader().keys.values():
         default = "none" if key.default is None else str(key.default)

@@ -1,4 +1,4 @@
-"""The release manifest: a release as a TOML file beside its image.
+"""Release manifest: a TOML file next to a firmware image with its version, hash and rules.
 
 `firmware.hex` has `firmware.hex.toml`:
 
@@ -11,7 +11,7 @@
     minimum_boot_version = "V1.0.0"
     previous_from = "V1r0r0_20220512"
 
-An unreadable or invalid manifest is an ImageError, because its image is not trustworthy.
+An unreadable or invalid manifest is an ImageError, because its image cannot be trusted.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 FORMAT_KEY: Final = "format"
 FORMAT_VERSION: Final = 1
 STATEMENTS: Final = tuple(each.name for each in fields(Release) if each.name != "source")
-"""Keys in the order in which they are written."""
+"""Keys of a manifest in the order in which they are written."""
 SUFFIX: Final = ".toml"
 
 
 def manifest_path(image_path: str | os.PathLike[str]) -> Path:
-    """Path of an image's manifest: next to it, with `.toml` appended to its whole name."""
+    """Path of an image's manifest: the image's path with `.toml` appended."""
     path = Path(image_path)
     return path.with_name(path.name + SUFFIX)
 
@@ -53,7 +53,7 @@ def find_release(
 ) -> Release | None:
     """Read the manifest `given`, else the one next to the image; None without any.
 
-    Raises as `read_release`.
+    Raises UsageError and ImageError like `read_release`.
     """
     if given is not None:
         return read_release(given)
@@ -77,7 +77,7 @@ def reader() -> Reader[Release]:
 
 
 def read_release(path: str | os.PathLike[str]) -> Release:
-    """Read the release in a manifest.
+    """Read a release manifest.
 
     Raises UsageError if the file does not exist or is not regular; ImageError, with all problems,
     if it cannot be read, is not TOML, or has another format version.
@@ -94,7 +94,7 @@ def read_release(path: str | os.PathLike[str]) -> Release:
 
 
 def check_statement(key: str, value: object) -> None:
-    """Raise ValueError if a manifest cannot contain this value."""
+    """Raise ValueError for a value that a manifest cannot contain."""
     _, faults = reader().check({key: value}, source="")
     for fault in faults:
         if fault.place.startswith(key):
@@ -124,8 +124,8 @@ def release_of(
     firmware_version: str | None = None,
     **statements: str | Sequence[str] | None,
 ) -> Release:
-    """Create the release of an image, with other `statements` by the keys of a manifest. The
-    default firmware version is the one inside the image.
+    """Create the release of an image; `statements` are further manifest keys. The default firmware
+    version is the one inside the image.
 
     Raises ImageError if the given firmware version differs from the one inside, ValueError for a
     value that a manifest cannot contain.
@@ -151,7 +151,7 @@ def release_of(
 
 
 def to_toml(release: Release) -> str:
-    """Text of a manifest, without unset values."""
+    """Format a manifest, without unset values."""
     values: dict[str, Any] = {FORMAT_KEY: FORMAT_VERSION}
     for key in STATEMENTS:
         value = getattr(release, key)

@@ -10,7 +10,7 @@ A file has values for every device, and tables for single devices that override 
     [wmc.version_query]
     command = 0x3300
 
-The table [bus] beside them names the computer's adapter (`flasher.settings.bus`).
+The table [bus] of the same file names the computer's adapter (`flasher.settings.bus`).
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ if TYPE_CHECKING:
 
 FILE_NAME: Final = "flasher.toml"
 _BUS: Final = "bus"
-"""Table of the adapter, which is not part of the profile (`flasher.settings.bus`)."""
+"""Table of the adapter (`flasher.settings.bus`), not part of the profile."""
 DEFAULT: Final = "default"
 DOCUMENT: Final = "document"
 _DOCUMENTED: Final = frozenset({"command_repeat_s", "command_timeout_s", "boot_version_spacing_s"})
-"""Timings given by the documents; all others are readings (R12)."""
-_BESIDE: Final = ("target", "dialect", "sources")
+"""Timings that the documents give; all others are readings (R12)."""
+_NOT_IN_FILE: Final = ("target", "dialect", "sources")
 """Fields of `Profile` that are not in the file."""
 _TABLES: Final = ("timings", "application_area", "version_query")
 _DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
@@ -96,14 +96,14 @@ Data = Annotated[
 
 
 def sent_ids(target: Target) -> dict[int, Node | None]:
-    """CAN ids on which a device sends, with their receivers; None is broadcast."""
+    """CAN ids on which a device sends, with their receivers; None means broadcast."""
     receivers = (None, *(node for node in Node if node is not target.node))
     return {can_id(target.node, receiver): receiver for receiver in receivers}
 
 
 @dataclass(frozen=True)
 class ApplicationArea:
-    """Address range of a device's application; nothing outside must be sent (R8)."""
+    """Address range of a device's application; bytes outside must not be sent (R8)."""
 
     start: Number32
     """Address of the application."""
@@ -118,8 +118,8 @@ class ApplicationArea:
 
 @dataclass(frozen=True)
 class VersionQuery:
-    """How to ask a device for its firmware version: a query without data, and the position of the
-    text in the answer.
+    """Query for a device's firmware version: its command, and the position of the text in the
+    answer.
     """
 
     command: Number16
@@ -149,19 +149,19 @@ class VersionQuery:
 
 
 class VersionAnswer(Content):
-    """Answer to a version query of a profile."""
+    """Answer to the version query of a profile."""
 
     firmware_version: WireText
 
 
 def _version_answer(before_bytes: int, text_bytes: int, after_bytes: int) -> type[Content]:
-    """Create the content type of such an answer; bytes around the text are kept."""
+    """Create the content type of a version answer; bytes around the text are kept."""
     return make_dataclass(
         "VersionAnswer",
         [
             ("before", bytes, wire_field(BytesField(before_bytes))),
             ("firmware_version", WireText, wire_field(TextField(text_bytes))),
-            ("behind", bytes, wire_field(BytesField(after_bytes))),
+            ("after", bytes, wire_field(BytesField(after_bytes))),
         ],
         bases=(VersionAnswer,),
         frozen=True,
@@ -169,7 +169,7 @@ def _version_answer(before_bytes: int, text_bytes: int, after_bytes: int) -> typ
 
 
 def documented_query(target: Target) -> VersionQuery | None:
-    """Version query of chapter 3, for the BMS only."""
+    """Documented version query (table 7), for the BMS only; None for other targets."""
     if not target.has_version_query:
         return None
     offset = 0
@@ -188,7 +188,7 @@ def documented_query(target: Target) -> VersionQuery | None:
 
 @dataclass(frozen=True)
 class Profile:
-    """Settings for one target in one dialect. For each name of `values()`, `sources` has "default"
+    """Settings for one target in one dialect. `sources` maps each name of `values()` to "default"
     (a reading of this project), "document", or the path of a file.
     """
 
@@ -257,11 +257,11 @@ class Profile:
             )
 
     def upgrade_options(self, **overrides: Any) -> UpgradeOptions:
-        """Create the options of an upgrade. `overrides` are its fields or those of `Timings`, by
-        name; None means not given. Raises TypeError for another name.
+        """Create the options of an upgrade. `overrides` are fields of `UpgradeOptions` or
+        `Timings`, by name; None means not given. Raises TypeError for another name.
 
-        They include the product's own version query, but not the document's, whose answer also has
-        the hardware version.
+        They include the product's own version query, but not the documented one, whose answer also
+        has the hardware version.
         """
         given = {name: value for name, value in overrides.items() if value is not None}
         names = {known.name for known in fields(UpgradeOptions)}
@@ -287,7 +287,7 @@ class Profile:
         return self.sources.get(name, DEFAULT) != DEFAULT
 
     def identity(self, **overrides: Any) -> Identity:
-        """Create the checks' settings; `overrides` are the other fields of `Identity`."""
+        """Create the settings of identity checks; `overrides` are other fields of `Identity`."""
         return Identity(
             low_charge_percent=self.low_charge_percent,
             in_use_ma=self.in_use_ma,
@@ -296,13 +296,13 @@ class Profile:
         )
 
     def values(self) -> Iterator[tuple[str, object]]:
-        """Yield every value with its name (TABLE.NAME in a table); None for a missing table."""
+        """Yield name (TABLE.NAME in a table) and value of each setting; None for no table."""
         for name in (known.name for known in fields(self)):
             value = getattr(self, name)
             if name in _TABLES and value is not None:
                 for part in fields(value):
                     yield f"{name}.{part.name}", getattr(value, part.name)
-            elif name not in _BESIDE:
+            elif name not in _NOT_IN_FILE:
                 yield name, value
 
 
@@ -327,9 +327,9 @@ def load_profile(
 
 
 def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
-    """Check a whole file for every target; return the targets that have a table.
+    """Check a profile file for every target; return the targets that have a table.
 
-    Raises UsageError as `load_profile`.
+    Raises UsageError with all problems of the file.
     """
     file = _ProfileFile(Path(path))
     for target in TARGETS.values():
@@ -339,10 +339,10 @@ def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
 
 def find_profile() -> Path | None:
     """Find the `flasher.toml` of the working directory, else the user's; None without any."""
-    return next(_found(), None)
+    return next(_profile_paths(), None)
 
 
-def _found() -> Iterator[Path]:
+def _profile_paths() -> Iterator[Path]:
     directories = [user_config_path("flasher", appauthor=False, roaming=True)]
     with suppress(FileNotFoundError):  # the working directory was deleted
         directories.insert(0, Path.cwd())
@@ -362,7 +362,7 @@ def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
     if path is not None and Path(path) == Path(os.devnull):
         return None
     named = [] if path is None else [Path(path)]
-    for place in (*named, *_found()):
+    for place in (*named, *_profile_paths()):
         was_named = place.resolve() in [each.resolve() for each in named]
         document = read_toml(place, what="profile", was_named=was_named)
         if _BUS in document:
@@ -374,20 +374,19 @@ def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
 
 @cache
 def reader() -> Reader[Profile]:
-    """Reader for profiles, with all their keys."""
     from flasher.settings.toml_reader import Reader  # noqa: PLC0415
 
-    return Reader(Profile, "profile", beside=_BESIDE, also=(*TARGETS, _BUS))
+    return Reader(Profile, "profile", beside=_NOT_IN_FILE, also=(*TARGETS, _BUS))
 
 
 class _ProfileFile:
-    """File whose keys and values are valid individually. Raises UsageError."""
+    """Profile file whose keys and values are valid individually. Raises UsageError."""
 
     def __init__(self, path: Path, *, was_named: bool = True) -> None:
         self._path = path
         self._common: dict[str, Any] = {}
         self.tables: dict[str, Any] = {}
-        """By name of the target."""
+        """Tables by target name."""
         faults: list[Fault] = []
         document = read_toml(path, what="profile", was_named=was_named)
         for key, value in document.items():
@@ -418,14 +417,14 @@ class _ProfileFile:
 
     def profile(self, target: Target, dialect: Dialect) -> Profile:
         """Merge the file's values for a target over the defaults."""
-        given = _over(self._common, self.tables.get(target.name, {}))
+        given = _merged(self._common, self.tables.get(target.name, {}))
         query = documented_query(target)
         without = {
             "has_upgrade": dialect.has_upgrade,
             "version_query": None if query is None else asdict(query),
         }
         names = {"target": target.name, "dialect": dialect.name, "sources": {}}
-        profile = reader().read(_over(without, given), self._path, **names)
+        profile = reader().read(_merged(without, given), self._path, **names)
         faults = list(_contradictions(profile))
         if faults:
             raise reader().refusal(self._path, faults)
@@ -437,7 +436,7 @@ class _ProfileFile:
         return replace(profile, sources=_sources(profile, given, str(self._path)))
 
 
-def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Merge `values` over `base`, table by table."""
     tables = {
         name: {**base[name], **values[name]}
@@ -464,7 +463,7 @@ def _sources(profile: Profile, given: Mapping[str, Any], path: str) -> dict[str,
 
 
 def _contradictions(profile: Profile) -> Iterator[Fault]:
-    """Yield values that contradict each other."""
+    """Yield settings that contradict each other."""
     fault = reader().fault
     wanted = data_size(profile.reset_command)
     if len(profile.reset_data) != wanted:

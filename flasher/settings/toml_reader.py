@@ -1,7 +1,7 @@
-"""Reads a TOML file into a type, and reports all its problems at once.
+"""TOML reader: validates a file against a type, and reports all its problems at once.
 
-The type describes the file: fields are the keys, annotations their limits, docstrings after the
-fields their help. Messages and tables of the documentation are made from it.
+Fields of the type are the keys, annotations their limits, docstrings after the fields their help.
+Error messages and tables of the documentation are made from it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ModelT = TypeVar("ModelT")
 Location = tuple[str | int, ...]
 """Place in a document: keys, and indexes of lists."""
 Detail = tuple[str, Location, str]
-"""Error of the library: type, place, and text."""
+"""Validation error of pydantic: type, place and text."""
 CONFIG: Final = ConfigDict(
     extra="forbid",
     frozen=True,
@@ -37,32 +37,32 @@ _UNKNOWN: Final = frozenset({"extra_forbidden", "unexpected_keyword_argument"})
 _NO_TABLE: Final = frozenset({"dataclass_type", "model_type", "dict_type"})
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 _HEXADECIMAL: Final = frozenset({0x7FF, 0xFFFF, 0xFFFF_FFFF})
-"""Limits shown in hexadecimal."""
+"""Limits that are shown in hexadecimal."""
 
 
 class TomlTable(BaseModel):
-    """Table of a file."""
+    """Base of tables that are pydantic models."""
 
     model_config = CONFIG
 
 
 @dataclass(frozen=True)
 class Key:
-    """Key of a file."""
+    """Key of a settings file, for help and documentation."""
 
     path: str
-    """With its tables, as `limits.erase_s`."""
+    """Name with its tables, such as `limits.erase_s`."""
     default: Any
     allowed: str
-    """Allowed values in words."""
+    """Description of the allowed values."""
     choices: tuple[str, ...]
     """Allowed words of a choice."""
     text: str
-    """Its purpose."""
+    """Help text."""
 
 
 class Reader(Generic[ModelT]):
-    """Reads files of one kind, which messages call `what`.
+    """Reads files of one type, which messages call `what`.
 
     `beside` are fields of the type that are not in the file; `also` are keys of the file that are
     not fields of the type. `remedy` is appended to the remedy of each message.
@@ -93,14 +93,14 @@ class Reader(Generic[ModelT]):
 
     @cached_property
     def keys(self) -> dict[str, Key]:
-        """Every key with one place in the file, by its path."""
+        """All keys by path, without keys inside lists."""
         found = self._root.keys(())
         return {key.path: key for key in found if key.path not in self._beside}
 
     def load(
         self, path: str | os.PathLike[str], *, if_missing: str = "Correct the name.", **beside: Any
     ) -> ModelT:
-        """Read a file. Raises UsageError if it does not exist, and `error` with all problems."""
+        """Read a file. Raises UsageError if it does not exist, else `error` with all problems."""
         document = read_toml(path, what=self._what, error=self._error, if_missing=if_missing)
         return self.read(document, path, **beside)
 
@@ -111,7 +111,7 @@ class Reader(Generic[ModelT]):
     def read(
         self, document: Mapping[str, Any], path: str | os.PathLike[str], **beside: Any
     ) -> ModelT:
-        """Read a document. Raises `error` with all problems."""
+        """Read a parsed document. Raises `error` with all problems."""
         value, faults = self.check(document, **beside)
         if value is None or faults:
             raise self.refusal(path, faults)
@@ -125,13 +125,13 @@ class Reader(Generic[ModelT]):
         is_whole: bool = True,
         **beside: Any,
     ) -> tuple[ModelT | None, list[Fault]]:
-        """Read a document, or the table `prefix` of one; return the value and all problems. Missing
-        keys are only a problem of a whole document.
+        """Read a parsed document, or the table `prefix` of one; return the value and all problems.
+        Missing keys are a problem of a whole document only.
         """
-        odd: list[Location] = []
-        plain = _for_json(dict(document), (), odd)
+        invalid: list[Location] = []
+        plain = _for_json(dict(document), (), invalid)
         value = None
-        details: list[Detail] = [("odd", at, "") for at in odd]
+        details: list[Detail] = [("invalid", at, "") for at in invalid]
         details += [("extra_forbidden", (name,), "") for name in document if name in self._beside]
         try:
             # As JSON, in which `strict` allows what a file may contain: a list for a tuple, a word
@@ -147,7 +147,7 @@ class Reader(Generic[ModelT]):
         return value, self._faults(document, details, prefix)
 
     def refusal(self, path: str | os.PathLike[str], faults: Sequence[Fault]) -> FlasherError:
-        """Create the error for a file with these faults."""
+        """Create the error for a file with these problems."""
         shown = printable(os.fspath(path))
         if len(faults) == 1:
             (fault,) = faults
@@ -176,7 +176,7 @@ class Reader(Generic[ModelT]):
         for kind, location, sentence in details:
             if kind == "too_short" and any(each[: len(location)] == location for each in places):
                 continue  # the length of a list with errors is not reported
-            at, value = _found(document, location)
+            at, value = _existing_part(document, location)
             if kind == "missing":
                 missing.setdefault(location[:-1], []).append(str(location[-1]))
             elif kind in _UNKNOWN or location[-1:] == ("[key]",):
@@ -193,7 +193,7 @@ class Reader(Generic[ModelT]):
         return [*strange, *lacking, *wrong.values()]
 
     def _unknown(self, location: Location, keys: list[str], prefix: Location) -> Iterator[Fault]:
-        """Yield the unknown keys of one table; the first one lists the known keys."""
+        """Yield the unknown keys of a table; the first one lists the known keys."""
         table = (*prefix, *location)
         names = [
             *(() if table else self._also),
@@ -228,7 +228,7 @@ class Reader(Generic[ModelT]):
         return self.fault((*prefix, *location), f"cannot be {value!a:.60}.", remedy)
 
     def fault(self, location: Location, what: str, remedy: str = "") -> Fault:
-        """Create a fault; `what` begins with a verb, whose subject is the place or the file."""
+        """Create a problem; `what` begins with a verb, whose subject is the place or the file."""
         place = location_text(location)
         return Fault(place, f"{place or f'The {self._what}'} {what}", remedy)
 
@@ -252,7 +252,7 @@ class _Schema:
         return tuple(each for part in parts for each in part.kinds if each.node != _NULL)
 
     def at(self, location: Location) -> _Schema:
-        """Schema at this place; empty if unknown."""
+        """Schema at a place; empty if unknown."""
         if not location:
             return self
         part = location[0]
@@ -267,7 +267,7 @@ class _Schema:
         return _Schema({}, {})
 
     def keys(self, table: Location) -> Iterator[Key]:
-        """Keys of the table and of its tables."""
+        """Yield the keys of a table and of its tables."""
         for name in self.kinds[0].node.get("properties", {}):
             place, found = (*table, name), self.at((name,))
             if "properties" in found.kinds[0].node:
@@ -286,25 +286,25 @@ class _Schema:
 
     @property
     def choices(self) -> list[str]:
-        """Words of a choice."""
+        """Allowed words of a choice."""
         return [str(word) for each in self.kinds for word in each.node.get("enum", ())]
 
     @property
     def has_words(self) -> bool:
-        """True if its type describes itself in words."""
+        """True if the type has its own description of its values."""
         return any("words" in each.node for each in self.kinds)
 
     @property
     def text(self) -> str:
-        """Its purpose."""
+        """Help text."""
         return " ".join(str(self.node.get("description", "")).split())
 
     def allowed(self, name: str) -> str:
-        """Allowed values in words; `name` is the key, which may end with a unit."""
+        """Description of the allowed values; `name` is the key, which may end with a unit."""
         return " or ".join(dict.fromkeys(each.words(name) for each in self.kinds))
 
     def words(self, name: str) -> str:
-        """Same as `allowed`, for one kind of value."""
+        """Description of the allowed values of one kind."""
         match self.node:
             case {"words": str() as words}:
                 return words
@@ -349,7 +349,7 @@ _NULL: Final = {"type": "null"}
 
 
 def location_text(location: Location) -> str:
-    """Format a place as people write it: `target[0].base`."""
+    """Format a place, such as `target[0].base`."""
     place = ""
     for part in location:
         name = f"[{part}]" if isinstance(part, int) else printable(part)[:60]
@@ -361,8 +361,8 @@ def _number(value: float) -> str:
     return f"0x{value:X}" if value in _HEXADECIMAL else f"{value:.12g}"
 
 
-def _found(document: Any, location: Location) -> tuple[Location, object]:
-    """Return the existing part of a location, without the library's names, and its value."""
+def _existing_part(document: Any, location: Location) -> tuple[Location, object]:
+    """Return the part of a location that exists in the document, and its value."""
     for at, part in enumerate(location):
         is_there = (isinstance(document, dict) and part in document) or (
             isinstance(document, list) and isinstance(part, int) and part < len(document)
@@ -373,19 +373,19 @@ def _found(document: Any, location: Location) -> tuple[Location, object]:
     return location, document
 
 
-def _for_json(value: Any, at: Location, odd: list[Location]) -> Any:
-    """Convert to what JSON can hold. Adds to `odd` the places of values that are not valid settings
-    either: dates, and command-line texts that are not Unicode.
+def _for_json(value: Any, at: Location, invalid: list[Location]) -> Any:
+    """Convert to a JSON value. Adds to `invalid` the places of values that no setting accepts:
+    dates, and command-line texts that are not Unicode.
     """
     match value:
         case dict():
-            return {key: _for_json(each, (*at, key), odd) for key, each in value.items()}
+            return {key: _for_json(each, (*at, key), invalid) for key, each in value.items()}
         case list():
-            return [_for_json(each, (*at, n), odd) for n, each in enumerate(value)]
+            return [_for_json(each, (*at, n), invalid) for n, each in enumerate(value)]
         case str() if not _SURROGATE.search(value):
             return value
         case datetime.date() | str():
-            odd.append(at)
+            invalid.append(at)
             return None
         case _:
             return value

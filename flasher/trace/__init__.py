@@ -1,1 +1,1 @@
-"""Recordings of bus traffic: writing, reading, decoding and explaining them."""
+"""Traces of bus traffic: recording, reading, decoding and explaining."""

@@ -1,8 +1,8 @@
-"""Reader of .blf containers that hands python-can pieces of a bounded size.
+"""Reader of .blf trace files that limits the memory of python-can's reader.
 
-A .blf file is a header and objects. Objects of one type are containers: they hold the objects with
-the frames, compressed. python-can unpacks a whole container whatever its size, and loops forever on
-an object of size 0.
+A .blf file is a header and objects. Containers are objects that contain the objects with the
+frames, compressed. python-can unpacks a whole container of any size, and loops forever on an object
+of size 0.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 from flasher.trace.bounds import Bounds, UnfitError, check_unpacked
 
 _HEADER: Final = Struct("<4sL64x")
-"""Signature and size; the whole header is larger."""
+"""Signature and size; the whole header is longer."""
 _HEADER_MAX: Final = 4096
 _OBJECT: Final = Struct("<4sHHLL")
 """Signature, size and version of the header, size of the object, type."""
@@ -25,21 +25,21 @@ _CONTAINER_TYPE: Final = 10
 _PLAIN, _PACKED = 0, 2
 _SIGNATURE: Final = b"LOBJ"
 _SEARCHED: Final = 8
-"""The next object begins within this many bytes."""
+"""Bytes within which the next object begins."""
 _FRAME_SIZES: Final = {1: 48, 73: 64, 86: 48, 100: 116, 101: 72}
-"""Smallest size of each object type that holds a frame."""
+"""Minimum size of each object type with a frame."""
 _VERSIONS: Final = (1, 2)
 _OBJECT_MAX: Final = 16 * 1024 * 1024
 _PIECE_SIZE: Final = 65_536
 
 
 class UnpackedBlf:
-    """A .blf file object for `can.BLFReader`: the same header, then the objects that hold frames,
-    in uncompressed containers.
+    """.blf file object for `can.BLFReader`: the same header, then the objects with frames, in
+    uncompressed containers.
     """
 
     def __init__(self, source: BufferedIOBase, size: int, bounds: Bounds) -> None:
-        """`size` is the file's, in bytes. Raises UnfitError."""
+        """Open a file of `size` bytes. Raises UnfitError."""
         self._source = source
         self._bounds = bounds
         check_unpacked(self._unpacked(), size)
@@ -56,10 +56,10 @@ class UnpackedBlf:
         return taken
 
     def close(self) -> None:
-        """Do nothing: the caller closes the file that it opened."""
+        """Do nothing: the caller closes its file."""
 
     def _header(self) -> bytes:
-        """The header, cut to the part that python-can reads."""
+        """Return the part of the file header that python-can reads."""
         header = self._exactly(_HEADER.size)
         signature, size = _HEADER.unpack(header)
         if signature != b"LOGG" or not _HEADER.size <= size <= _HEADER_MAX:
@@ -115,7 +115,7 @@ class UnpackedBlf:
             self._source.read(size % 4)  # padding
 
     def _objects(self, held: bytearray) -> Iterator[bytes]:
-        """Remove the complete objects from the start of `held`; return those that hold a frame."""
+        """Remove the complete objects from the start of `held`; yield those with a frame."""
         at = 0
         while len(held) - at >= _SEARCHED + _OBJECT.size:
             start = held.find(_SIGNATURE, at, at + _SEARCHED)

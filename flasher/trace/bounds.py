@@ -1,4 +1,4 @@
-"""Limits on reading trace files."""
+"""Limits on trace files: size, compression ratio, line length, entries without frames."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from io import BufferedIOBase
 from typing import Final, Self
 
 FILE_MAX_SIZE: Final = 1024 * 1024 * 1024
-"""In bytes, also after unpacking: half a day of a full bus."""
+"""Bytes, also after unpacking: half a day of a full bus."""
 _RATIO_MAX: Final = 50
 """Recordings compress to a tenth; a higher ratio is an attack on memory."""
 _UNPACKED_FREE: Final = 1024 * 1024
-"""In bytes: allowed for the smallest packed file too."""
+"""Unpacked bytes allowed for a compressed file of any size."""
 _IDLE_MAX: Final = 100_000
 _IDLE_PER_FRAME: Final = 10
 _LINE_MAX: Final = 65_536
-"""In bytes. Frames of other networks have the longest lines."""
+"""Bytes. Frames of other networks have the longest lines."""
 
 
 class UnfitError(Exception):
-    """The content is not a trace; the text gives the reason."""
+    """The file is not a trace; the text gives the reason."""
 
     def __init__(self, text: str, *, remedy: str = "") -> None:
-        """`remedy` is for a file of the right format whose content is not supported."""
+        """`remedy` is for a file of the right format with unsupported content."""
         super().__init__(text)
         self.remedy = remedy
 
@@ -33,7 +33,7 @@ class UnfitError(Exception):
 def check_unpacked(pieces: Iterator[bytes], packed_size: int) -> None:
     """Unpack a file of `packed_size` bytes once, before any frame is read.
 
-    Raises UnfitError when it is larger than any recording. Other damage is found again later, after
+    Raises UnfitError if it is larger than any recording. Other damage is found by the reader, after
     the frames before it.
     """
     most = min(FILE_MAX_SIZE, max(_UNPACKED_FREE, _RATIO_MAX * packed_size))
@@ -48,11 +48,11 @@ def check_unpacked(pieces: Iterator[bytes], packed_size: int) -> None:
 
 
 class Bounds:
-    """Counts frames and entries of one file; stops where no trace would continue."""
+    """Counts frames and entries of a trace file, to stop at endless entries without frames."""
 
     def __init__(self) -> None:
         self.frames = 0
-        """The caller counts them."""
+        """Number of frames, counted by the caller."""
         self._entries = 0
 
     def entry(self) -> None:
@@ -65,7 +65,7 @@ class Bounds:
 
 
 class BoundedLines:
-    """Lines of a file, for python-can's text readers.
+    """Lines of a trace file, for python-can's text readers.
 
     Ends with the line that contains byte number `size`, even if another program appends; None reads
     to the end.
@@ -92,4 +92,4 @@ class BoundedLines:
         return raw.decode("utf-8-sig")
 
     def close(self) -> None:
-        """Do nothing: the caller closes the file that it opened."""
+        """Do nothing: the caller closes its file."""

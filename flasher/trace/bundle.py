@@ -1,8 +1,8 @@
-"""Bundles: the evidence of a failed command, for later diagnosis.
+"""Bundles: folders with trace, transcript and report of a failed command, for diagnosis.
 
-A folder of three files: `trace.blf`, the last frames; `transcript.txt`, the same frames decoded;
-`report.json`, the circumstances. It appears complete under its final name, or not at all. Only its
-owner can read it: a command line may hold private data.
+`trace.blf` contains the last frames, `transcript.txt` the same frames decoded, `report.json` the
+circumstances. A bundle appears complete under its final name, or not at all. Only its owner can
+read it: a command line may contain private data.
 
 Wireshark, CANalyzer and python-can all read .blf with directions, remote and error frames.
 """
@@ -39,7 +39,7 @@ REPORT: Final = "report.json"
 PREFIX: Final = "flasher-"
 """Name prefix of every bundle."""
 FORMAT: Final = 1
-"""Version of report.json; incremented when a key changes its meaning."""
+"""Version of report.json, incremented when a key changes its meaning."""
 _PACKAGES: Final = {"flasher": "welling-flasher", "python_can": "python-can"}
 
 
@@ -50,10 +50,10 @@ def write_bundle(
     *,
     wall_clock: Callable[[], float] = time.time,
 ) -> Path:
-    """Write a bundle into `folder`, creating it if needed; returns the bundle's path.
+    """Write a bundle into `folder`, creating it if needed; return the bundle's path.
 
-    The name is `facts["target"]` and the time; nothing is overwritten. `facts` go into report.json:
-    dataclasses by field, anything else that JSON lacks as text. Raises OSError.
+    The name is `facts["target"]` and the time; no bundle is overwritten. `facts` go into
+    report.json: dataclasses by field, other types that JSON lacks as text. Raises OSError.
     """
     now = wall_clock()
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,14 +76,14 @@ def write_bundle(
 
 
 def _plain(value: Any) -> Any:
-    """Convert for JSON without loading the validation library, while a user waits."""
+    """Convert a value for JSON without the validation library, whose import takes a while."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     return value.value if isinstance(value, Enum) else printable(str(value))
 
 
 def bundles(folder: Path) -> list[Path]:
-    """The bundles in a folder, the latest last; empty if the folder is missing."""
+    """List the bundles in a folder, latest last; empty if the folder is missing."""
     if not folder.is_dir():
         return []
     found = (path for path in folder.iterdir() if path.name.startswith(PREFIX) and path.is_dir())
@@ -97,7 +97,7 @@ def keep_last(folder: Path, count: int) -> None:
 
 
 def _names(folder: Path, base: str) -> tuple[Path, Path]:
-    """A free name, and the temporary folder for writing, which is created."""
+    """Return a free name, and the new temporary folder for writing."""
     for number in count(1):
         name = base if number == 1 else f"{base}-{number}"
         part = folder / f".{name}.part"
@@ -126,8 +126,8 @@ def _write_trace(path: Path, recorder: FlightRecorder) -> None:
 
 
 def transcript(recorder: FlightRecorder) -> Iterator[str]:
-    """One line for each message of the ring: seconds since the oldest frame, direction, id, sender
-    and receiver, content.
+    """Yield a line for each message in the recorder: seconds since the oldest frame, direction, CAN
+    id, sender and receiver, content.
     """
     pieces = TimedDecoder()
     first_at: float | None = None

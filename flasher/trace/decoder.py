@@ -1,8 +1,8 @@
-"""Decoder of CAN frames: the messages of both documents, and everything else by name.
+"""Trace decoder: CAN frames to messages, damaged bytes, foreign frames and error frames.
 
 `Decoder` takes the whole bus, one byte stream for each CAN id. It returns a `BusEvent` for each
 message, each stretch of damaged bytes and each foreign frame, with typed fields and as text that is
-safe on any screen. `TimedDecoder` adds how long each took.
+safe on any screen. `TimedDecoder` adds their times on the wire.
 
 Time stamps differ: adapters and candump stamp the end of a frame; our own recorder stamps a sent
 frame when the driver accepts it, and a queue accepts a whole message at once. `TimedEvent` computes
@@ -33,29 +33,29 @@ from flasher.wording import wording
 
 _TIMEOUT_S: Final = DEFAULT_TIMINGS.inter_frame_timeout_s
 _LONG_ID_BITS: Final = 20
-"""Added by a 29-bit id: 18 id bits, SRR and r1."""
+"""Additional bits of a 29-bit id: 18 id bits, SRR and r1."""
 _ERROR_FRAME_BITS: Final = 20
-"""Approximate: flags, delimiter, interframe space."""
+"""Flags, delimiter and interframe space, approximately."""
 ACCEPTED_SHARE: Final = 0.9
-"""Frames whose stamps are closer than this share of their wire time were stamped on acceptance."""
+"""Frames stamped closer together than this share of their wire time were stamped on acceptance."""
 
 
 class Kind(Enum):
-    """How the decoder classifies a `BusEvent`."""
+    """Kinds of bus events."""
 
     MESSAGE = "message"
     UNKNOWN = "unknown"
-    """Intact, but not in the documents."""
+    """Intact, but not documented."""
     MALFORMED = "malformed"
-    """In the documents, but with another mode or other data."""
+    """Documented, but with another mode or other data."""
     DAMAGED = "damaged"
     FOREIGN = "foreign"
-    """A frame that no node of the documents sends."""
+    """Frame with a CAN id or format that no documented node sends."""
     ERROR_FRAME = "error_frame"
 
 
 class Field(NamedTuple):
-    """One value inside a message: `name` includes its unit, `value` is ready for JSON."""
+    """Value in a message: `name` includes its unit, `value` is ready for JSON."""
 
     name: str
     value: Any
@@ -64,7 +64,7 @@ class Field(NamedTuple):
     unit: str = ""
 
     def words(self, limit: int | None = None, mark: str = "") -> str:
-        """Label, value and unit; the value is cut after `limit` characters."""
+        """Label, value and unit as text; the value is truncated after `limit` characters."""
         text = self.text
         if limit is not None and len(text) > limit:
             text = f"{text[:limit].rstrip()} ..."
@@ -73,8 +73,8 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True)
 class BusEvent:
-    """One event on the bus at `at` seconds. `sender` and `receiver` are node names, "all" for a
-    broadcast, empty for an id of no node.
+    """Event on the bus at `at` seconds. `sender` and `receiver` are node names, "all" for a
+    broadcast, empty for the CAN id of no node.
     """
 
     at: float
@@ -86,23 +86,23 @@ class BusEvent:
     command: int | None = None
     fields: tuple[Field, ...] = ()
     is_alarm: bool = False
-    """An intact message that reports trouble: a NAK, or active faults."""
+    """The message is intact and reports trouble: a NAK, or active faults."""
     in_dialect: bool = True
     """False for a message that the requested dialect lacks."""
 
     @property
     def route(self) -> str:
-        """Sender and receiver; empty for an id of no node."""
+        """Sender and receiver; empty for the CAN id of no node."""
         return f"{self.sender} > {self.receiver}" if self.sender else ""
 
     @property
     def marked_title(self) -> str:
-        """The title, marked if the dialect lacks the message."""
+        """Title, marked if the dialect lacks the message."""
         return self.title if self.in_dialect else f"{self.title} {NOT_IN_DIALECT}"
 
     @property
     def is_trouble(self) -> bool:
-        """True for anything that does not belong on a healthy bus."""
+        """True for an event that does not occur on a healthy bus."""
         return self.is_alarm or self.kind not in (Kind.MESSAGE, Kind.FOREIGN)
 
 
@@ -116,7 +116,7 @@ ROUTES: Final = {
     for receiver in (None, *Node)
     if sender is not receiver
 }
-"""Sender and receiver of every CAN id of the documents."""
+"""Sender and receiver of every documented CAN id."""
 _TO_DEVICE: Final = frozenset(target.request_id for target in TARGETS.values())
 _TO_TOOL: Final = frozenset(target.answer_id for target in TARGETS.values())
 
@@ -132,16 +132,16 @@ TITLES: Final[dict[type[messages.UpgradeMessage], str]] = {
     messages.EndOfTransfer: "end of transfer",
     messages.Complete: "complete",
 }
-"""Titles of the messages of the upgrade."""
+"""Titles of the upgrade messages."""
 
 
 def route(of_id: int) -> tuple[str, str] | None:
-    """Names of sender and receiver of an 11-bit id; None for an id of no node."""
+    """Names of sender and receiver of an 11-bit CAN id; None for the id of no node."""
     return ROUTES.get(of_id)
 
 
 def message_titles() -> tuple[str, ...]:
-    """The titles of all messages, each once."""
+    """List the titles of all messages, each once."""
     titles = [item.title for item in catalogue.ITEMS] + list(TITLES.values())
     return tuple(dict.fromkeys(titles))
 
@@ -158,7 +158,7 @@ class Decoder:
         """Streams with an incomplete message: rarely more than two or three."""
 
     def feed(self, frame: Frame, now: float) -> Sequence[BusEvent]:
-        """The events that the frame completed, in order: usually none, sometimes several."""
+        """Return the events that a frame completes, in order: usually none, sometimes several."""
         if frame.is_error:
             return (BusEvent(now, Kind.ERROR_FRAME, frame.can_id, wording(Kind.ERROR_FRAME)),)
         stream = self._streams.get(frame.can_id)
@@ -172,11 +172,11 @@ class Decoder:
         return [self._describe(each, now) for each in found] if found else ()
 
     def deadline(self) -> float | None:
-        """When `tick` next drops an incomplete message; None without one."""
+        """Time at which `tick` next drops an incomplete message; None without one."""
         return min((stream.due_at for stream in self._holding.values()), default=None)
 
     def tick(self, now: float) -> list[BusEvent]:
-        """Messages cut short: their rest did not arrive in time (R12)."""
+        """Return messages whose remaining frames did not arrive in time (R12), as damaged bytes."""
         found = [each for stream in self._holding.values() for each in stream.tick(now)]
         self._holding = {key: held for key, held in self._holding.items() if held.due_at < inf}
         return [self._describe(each, now) for each in found]
@@ -196,7 +196,7 @@ class Decoder:
 
 
 def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
-    """Kind, title, fields, and whether the message reports trouble."""
+    """Return kind, title and fields of a message, and whether it reports trouble."""
     decoded = catalogue.decode(message)
     if decoded is not None:
         content = decoded.content
@@ -223,7 +223,7 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
 
 
 def content_fields(content: Content) -> tuple[Field, ...]:
-    """The fields of a message of chapter 3; reserved bytes only when not zero."""
+    """Return the fields of an application message; reserved bytes only if not zero."""
     fields = []
     for name, codec in content.LAYOUT:
         value = getattr(content, name)
@@ -238,7 +238,7 @@ def content_fields(content: Content) -> tuple[Field, ...]:
 
 
 def remark(name: str, unit: str, value: object) -> str:
-    """Remark for a percentage shown as received (R22)."""
+    """Return a remark on a percentage that is shown as received (R22); empty without one."""
     if unit != "%" or not isinstance(value, int):
         return ""
     if value > 100:
@@ -247,7 +247,7 @@ def remark(name: str, unit: str, value: object) -> str:
 
 
 def _row_fields(row: messages.UpgradeMessage) -> tuple[Field, ...]:
-    """The fields of an upgrade message."""
+    """Return the fields of an upgrade message."""
     values = vars(row)
     return tuple(
         Field(
@@ -260,7 +260,7 @@ def _row_fields(row: messages.UpgradeMessage) -> tuple[Field, ...]:
 
 
 def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:
-    """The fields of a message outside the documents."""
+    """Return command, mode and data of an undocumented or malformed message as fields."""
     fields = (
         Field("command", f"{message.command:04X}", "command", f"{message.command:04X}"),
         Field("mode", message.mode, "mode", f"{message.mode:02X}"),
@@ -290,7 +290,7 @@ def _raw(name: str, data: bytes) -> Field:
 
 
 def _plain_value(value: object) -> Any:
-    """A value for JSON: numbers, texts, lists of them; bytes in hexadecimal."""
+    """Convert a value for JSON: numbers, texts, lists of them; bytes in hexadecimal."""
     match value:
         case Bits():
             return flag_names(type(value), value)
@@ -310,7 +310,7 @@ def _plain_value(value: object) -> Any:
 
 
 def bits_of(frame: Frame) -> int:
-    """Bit times of any frame; stuff bits are exact for the base format, else left out."""
+    """Length of any frame in bit times; stuff bits are counted for the base format only."""
     if frame.is_error:
         return _ERROR_FRAME_BITS
     if frame.is_extended:
@@ -320,38 +320,38 @@ def bits_of(frame: Frame) -> int:
 
 @dataclass(frozen=True, slots=True)
 class TimedEvent:
-    """One event, with its first frame and the bits of all its frames."""
+    """Bus event with the time stamps and bit times of its frames."""
 
     event: BusEvent
     begin_s: float
-    """Stamp of the first frame."""
+    """Time stamp of the first frame."""
     end_s: float
-    """Stamp of the last frame."""
+    """Time stamp of the last frame."""
     bits: int
     first_bits: int
-    """Bits of the first frame alone."""
+    """Bit times of the first frame."""
 
     def began_s(self, bitrate_bps: int) -> float:
-        """Estimated begin of the first frame on the wire."""
-        if self._bears_ends(bitrate_bps):
+        """Estimated time at which the first frame began on the wire."""
+        if self._stamps_mark_ends(bitrate_bps):
             return self.begin_s - self.first_bits / bitrate_bps
         return self.begin_s
 
     def left_s(self, bitrate_bps: int) -> float:
-        """Estimated end of the last frame on the wire."""
-        if self._bears_ends(bitrate_bps):
+        """Estimated time at which the last frame ended on the wire."""
+        if self._stamps_mark_ends(bitrate_bps):
             return self.end_s
         return max(self.end_s, self.begin_s + self.bits / bitrate_bps)
 
-    def _bears_ends(self, bitrate_bps: int) -> bool:
-        """True when stamps mark the end of each frame, False when they mark acceptance."""
+    def _stamps_mark_ends(self, bitrate_bps: int) -> bool:
+        """True if stamps mark the end of each frame, False if they mark its acceptance."""
         between_s = (self.bits - self.first_bits) / bitrate_bps
         return self.end_s - self.begin_s >= ACCEPTED_SHARE * between_s
 
 
 @dataclass(slots=True)
 class _Open:
-    """Frames of one id since its last timed event."""
+    """Frames of one CAN id since its last timed event."""
 
     begin_s: float
     first_bits: int
@@ -360,7 +360,7 @@ class _Open:
 
 
 class TimedDecoder:
-    """Decodes the frames of a bus, in the order of time, with their wire times."""
+    """Decodes the frames of a bus, in the order of time, with their times on the wire."""
 
     def __init__(self) -> None:
         self._decoder = Decoder()
@@ -368,7 +368,7 @@ class TimedDecoder:
         self._nothing_due_before = -inf
 
     def feed(self, frame: Frame, now: float, bits: int) -> Sequence[TimedEvent]:
-        """Messages cut short before `now`, then those that the frame completed."""
+        """Return messages that became incomplete by `now`, then those that the frame completes."""
         found: list[TimedEvent] = []
         if now > self._nothing_due_before:
             found = self._cut_short(now)
@@ -385,7 +385,7 @@ class TimedDecoder:
         return found
 
     def finish(self, now: float) -> list[TimedEvent]:
-        """Messages still incomplete at the end."""
+        """Return the messages that are still incomplete at the end."""
         return self._cut_short(now + 2 * _TIMEOUT_S)
 
     def _cut_short(self, now: float) -> list[TimedEvent]:

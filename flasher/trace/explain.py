@@ -1,7 +1,7 @@
-"""Builds the story of a trace from its frames.
+"""Trace explanation: builds the story of the upgrades in a trace from its frames.
 
 Reads the frames once and keeps none. Uses CAN ids alone, as most formats do not record the sender.
-Asks no host engine: that could share its bugs.
+Shares no code with the host engines, whose bugs it would repeat.
 """
 
 from __future__ import annotations
@@ -41,22 +41,30 @@ from flasher.trace.verdict import judge, remarks
 from flasher.wording import explanation
 
 MAX_TALKERS: Final = 100
-"""Different ids listed; further ones are only counted."""
+"""Maximum number of listed CAN ids; further ones are only counted."""
 _MAX_IDS: Final = 100_000
 MAX_PACKETS: Final = 200_000
-"""Packets stored one by one in a story, over all upgrades."""
+"""Maximum number of packets stored one by one in a story, over all upgrades."""
 EVERYTHING_LIMIT: Final = 200_000
-"""Lines of a list that shows every message."""
+"""Maximum number of lines in a list of every message."""
 WALL_TIME_FROM: Final = 1e8
-"""Stamps from here on (1973) are wall time; smaller ones are relative to a start."""
+"""Time stamps from here on (1973) are wall time; smaller ones are relative to a start."""
 _MAY_BE_ANSWERED: Final = frozenset({Cause.RECORDING_ENDS, Cause.TOOL_STOPPED})
-"""Ends of a trace after which the latest message may have been answered."""
-_BEGINNERS: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
-"""Messages of the tool that start an upgrade."""
-_OF_BOOTLOADERS: Final = frozenset(Command) - {Command.READ_VERSION, Command.VERSION_INFORMATION}
+"""Verdicts after which the last message may have been answered outside the trace."""
+_BEGINNING_COMMANDS: Final = (
+    Command.RESET,
+    Command.UPDATE,
+    Command.PACKET,
+    Command.END_OF_TRANSFER,
+)
+"""Messages of the tool with which an upgrade begins."""
+_BOOTLOADER_COMMANDS: Final = frozenset(Command) - {
+    Command.READ_VERSION,
+    Command.VERSION_INFORMATION,
+}
 """Commands that applications never send."""
 _BURST_S: Final = 1.0
-"""An announcement this shortly before an update command is a part of the upgrade."""
+"""Maximum time between a boot version and the upgrade that it belongs to."""
 _SHUTDOWN: Final = 0x1308
 _BY_REQUEST: Final = {target.request_id: target for target in TARGETS.values()}
 _BY_ANSWER: Final = {target.answer_id: target for target in TARGETS.values()}
@@ -81,10 +89,10 @@ def explain(
 ) -> Story:
     """Build the story of a trace: `frames` with their times in seconds, in file order.
 
-    `suffix` names the format. `bitrate_bps` None means the dialect's own rate. `until` is when
-    listening ended, on the same clock, if known. `everything` keeps every message as a line of its
-    own. `is_one_tool` means that one tool sent everything, and may break the protocol on purpose.
-    Raises what `frames` raises.
+    `suffix` names the format. `bitrate_bps` None means the dialect's own rate. `until` is the end
+    of the recording on the same clock, if known. `everything` keeps every message as its own line.
+    `is_one_tool` means that one tool sent everything, and may break the protocol on purpose. Raises
+    the exceptions of `frames`.
     """
     reading = _StoryBuilder(bitrate_bps, everything=everything, is_one_tool=is_one_tool)
     now = float("-inf")
@@ -109,7 +117,7 @@ class _StoryBuilder:
         self._packets_left = MAX_PACKETS
         self._outside = self._new_steps()
         self._announced: dict[Target, list[TimedEvent]] = {}
-        """The latest announcements that no tool has answered yet."""
+        """Latest boot versions that no tool has answered yet."""
         self._announcements = 0
         self._has_hmi = False
         self._has_nodes = False
@@ -155,14 +163,17 @@ class _StoryBuilder:
             self._close(target, timed.begin_s)
             upgrade = None
         if upgrade is None:
-            if timed.event.kind is not Kind.MESSAGE or timed.event.command not in _BEGINNERS:
+            if (
+                timed.event.kind is not Kind.MESSAGE
+                or timed.event.command not in _BEGINNING_COMMANDS
+            ):
                 self._outside.add(step_of(timed.event, timed.end_s))
                 return
             upgrade = self._begin(target, timed)
         upgrade.tool(timed)
 
     def _begin(self, target: Target, timed: TimedEvent) -> ObservedUpgrade:
-        """Start an upgrade with the announcements that led to it."""
+        """Begin an upgrade, with the boot versions that led to it."""
         heard = [
             message
             for message in self._announced.pop(target, [])
@@ -182,14 +193,14 @@ class _StoryBuilder:
         return upgrade
 
     def _end_of_restart(self, target: Target, timed: TimedEvent) -> None:
-        """Drop an upgrade that was a mere restart: the device announced itself, received no update
-        command, and its application answers.
+        """Drop an upgrade that was a mere restart: the device sent boot versions, received no
+        update command, and its application answers.
         """
         upgrade = self._open.get(target)
         is_application = timed.event.kind in (Kind.MESSAGE, Kind.UNKNOWN)
         if upgrade is None or not upgrade.is_restart or not is_application:
             return
-        if timed.event.command not in _OF_BOOTLOADERS:
+        if timed.event.command not in _BOOTLOADER_COMMANDS:
             del self._open[target]
             for line in upgrade.steps.lines():
                 if isinstance(line, Step):
@@ -210,7 +221,7 @@ class _StoryBuilder:
         self._outside.add(step_of(timed.event, timed.end_s))
 
     def _other(self, timed: TimedEvent) -> None:
-        """Handle a message between other nodes, or to all of them."""
+        """Process a message between other nodes, or a broadcast."""
         event = timed.event
         if event.kind is Kind.MESSAGE and event.can_id == BMS.broadcast_id:
             if event.command == Command.VERSION_INFORMATION:
@@ -262,8 +273,8 @@ class _StoryBuilder:
     def story(
         self, source: str, suffix: str, until: float | None, recorded: Recorded | None
     ) -> Story:
-        """The finished story; feed nothing afterwards. `until` is when the trace ended, in seconds
-        on its clock; None means at its last frame.
+        """Return the story, after the last frame. `until` is the end of the trace in seconds on its
+        clock; None means its last frame.
         """
         start = self._start or 0.0
         until_s = max(self._bus.last_at, 0.0 if until is None else until - start)
@@ -339,7 +350,7 @@ class BusCounter:
         self.damaged = 0
         self.malformed = 0
         self.is_alone = True
-        """Only the tool sent anything."""
+        """Only the tool sent frames."""
         self._bits = 0
         self._peak_bits = 0
         self._second = 0
@@ -348,7 +359,7 @@ class BusCounter:
         self._talkers: dict[tuple[int, bool], int] = {}
 
     def frame(self, frame: Frame, now: float, bits: int) -> None:
-        """Count one frame; times never decrease."""
+        """Count a frame; times never decrease."""
         if self.first_at is None:
             self.first_at = self.last_at = now
         if now - self.last_at > self._gap[0]:
@@ -372,7 +383,7 @@ class BusCounter:
             self.is_alone = names is not None and names[0] == Node.CDL.name
 
     def note(self, event: BusEvent) -> None:
-        """Count an event that is not a message of the documents."""
+        """Count damaged bytes, and malformed or unknown messages."""
         self.damaged += event.kind is Kind.DAMAGED
         self.malformed += event.kind in (Kind.MALFORMED, Kind.UNKNOWN)
 
@@ -392,7 +403,7 @@ class BusCounter:
         )
 
     def talkers(self, but: set[int]) -> list[Talker]:
-        """All senders except these 11-bit ids, most frames first."""
+        """Return all senders except these 11-bit CAN ids, most frames first."""
         found = []
         for (of_id, is_extended), frames in self._talkers.items():
             names = None if is_extended else route(of_id)

@@ -1,7 +1,7 @@
-"""Bus usage figures of a transfer, measured live by a tap or from a trace by the same code.
+"""Bus usage of a transfer: answer times, turnaround times, repetitions, share of the line rate.
 
-`Transfer` takes messages; `LinkMeter` is the tap that decodes a driver's frames. Neither keeps
-frames: two times remain of each packet, and a `Distribution` of many times.
+`Transfer` takes messages; `LinkMeter` is a tap that decodes a driver's frames, live or from a
+trace. Neither keeps frames: two times remain of each packet, and a `Distribution` of many times.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SECONDS: Final = "d"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Spread of times, in seconds. A percentile is a measured value (nearest rank), never
+    """Distribution of times in seconds. A percentile is a measured value (nearest rank), never
     interpolated.
     """
 
@@ -37,7 +37,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: Iterable[float] | Mapping[float, int]) -> Self | None:
-        """The distribution of these seconds, or of value counts; None without values."""
+        """Compute the distribution of these seconds, or of value counts; None without values."""
         ranked = Ranked(values)
         if not ranked:
             return None
@@ -52,7 +52,7 @@ class Distribution:
 
 
 class Ranked:
-    """Sorted values with their counts, so that millions take little memory."""
+    """Sorted values with their counts, so that millions need little memory."""
 
     def __init__(self, values: Iterable[float] | Mapping[float, int]) -> None:
         counts = Counter(values)
@@ -67,7 +67,7 @@ class Ranked:
 
     @property
     def median(self) -> float:
-        """The middle value, or the mean of the two in the middle."""
+        """Middle value, or the mean of the two in the middle."""
         return (self[(len(self) - 1) // 2] + self[len(self) // 2]) / 2
 
 
@@ -100,11 +100,11 @@ class LinkReport:
     """From a packet's last frame on the wire to the last frame of its ACK or NAK; None without
     samples. Repeated packets are left out: the answer may belong to any copy."""
     unreadable: int | None = None
-    """How often the adapter delivered something other than a frame; None if not counted."""
+    """Number of inputs of the adapter that were not frames; None if not counted."""
 
 
 class Transfer:
-    """Collects packets and answers over all attempts. Feed messages in order."""
+    """Collects packets and answers over all attempts, in order."""
 
     def __init__(self, bitrate_bps: int) -> None:
         self._bitrate_bps = bitrate_bps
@@ -118,9 +118,9 @@ class Transfer:
         self._begin_s: float | None = None
         self._last_ack_s: float | None = None
         self._acked_at_s: float | None = None
-        """Time of the ACK that no packet has followed yet."""
+        """Time of an ACK that no packet has followed yet."""
         self._number = 0
-        """The current packet; 0 before the first one of an attempt."""
+        """Current packet; 0 before the first one of an attempt."""
         self._highest = 0
         self._copies = 0
         self._bits = 0
@@ -130,7 +130,7 @@ class Transfer:
         self._answers = array(_SECONDS)
 
     def begin_attempt(self) -> None:
-        """The device requests packet 1 or receives the update command."""
+        """Begin another attempt, at update command or request transfer."""
         if self._begin_s is not None and self._last_ack_s is not None:
             self._past_s += self._last_ack_s - self._begin_s
         self._begin_s = self._last_ack_s = self._acked_at_s = None
@@ -157,7 +157,7 @@ class Transfer:
         self._acked_at_s = None
 
     def answer(self, number: int, timed: TimedEvent, *, is_ack: bool) -> None:
-        """The device answered a packet; answers to other packets are ignored."""
+        """Record the answer to a packet; answers to other packets are ignored."""
         if not is_ack:
             self._naks += 1
         if number != self._number or self._is_acked:
@@ -173,7 +173,7 @@ class Transfer:
             self._copies = 2  # The next answer may belong to this copy or the next one.
 
     def report(self) -> LinkReport | None:
-        """The figures so far; None before the first packet."""
+        """Return the bus usage so far; None before the first packet."""
         if not self._packets:
             return None
         transfer_s = self._past_s
@@ -197,7 +197,7 @@ class Transfer:
 
 
 class LinkMeter:
-    """A driver's tap that measures the transfer to `target`. Call `report` at any time."""
+    """Driver's tap that measures the transfer to `target`. Call `report` at any time."""
 
     def __init__(self, target: Target, bitrate_bps: int) -> None:
         self._ids = frozenset((target.request_id, target.answer_id))

@@ -1,6 +1,6 @@
-"""One upgrade of one target as observed on the bus, in the order of time.
+"""Facts of one upgrade of one target in a trace: phases, packets, repetitions, damage.
 
-It only records and does not know which message comes next. `verdict` judges the facts.
+It only records, and expects no certain message next. `verdict` judges the facts.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from flasher.trace.steps import StepList, step_of
 from flasher.trace.story import PacketStory, PhaseSpan, Step, StepKind, TraceVerdict
 
 NEXT_UPGRADE_S: Final = 15.0
-"""A reset after this much silence starts another upgrade, not another attempt."""
+"""Silence after which a reset begins another upgrade, not another attempt."""
 _GAP_S: Final = 1.0
-"""Silence that gets a line of its own."""
+"""Silence that is a line in the story."""
 AT_ONCE_S: Final = 0.3
-"""A tool that gives up waits longer than this before it starts over."""
+"""Shorter than a tool waits before it gives up and starts over."""
 IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
-"""A tool silent for this long before the transfer was waiting for an answer."""
+"""Silence of a tool that waits for an answer before the transfer."""
 _LATE_BOOT_S: Final = 0.25
-"""Boot versions this soon after an update command may already have been on the wire."""
+"""Boot versions this soon after an update command may have been on the wire before it."""
 _VERSION_SIZE: Final = 32
-"""Bytes of the previous packet in which a version across two packets may begin."""
+"""Bytes of the previous packet that are searched for the begin of a version text."""
 _MAX_NOTED: Final = 10
-"""Different texts of one kind that are kept."""
+"""Maximum number of different texts of one kind."""
 
 
 class Interleaving:
-    """Detects messages that begin inside another one on the same id: two senders at once."""
+    """Detects messages that begin inside another one on the same CAN id: two senders at once."""
 
     def __init__(self) -> None:
         self.found = 0
@@ -64,7 +64,7 @@ class Interleaving:
         self._last_at = now
 
     def answered(self) -> None:
-        """The other side answered: the message was complete, even if a part is missing here."""
+        """Expect no rest of an answered message: it was complete, even if frames are missing."""
         self._left = 0
 
 
@@ -79,7 +79,7 @@ def _is_head(data: bytes) -> bool:
 
 @dataclass
 class ObservedUpgrade:
-    """One upgrade of one target so far. Times are seconds on the trace's clock.
+    """Facts of an upgrade so far. Times are seconds on the trace's clock.
 
     `steps` and `link` grow with it; `judge` gives the verdict of an attempt followed by another
     one.
@@ -92,7 +92,7 @@ class ObservedUpgrade:
     judge: Callable[[ObservedUpgrade, float], TraceVerdict]
     max_packets: int
     is_one_tool: bool = False
-    """Everything on the tool's id is known to come from one tool."""
+    """All messages with the tool's CAN id are known to come from one tool."""
 
     phase: Phase | None = None
     phase_begin_s: float = 0.0
@@ -101,20 +101,20 @@ class ObservedUpgrade:
     earlier: TraceVerdict | None = None
     """Verdict of the previous attempt, if it reached the transfer."""
     is_answered: bool = False
-    """The target sent something intact."""
+    """The target sent an intact message."""
 
     # Before the transfer.
     resets: int = 0
     feedbacks: int = 0
     boot_versions: dict[str, int] = field(default_factory=dict)
-    """Name and version, and how often each was announced."""
+    """Number of boot versions by name and version."""
     boot_names: set[str] = field(default_factory=set)
     is_boot_odd: bool = False
-    """A boot version did not have the document's form."""
+    """A boot version did not have the documented form."""
     boot_changes: int = 0
-    """How often a boot version differs from the previous one in the same attempt."""
+    """Number of boot versions that differ from the previous one in the same attempt."""
     is_announced: bool = False
-    """The bootloader announced itself in this attempt."""
+    """The bootloader sent a boot version in this attempt."""
     updates: int = 0
     boots_after_update: int = 0
     feedbacks_after_update: int = 0
@@ -133,7 +133,7 @@ class ObservedUpgrade:
     damage_now: int = 0
     """Damage since the last progress."""
     is_cut_short: bool = False
-    """The latest message on the tool's id is incomplete."""
+    """The latest message with the tool's CAN id is incomplete."""
     errors: int = 0
     errors_now: int = 0
     """Error frames since the last progress."""
@@ -153,12 +153,12 @@ class ObservedUpgrade:
     # Others.
     shutdown_at_s: float | None = None
     intrusions: list[str] = field(default_factory=list)
-    """Messages on the tool's id that this upgrade does not explain."""
+    """Messages with the tool's CAN id that are not explained by this upgrade."""
     interleaving: Interleaving = field(default_factory=Interleaving)
 
     def __post_init__(self) -> None:
         self.last_at_s = self.tool_at_s = self.begin_s
-        """Time of the latest message of either side, and of the tool."""
+        """Time of the latest message, of either side and of the tool."""
         self.link = Transfer(self.bitrate_bps)
         self._update_at_s = self._request_at_s = self.begin_s
         self._by_number: dict[int, PacketStory] = {}
@@ -169,13 +169,13 @@ class ObservedUpgrade:
 
     @property
     def is_restart(self) -> bool:
-        """So far the device restarted and announced itself, and received no update command."""
+        """True while the device restarted, sent boot versions, and received no update command."""
         return self.is_announced and not self.updates and self.phase is Phase.BOOT
 
     # -- inputs ------------------------------------------------------------------------------------
 
     def begins_another(self, event: BusEvent) -> bool:
-        """True when a tool's message belongs to the next upgrade."""
+        """True if a message of the tool belongs to the next upgrade."""
         is_over = self.completed_at_s is not None or self.early_complete
         if event.command == Command.RESET:
             return is_over or event.at - self.last_at_s > NEXT_UPGRADE_S
@@ -184,7 +184,7 @@ class ObservedUpgrade:
         return False
 
     def tool(self, timed: TimedEvent) -> None:
-        """Record an event on the id of the tool's messages to the target."""
+        """Record an event with the CAN id of the tool's messages to the target."""
         self._silence(timed.begin_s)
         values = values_of(timed.event)
         is_damaged = timed.event.kind is Kind.DAMAGED
@@ -195,11 +195,11 @@ class ObservedUpgrade:
             self._packet(timed, values)
         else:
             self.steps.add(step_of(timed.event, timed.end_s))
-            self._tool_says(timed, values)
+            self._tool_message(timed, values)
         self.last_at_s = self.tool_at_s = timed.end_s
 
     def device(self, timed: TimedEvent) -> None:
-        """Record an event on the id of the target's answers to the tool."""
+        """Record an event with the CAN id of the target's answers to the tool."""
         self._silence(timed.begin_s)
         self.interleaving.answered()
         self.is_answered |= timed.event.kind is not Kind.DAMAGED
@@ -214,7 +214,7 @@ class ObservedUpgrade:
                 self.damage_from_device += 1
                 self.damage_now += 1
             elif timed.event.kind is Kind.MESSAGE:
-                self._device_says(timed, values)
+                self._device_message(timed, values)
         self.last_at_s = timed.end_s
 
     def version(self, timed: TimedEvent) -> None:
@@ -239,7 +239,7 @@ class ObservedUpgrade:
 
     # -- the tool ----------------------------------------------------------------------------------
 
-    def _tool_says(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+    def _tool_message(self, timed: TimedEvent, values: dict[str, Any]) -> None:
         event = timed.event
         if event.kind is not Kind.MESSAGE:
             return
@@ -254,7 +254,7 @@ class ObservedUpgrade:
                     self._enter(Phase.END, timed.begin_s)
                     self._progress()
             case _ if self.phase is Phase.TRANSFER:
-                self._intrude(f"{event.title} (command {event.command:04X})")
+                self._add_intrusion(f"{event.title} (command {event.command:04X})")
             case _ if self.phase is Phase.END and event.command == Command.READ_VERSION:
                 self._enter(Phase.CONFIRM, timed.begin_s)
 
@@ -267,14 +267,14 @@ class ObservedUpgrade:
             if self.phase is None:
                 self._enter(Phase.RESET, timed.begin_s)
         elif self._is_undisturbed(timed.begin_s):
-            self._intrude("reset")
+            self._add_intrusion("reset")
         else:
             self._next_attempt(timed.begin_s)
             self._enter(Phase.RESET, timed.begin_s)
 
     def _update(self, timed: TimedEvent, size_bytes: int) -> None:
         if self._is_undisturbed(timed.begin_s):
-            self._intrude("update command")
+            self._add_intrusion("update command")
             return
         in_silence = not self.is_announced and self._gave_up(timed.begin_s)
         if self.phase in (Phase.TRANSFER, Phase.END, Phase.CONFIRM) or in_silence:
@@ -287,20 +287,20 @@ class ObservedUpgrade:
         self._enter(Phase.UPDATE, timed.begin_s)
 
     def _gave_up(self, now: float) -> bool:
-        """True when the tool sent update commands and waited in vain: its next message starts
-        another attempt.
+        """True if the tool sent update commands and waited in vain: its next message begins another
+        attempt.
         """
         return self.updates > 0 and now - self.tool_at_s >= IN_VAIN_S
 
     def _is_undisturbed(self, now: float) -> bool:
-        """True while nothing went wrong, so that no tool has a reason to start over."""
+        """True while nothing went wrong, so that a tool has no reason to start over."""
         if self.is_one_tool:
             return False
         packet = self.current
         running = self.phase is Phase.TRANSFER and packet is not None and packet.is_clean
         return running and now - self.last_at_s < AT_ONCE_S and not self.is_restarted
 
-    def _intrude(self, what: str) -> None:
+    def _add_intrusion(self, what: str) -> None:
         if len(self.intrusions) < _MAX_NOTED:
             at = "" if self.current is None else f" while packet {self.current.number} was in work"
             self.intrusions.append(f"{what}{at}")
@@ -327,7 +327,7 @@ class ObservedUpgrade:
                 self.packets.append(packet)
         else:
             if current is not None and current.number > number and packet.answered_at_s:
-                self._intrude(f"packet {number} once more")
+                self._add_intrusion(f"packet {number} once more")
                 return
             packet.tries += 1
         self._left_s[number] = timed.left_s(self.bitrate_bps)
@@ -335,7 +335,7 @@ class ObservedUpgrade:
 
     # -- the device --------------------------------------------------------------------------------
 
-    def _device_says(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+    def _device_message(self, timed: TimedEvent, values: dict[str, Any]) -> None:
         match timed.event.command:
             case Command.GENERAL_FEEDBACK:
                 self.feedbacks += 1
@@ -422,11 +422,11 @@ class ObservedUpgrade:
             self.spans.append(PhaseSpan(self.phase, self.attempt, self.phase_begin_s, end_s))
 
     def _progress(self) -> None:
-        """Something succeeded: earlier trouble no longer explains a failure."""
+        """Forget trouble before a success: it does not explain a later failure."""
         self.damage_now = self.errors_now = 0
 
     def _next_attempt(self, at_s: float) -> None:
-        """The tool starts over: reset the facts of a single attempt."""
+        """Reset the facts of a single attempt, because the tool starts over."""
         is_first = self.phase is Phase.UPDATE and self.earlier is None
         if is_first or self.phase in (Phase.TRANSFER, Phase.END):
             self.earlier = self.judge(self, at_s)

@@ -1,4 +1,4 @@
-"""Wireshark captures: a reader of .pcapng and .pcap files, and a writer of .pcapng.
+"""Wireshark captures: reader of .pcapng and .pcap files, writer of .pcapng files.
 
 The reader skips names, statistics and other link types. A CAN frame is a packet of SocketCAN (link
 type 227): identifier with flags, high byte first, size, CAN FD flags, data.
@@ -20,7 +20,7 @@ from flasher.trace.bounds import Bounds, UnfitError
 
 _LINK_TYPE_CAN: Final = 227
 _LINK_TYPES: Final = {1: "Ethernet", 113: 'Linux "any"', 190: "CAN 2.0B", 276: 'Linux "any"'}
-"""Link types that messages name."""
+"""Names of link types, for messages."""
 
 _EXTENDED, _REMOTE, _ERROR = 1 << 31, 1 << 30, 1 << 29
 _ID_MASK: Final = _ERROR - 1
@@ -40,8 +40,8 @@ _PCAP_MAGICS: Final = {0xA1B2C3D4: 10**6, 0xA1B23C4D: 10**9}
 
 
 def frames_of_capture(source: BufferedIOBase, bounds: Bounds) -> Iterator[tuple[float, Frame]]:
-    """Time in seconds and frame of each packet of a .pcapng or .pcap file. Raises UnfitError for
-    other files, without CAN, and at frames of a second interface.
+    """Yield time in seconds and frame of each packet of a .pcapng or .pcap file. Raises UnfitError
+    for other files, for captures without CAN, and at frames of a second interface.
     """
     magic = source.read(4)
     source.seek(0)
@@ -59,7 +59,7 @@ def frames_of_capture(source: BufferedIOBase, bounds: Bounds) -> Iterator[tuple[
 
 @dataclass(frozen=True)
 class _Interface:
-    """Link type of an interface, and the unit of its times."""
+    """Link type and time unit of a captured interface."""
 
     link_type: int
     units_per_s: int = 10**6
@@ -67,14 +67,14 @@ class _Interface:
 
 
 class _Interfaces:
-    """The interfaces of a capture: exactly one has the frames."""
+    """Interfaces of a capture, of which exactly one may have CAN frames."""
 
     def __init__(self) -> None:
         self.link_types: set[int] = set()
         self._of_frames: object = None
 
     def take(self, key: object) -> None:
-        """Note a frame of this interface."""
+        """Record a frame of an interface. Raises UnfitError for a second interface with frames."""
         if self._of_frames not in (None, key):
             raise UnfitError(
                 "it holds frames of more than one CAN interface",
@@ -83,7 +83,7 @@ class _Interfaces:
         self._of_frames = key
 
     def check_can(self) -> None:
-        """Raises UnfitError when there are interfaces, but none is CAN."""
+        """Raise UnfitError if there are interfaces, but none is CAN."""
         if not self.link_types or _LINK_TYPE_CAN in self.link_types:
             return
         kinds = ", ".join(
@@ -97,7 +97,7 @@ class _Interfaces:
 
 
 def _frame(packet: bytes) -> Frame | None:
-    """The frame in a packet; None for CAN FD and CAN XL. Raises UnfitError."""
+    """Decode the CAN frame in a packet; None for CAN FD and CAN XL. Raises UnfitError."""
     if len(packet) < _CAN_HEADER.size:
         raise UnfitError("a packet is too short for a CAN frame")
     can_id, size, flags = _CAN_HEADER.unpack_from(packet)
@@ -114,7 +114,7 @@ def _frame(packet: bytes) -> Frame | None:
 # -- reading ---------------------------------------------------------------------------------------
 
 _Packets = Iterator[tuple[object, float, bytes]]
-"""Interface, time in seconds and content of each packet of CAN."""
+"""Interface, time in seconds and content of each CAN packet."""
 
 
 def _pcap(source: BufferedIOBase, bounds: Bounds, found: _Interfaces) -> _Packets:
@@ -215,7 +215,7 @@ def _padded(size: int) -> int:
 
 
 class PcapngWriter:
-    """Writer with the interface of python-can's own, with comments for Wireshark."""
+    """Trace writer with the interface of python-can's writers, and comments for Wireshark."""
 
     def __init__(self, path: str | os.PathLike[str], comment: str = "") -> None:
         """`comment` is for the whole file. Raises OSError."""
@@ -229,7 +229,7 @@ class PcapngWriter:
         )
 
     def __call__(self, message: can.Message, comment: str = "") -> None:
-        """Write one frame with an optional `comment`. Raises OSError."""
+        """Write a frame with an optional `comment`. Raises OSError."""
         flags = (
             _EXTENDED * message.is_extended_id
             | _REMOTE * message.is_remote_frame
@@ -254,7 +254,7 @@ class PcapngWriter:
 
 
 def _options(values: dict[int, bytes]) -> bytes:
-    """Options of a block, without empty ones."""
+    """Encode the options of a block, without empty ones."""
     written = [
         Struct("<HH").pack(code, len(value)) + value.ljust(_padded(len(value)), b"\0")
         for code, value in values.items()

@@ -1,9 +1,9 @@
-"""Reader of recorded traces: the formats of python-can, and Wireshark captures.
+"""Trace reader: python-can's formats and Wireshark captures, with limits on size and time.
 
-python-can parses the content, but takes a line, a container or a database of any size and may read
-forever; this module limits what it is given.
+python-can parses the content, but accepts a line, a container or a database of any size and may
+read forever; this module limits its input.
 
-SQLite creates and removes files beside a database that it opens, and repairs it. So a copy in a
+SQLite creates and removes files next to a database that it opens, and repairs it. So a copy in a
 temporary folder is read: the original stays unchanged, and content that another program has not yet
 merged into the file is read too.
 """
@@ -37,18 +37,18 @@ _FRAMES: Final = "SELECT ts, arbitration_id, extended, remote, error, data FROM 
 _IS_TABLE: Final = (
     "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'messages' AND rootpage > 0"
 )
-"""A view or a virtual table may have endless rows."""
+"""A view or a virtual table is excluded, because it may have endless rows."""
 _COMPANIONS: Final = ("-journal", "-wal")
-"""Files that SQLite writes beside a database; both hold parts of its content."""
+"""Suffixes of files that SQLite writes next to a database, with parts of its content."""
 _COPIED_MAX_SIZE: Final = 256 * 1024 * 1024
 _VALUE_MAX: Final = 65_536
-"""In bytes, of one value."""
+"""Bytes of one value."""
 _ROW_MIN_SIZE: Final = 8
-"""In bytes, of the smallest row of seven columns: a damaged file may lead in circles."""
+"""Bytes of the smallest row of seven columns: a damaged file may lead in circles."""
 
 SUFFIXES = ".asc .blf .csv .db .log .mf4 .pcap .pcapng .trc, also followed by .gz"
 _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
-"""In bytes, for a format that is read in one piece."""
+"""Bytes, for a format that is read in one piece."""
 _PIECE_SIZE: Final = 65_536
 _TIME_MAX_S: Final = 1e11
 """About the year 5000. No clock gives a later time, or its negative."""
@@ -113,7 +113,7 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
 def _frames(
     suffix: str, source: BufferedIOBase, size: int, path: Path, bounds: Bounds
 ) -> Iterator[tuple[float, Frame]]:
-    """The frames from the format's reader. Raises whatever that raises."""
+    """Yield the frames from the format's reader. Raises any exception of that reader."""
     if suffix == ".db":
         yield from _frames_of_database(source, path)
         return
@@ -142,10 +142,10 @@ def _frames(
 
 
 def _mf4_reader(whole: bytes) -> can.MF4Reader:
-    """Raises UnfitError, and NotImplementedError without the package."""
+    """Open an .mf4 file. Raises UnfitError, and NotImplementedError without the package."""
     load_mf4()
-    # What asammdf leaves of a file that it cannot open complains on stderr when it goes away: that
-    # is now, and not when the error has been told.
+    # After a failed open, asammdf prints on stderr when its objects are collected: that is done
+    # here, while stderr is redirected.
     with redirect_stderr(StringIO()):
         try:
             return can.MF4Reader(BytesIO(whole))
@@ -158,7 +158,7 @@ def _mf4_reader(whole: bytes) -> can.MF4Reader:
 
 
 def _check(at_s: float, frame: Frame) -> None:
-    """Raises UnfitError for an impossible time or id."""
+    """Raise UnfitError for an impossible time or CAN id."""
     if not math.isfinite(at_s) or abs(at_s) > _TIME_MAX_S:
         raise UnfitError(f"a frame has the time {at_s!r}")
     is_long = frame.is_extended or frame.is_error
@@ -181,7 +181,7 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[float, Frame]]:
-    """Time in seconds and frame of each row. `path` locates the companion files.
+    """Yield time in seconds and frame of each row; `path` locates the companion files.
 
     Raises UnfitError, and sqlite3.Error for an invalid database.
     """

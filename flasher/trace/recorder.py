@@ -1,4 +1,4 @@
-"""Recorder of all frames in both directions to a file; the suffix chooses the format."""
+"""Trace recorder: writes all frames in both directions to a file; the suffix chooses the format."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from flasher.python_can import can, load_mf4
 from flasher.trace.pcapng import PcapngWriter
 
 _CANDUMP_ERROR: Final = 0x2000_0080
-"""Error frame, bus error."""
+"""CAN id of an error frame for a bus error."""
 _INTERFACE_MAX: Final = 15
-"""Characters of a Linux interface name: can-utils have no room for more."""
+"""Maximum length of a Linux interface name: can-utils have no room for more."""
 _NOT_IN_NAME: Final = re.compile(r"[^A-Za-z0-9.:_-]")
 _COMMIT_FRAMES: Final = 500
-"""At most this many frames are lost when the process is killed."""
+"""Maximum number of frames that are lost when the process is killed."""
 ONE_TOOL_CHANNEL: Final = "conformance"
 """Channel in logs of the conformance suite, which breaks the protocol on purpose."""
 
 
 def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0) -> can.Message:
-    """A frame as a python-can message at wall time `at_s`."""
+    """Convert a frame to a python-can message at wall time `at_s`."""
     return can.Message(
         timestamp=at_s,
         arbitration_id=frame.can_id,
@@ -44,7 +44,7 @@ def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0)
 
 
 class Writer(Protocol):
-    """Common interface of all trace writers."""
+    """Interface of all trace writers."""
 
     def __call__(self, msg: can.Message, /) -> None: ...
 
@@ -57,13 +57,12 @@ class CandumpWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Raises OSError."""
         self._file = Path(path).open("w", encoding="ascii")  # noqa: SIM115  stop() closes it
         self.interface = "can0"
-        """Written with every frame; one word."""
+        """Interface name in every line; without spaces."""
 
     def __call__(self, message: can.Message) -> None:
-        """Write one frame. Raises OSError."""
+        """Write a frame. Raises OSError."""
         can_id, data = f"{message.arbitration_id:03X}", bytes(message.data).hex().upper()
         if message.is_error_frame:
             can_id, data = f"{_CANDUMP_ERROR | message.arbitration_id:08X}", data or "00" * 8
@@ -80,12 +79,11 @@ class CandumpWriter:
 
 
 class DatabaseWriter:
-    """Writes to an SQLite file, in the table that python-can reads. python-can's own writer loses
+    """Writes an SQLite file with the table that python-can reads. python-can's own writer loses
     queued frames at the end, and appends to an existing file.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Raises OSError."""
         Path(path).write_bytes(b"")
         # The tap of an asynchronous program is called in several threads, one after the other.
         self._connection = sqlite3.connect(path, check_same_thread=False)
@@ -100,7 +98,7 @@ class DatabaseWriter:
         )
 
     def __call__(self, message: can.Message) -> None:
-        """Write one frame. Raises OSError."""
+        """Write a frame. Raises OSError."""
         row = (
             message.timestamp,
             message.arbitration_id,
@@ -116,7 +114,7 @@ class DatabaseWriter:
             self._do(self._connection.commit)
 
     def stop(self) -> None:
-        """Close the file. Raises ValueError when already closed, and OSError."""
+        """Close the file. Raises OSError, and ValueError if it is already closed."""
         if self._is_closed:
             raise ValueError("it is closed")
         self._is_closed = True
@@ -126,21 +124,21 @@ class DatabaseWriter:
             self._connection.close()
 
     def _do(self, work: Callable[..., object], *arguments: object) -> None:
-        """Execute a statement; raises OSError for errors of the database."""
+        """Execute a statement. Raises OSError for errors of the database."""
         try:
             work(*arguments)
         except sqlite3.Error as error:
             raise OSError(None, str(error)) from error
 
 
-def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
-    """Create the writer for the suffix of the file, readable by its owner only; messages name it
-    `called`. Raises UsageError for an unknown suffix, a missing package, or a file that cannot be
-    written.
+def writer_of(path: str | os.PathLike[str], *, name: str = "") -> Writer:
+    """Create the trace writer for a file's suffix; only the owner can read the file. Messages name
+    it `called`. Raises UsageError for an unknown suffix, a missing package, or a file that cannot
+    be written.
     """
-    suffix, shown = Path(path).suffix.lower(), printable(called or os.fspath(path)) or "''"
+    suffix, shown = Path(path).suffix.lower(), printable(name or os.fspath(path)) or "''"
     try:
-        with _created_for_its_owner(path):
+        with _created_private(path):
             if suffix == ".pcapng":
                 return PcapngWriter(path)
             if suffix == ".log":
@@ -169,9 +167,9 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
 
 
 @contextmanager
-def _created_for_its_owner(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Create the file for its owner only, before the block opens it. On failure a new file is
-    removed and an existing one is unchanged. Raises OSError.
+def _created_private(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Create a file that only its owner can read, before the block opens it. On failure a new file
+    is removed and an existing one is unchanged. Raises OSError.
     """
     was_there = os.path.lexists(path)
     make_private(path, is_appended_to=True)
@@ -185,18 +183,18 @@ def _created_for_its_owner(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 class Recorder:
-    """A tap for the driver that records to a file (.asc, .blf, .log, .csv, ...).
+    """Driver's tap that records to a file (.asc, .blf, .log, .csv, ...).
 
     Times in the file are wall-clock times, counted from the start by the driver's clock, so that a
-    jump of the wall clock leaves no gap. Use as a context manager: formats like .blf are complete
-    only when closed. Raises UsageError for an unknown suffix or a file that cannot be written. A
-    full disk ends the recording and nothing else; see `failure`.
+    jump of the wall clock leaves no gap. Use it as a context manager: formats like .blf are
+    complete only when closed. Raises UsageError for an unknown suffix or a file that cannot be
+    written. A full disk ends only the recording; see `failure`.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = os.fspath(path)
         self.failure: str | None = None
-        """Why the recording ended early; None while it is complete."""
+        """Reason why the recording ended early; None while it is complete."""
         shown = printable(self._path) or "''"
         if not Path(self._path).absolute().parent.is_dir():
             raise UsageError(

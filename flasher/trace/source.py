@@ -1,4 +1,4 @@
-"""Sources of a story: a trace file, or a bundle's folder with trace and report."""
+"""Explanation of a trace file, or of a bundle with trace and report."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _RATE_MAX_BPS: Final = 10_000_000
 
 
 def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
-    """Explain a trace file of any known format, or a bundle's folder.
+    """Explain a trace file of any known format, or the folder of a bundle.
 
-    Raises UsageError for anything else.
+    Raises UsageError for other files and folders.
     """
     damage: list[str] = []
     trace = trace_file(path)
@@ -42,13 +42,13 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
         until=report.get("written_at") if isinstance(report.get("written_at"), float) else None,
         everything=everything,
         recorded=_recorded(report) if report else None,
-        is_one_tool=_is_of_conformance(path),
+        is_one_tool=_is_conformance_log(path),
     )
-    return replace(_as_the_tool_ended(story), damage=" ".join(damage))
+    return replace(_with_tool_end(story), damage=" ".join(damage))
 
 
 def trace_file(path: Path) -> Path:
-    """The trace file itself, or the one in a bundle's folder. Raises UsageError for any other
+    """Return the trace file, for a bundle the one in its folder. Raises UsageError for any other
     folder.
     """
     if not path.is_dir():
@@ -62,10 +62,8 @@ def trace_file(path: Path) -> Path:
     )
 
 
-def _as_the_tool_ended(story: Story) -> Story:
-    """A bundle is written after the tool ended: a trace that stops early means that the tool
-    stopped, not the recording.
-    """
+def _with_tool_end(story: Story) -> Story:
+    """Replace the verdict "recording ends" of a bundle: it was written after its tool ended."""
     recorded = story.recorded
     if recorded is None or recorded.exit_code is None:
         return story
@@ -89,8 +87,8 @@ def _as_the_tool_ended(story: Story) -> Story:
 
 
 def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
-    """The frames up to the first unreadable one, which is noted in `damage`: a killed recorder
-    leaves half a line. Raises UsageError if no frame can be read.
+    """Yield the frames up to the first unreadable one, which is described in `damage`: a killed
+    recorder leaves half a line. Raises UsageError if no frame can be read.
     """
     count = 0
     try:
@@ -103,7 +101,7 @@ def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, 
         damage.append(f"{error.where or error.what}: {error.cause}")
 
 
-def _is_of_conformance(path: Path) -> bool:
+def _is_conformance_log(path: Path) -> bool:
     """True for a log of the conformance suite, by its channel."""
     if path.suffix.lower() != ".log" or not path.is_file():
         return False
@@ -116,7 +114,7 @@ def _suffix(path: Path) -> str:
 
 
 def _report(path: Path) -> dict[str, Any]:
-    """The report of a bundle; empty if missing."""
+    """Return the report of a bundle; empty if missing."""
     try:
         if not path.exists():
             return {}
@@ -139,7 +137,7 @@ def _no_report(path: Path, cause: str) -> UsageError:
 
 
 def recorded_of(path: Path) -> Recorded:
-    """The outcome that the command wrote to its bundle. Raises UsageError for a broken report."""
+    """Return the result that a command wrote to its bundle. Raises UsageError if it is broken."""
     return _recorded(_report(path / REPORT))
 
 

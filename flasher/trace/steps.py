@@ -1,4 +1,4 @@
-"""The steps of a story: good packets folded, error frames counted, length limited."""
+"""List of steps in a story: acknowledged packets folded, error frames counted, length limited."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.story import PacketRun, Step, StepKind, StoryLine
 
 MAX_STEPS: Final = 1000
-"""Lines kept of one list: its first and its last half."""
+"""Maximum number of lines in a list: its first and its last half are kept."""
 _VALUE_WIDTH: Final = 64
-"""Longer values are cut."""
+"""Characters of a value, which is truncated after them."""
 _ERRORS: Final = "error frames"
 
 
 class StepList:
-    """Collects lines; `fold` combines packets sent once and acknowledged into runs."""
+    """Collects lines; `fold` combines packets that were sent once and acknowledged into runs."""
 
     def __init__(self, *, fold: bool = True, limit: int = MAX_STEPS) -> None:
         self._fold = fold
@@ -27,7 +27,7 @@ class StepList:
         self._tail: deque[StoryLine] = deque(maxlen=self._half)
         self._taken = 0
         self._pending: tuple[int, float, Step] | None = None
-        """A packet waiting for its ACK: number, begin, and its line if none arrives."""
+        """Packet that waits for its ACK: number, begin, and its line if none arrives."""
         self._run: PacketRun | None = None
         self._errors = 0
         self._errors_at = (0.0, 0.0)
@@ -107,7 +107,7 @@ class StepList:
 
 
 def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[StoryLine, ...]:
-    """The lines of an upgrade, with the tool's messages that `device` left unanswered marked as
+    """Return the lines of an upgrade, with unanswered messages of the tool to `device` marked as
     trouble. `is_over`: nothing followed the last one.
     """
     lines = list(steps.lines())
@@ -130,7 +130,7 @@ def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[Sto
 
 
 def step_of(event: BusEvent, at_s: float) -> Step:
-    """A bus event as a line."""
+    """Convert a bus event to a line."""
     kind = StepKind.DAMAGED if event.kind is Kind.DAMAGED else StepKind.MESSAGE
     width = None if event.is_alarm else _VALUE_WIDTH  # no fault is left out
     # Image bytes, and a constant text that repeats the title, add nothing.

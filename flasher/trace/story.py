@@ -1,4 +1,4 @@
-"""The story of a recorded trace as data: `flasher explain` prints, draws and exports it.
+"""Story of a trace as data, which `flasher explain` prints, draws and exports.
 
 Dataclasses only; those of packets grow while the trace is read. Times named `..._s` are seconds
 since the first frame of the trace. Every text is safe to show in a terminal; a page still has to
@@ -15,13 +15,11 @@ from flasher.trace.figures import LinkReport
 
 
 class Cause(Enum):
-    """Result of an upgrade and its reason, or the content of a trace without one; the value is a
-    headline.
-    """
+    """Result of an upgrade with its reason, or the content of a trace without upgrade."""
 
     # It went well.
     COMPLETED = "completed"
-    """The device reported complete. The verdict's text has any version it answered later."""
+    """The device reported complete. The verdict's text has the version answered later, if any."""
     CONFIRMED_BY_VERSION = "confirmed_by_version"
 
     # It did not begin.
@@ -42,7 +40,7 @@ class Cause(Enum):
     BUS_TROUBLE = "bus_trouble"
     TOOL_STOPPED = "tool_stopped"
     TOOL_ENDED = "tool_ended"
-    """As the tool's report in the bundle states."""
+    """The tool's report in the bundle says that it ended."""
 
     # The end.
     REFUSED = "refused"
@@ -58,7 +56,7 @@ class Cause(Enum):
 
     @property
     def is_good(self) -> bool:
-        """True when the device reported that it has the new image."""
+        """True if the device reported that it has the new image."""
         return self in {Cause.COMPLETED, Cause.CONFIRMED_BY_VERSION}
 
     @property
@@ -69,19 +67,19 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class TraceVerdict:
-    """The result of a trace: cause, place, likely reason and next step."""
+    """Verdict on a trace: result, phase and packet, likely cause and next step."""
 
     cause: Cause
     phase: Phase | None
-    """Phase of the decision; None outside of an upgrade."""
+    """Phase in which the result was decided; None outside of an upgrade."""
     packet: int | None
-    """The current packet, from 1; None outside of the transfer."""
+    """Current packet, from 1; None outside of the transfer."""
     attempt: int
     """From 1; 0 without an upgrade."""
     text: str
-    """Description of the event, one or two sentences."""
+    """Description in one or two sentences."""
     likely: str = ""
-    """Likely cause; empty when nothing needs an explanation."""
+    """Likely cause; empty when none is needed."""
     remedy: str = ""
     """Next step; empty when none is needed."""
 
@@ -90,32 +88,32 @@ class StepKind(Enum):
     """Kind of a step, which decides how it is drawn."""
 
     MESSAGE = "message"
-    """An intact message, in the documents or not: an arrow from sender to receiver."""
+    """Intact message, documented or not: an arrow from sender to receiver."""
     DAMAGED = "damaged"
-    """Bytes without a valid message, on the id of sender and receiver."""
+    """Bytes without a valid message, on the CAN id of sender and receiver."""
     ERROR_FRAMES = "error frames"
     """Consecutive error frames; no sender."""
     GAP = "gap"
     """Notable silence of tool and device; no sender."""
     NOTE = "note"
-    """A remark of the explanation; no sender."""
+    """Remark of the explanation; no sender."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One message or one notable event."""
+    """Message or notable event in a story."""
 
     at_s: float
-    """Time of its last frame."""
+    """Time of the last frame."""
     kind: StepKind
     sender: str
-    """Name of the node ("CDL", "BMS"); empty without one."""
+    """Node name ("CDL", "BMS"); empty without one."""
     receiver: str
-    """Name of the node, "all" for a broadcast; empty without one."""
+    """Node name, "all" for a broadcast; empty without one."""
     title: str
     """"reset", "boot version", "packet", "NAK", ..."""
     text: str
-    """Its fields in words; may be empty."""
+    """Field labels and values; may be empty."""
     is_trouble: bool
     can_id: int | None = None
 
@@ -137,12 +135,12 @@ class PacketRun:
 
 
 StoryLine = Step | PacketRun
-"""An entry of a list of steps."""
+"""Entry in a list of steps."""
 
 
 @dataclass(frozen=True)
 class PhaseSpan:
-    """One phase of one attempt."""
+    """Phase of an attempt, from begin to end."""
 
     phase: Phase
     attempt: int
@@ -152,34 +150,34 @@ class PhaseSpan:
 
 @dataclass(slots=True)
 class PacketStory:
-    """One packet in one attempt."""
+    """Packet in an attempt: tries, NAKs, answer time."""
 
     number: int
     """From 1."""
     attempt: int
     tries: int
-    """Copies sent."""
+    """Number of copies sent."""
     naks: int
-    """NAKs for it."""
+    """Number of NAKs."""
     sent_at_s: float
-    """Last frame of its first copy."""
+    """Last frame of the first copy."""
     answered_at_s: float | None
-    """Time of its ACK; None without one."""
+    """Time of the ACK; None without one."""
     answer_s: float | None
     """From the last frame of the latest copy to the ACK; None without one."""
 
     @property
     def is_clean(self) -> bool:
-        """True while nothing went wrong with it."""
+        """True for a packet that was sent once and got no NAK."""
         return self.tries == 1 and not self.naks
 
 
 @dataclass(frozen=True)
 class UpgradeStory:
-    """One upgrade of one target, with all its attempts."""
+    """Upgrade of one target, with all its attempts."""
 
     target: str
-    """Name of the node in capitals."""
+    """Node name in capitals."""
     begin_s: float
     end_s: float
     image_size_bytes: int | None
@@ -187,9 +185,9 @@ class UpgradeStory:
     total_packets: int | None
     """From the packets; None without any."""
     boot_version: str | None
-    """Announced name and version; None if never announced."""
+    """Name and version of the bootloader; None if not announced."""
     running_version: str | None
-    """Version that the application answered after the upgrade; None without an answer."""
+    """Firmware version that the application answered after the upgrade; None without an answer."""
     attempts: int
     phases: tuple[PhaseSpan, ...]
     packets: tuple[PacketStory, ...]
@@ -198,15 +196,14 @@ class UpgradeStory:
     steps_left_out: int
     """Number of steps dropped."""
     link: LinkReport | None
-    """None when no packet was sent."""
+    """Bus usage; None if no packet was sent."""
     remarks: tuple[str, ...]
-    """Remarkable events, whatever the verdict: recovered restarts, error frames, queries,
-    SHUTDOWN."""
+    """Remarks besides the verdict: recovered restarts, error frames, queries, SHUTDOWN."""
     verdict: TraceVerdict
 
 
 class TalkerKind(Enum):
-    """Kind of a sender outside of the upgrades."""
+    """Kind of a sender outside of upgrades."""
 
     NODE = "node"
     FOREIGN = "foreign"
@@ -214,52 +211,52 @@ class TalkerKind(Enum):
 
 @dataclass(frozen=True)
 class Talker:
-    """One CAN id with traffic outside of the upgrades' dialogues."""
+    """CAN id with traffic that belongs to no upgrade."""
 
     can_id: int
     is_extended: bool
     name: str
-    """"BMS > all" for a node's id; empty for a foreign one."""
+    """"BMS > all" for a node's CAN id; empty for a foreign one."""
     frames: int
     kind: TalkerKind
 
 
 @dataclass(frozen=True)
 class BusFigures:
-    """The bus during the whole trace."""
+    """Bus load, error frames and damage during a whole trace."""
 
     duration_s: float
     """From the first frame to the last."""
     frames: int
-    """All frames, error frames not counted."""
+    """Number of frames, without error frames."""
     load: float | None
-    """Mean bus load, 0 to 1; None for a trace of no duration."""
+    """Mean bus load, 0 to 1; None for a trace without duration."""
     peak_load: float | None
     """Bus load in the busiest second; None for a shorter trace."""
     error_frames: int
     damaged: int
-    """Byte pieces on the drive system's ids without a valid message (wrong CRC, cut short ...)."""
+    """Stretches of bytes on documented CAN ids without a valid message (wrong CRC, incomplete)."""
     malformed: int
-    """Intact messages that the documents lack, or with content they forbid."""
+    """Intact messages that are not documented, or whose content breaks the document."""
     longest_gap_s: float
-    """The longest time without any frame."""
+    """Longest time without any frame."""
     longest_gap_at_s: float
-    """When it began."""
+    """Begin of that time."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Outcome that the flasher stored in a bundle's report.json."""
+    """Result of a command as stored in a bundle's report.json."""
 
     command: str
     exit_code: int | None
     error: str
-    """The reported error: what, where, likely cause, next step; may be empty."""
+    """Error of the command: what, where, likely cause, next step; may be empty."""
 
 
 @dataclass(frozen=True)
 class Story:
-    """Everything that a trace shows."""
+    """Explanation of a trace: bus figures, upgrades, other traffic and a verdict."""
 
     source: str
     """Name of the file or bundle, safe to show."""
@@ -269,7 +266,7 @@ class Story:
     """Wall time of the first frame in seconds since 1970; None if the format lacks it."""
     duration_s: float
     bitrate_bps: int
-    """Rate used to compute times on the wire."""
+    """Bit rate used to compute times on the wire."""
     frames: int
     bus: BusFigures
     upgrades: tuple[UpgradeStory, ...]
@@ -277,13 +274,13 @@ class Story:
     talkers: tuple[Talker, ...]
     """Most frames first."""
     verdict: TraceVerdict
-    """The first bad verdict among the last upgrades of each target; without an upgrade, what the
-    trace holds."""
+    """First bad verdict among the last upgrades of each target; without an upgrade, the content of
+    the trace."""
     steps: tuple[StoryLine, ...]
     """Messages outside of upgrades."""
     steps_left_out: int
     talkers_left_out: int = 0
     recorded: Recorded | None = None
-    """For a bundle only."""
+    """Set for a bundle."""
     damage: str = ""
-    """Where and why reading stopped; the story covers the part before."""
+    """Place and reason at which reading stopped; the story covers the part before."""

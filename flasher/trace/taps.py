@@ -1,4 +1,4 @@
-"""Taps of the driver: the flight recorder, and a filter that removes echoes.
+"""Driver taps: the flight recorder of the last frames, and a filter that removes echoes.
 
 The flight recorder always keeps the last frames in both directions, in a few megabytes. They are
 written only on request (`bundle`).
@@ -18,7 +18,7 @@ RING_FRAMES: Final = 20_000
 
 
 class Entry(NamedTuple):
-    """One frame: `at_s` on the driver's clock, and whether we sent it."""
+    """Recorded frame: `at_s` on the driver's clock, and whether this program sent it."""
 
     at_s: float
     frame: Frame
@@ -26,7 +26,7 @@ class Entry(NamedTuple):
 
 
 class FlightRecorder:
-    """A driver's tap that keeps the last `limit` frames, and counts all of them.
+    """Driver's tap that keeps the last `limit` frames, and counts all of them.
 
     `wall_offset_s` converts the driver's clock to seconds since 1970. It is measured once, at the
     first frame, so that a jump of the wall clock leaves no gap.
@@ -38,7 +38,7 @@ class FlightRecorder:
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._wall_clock = wall_clock
         self.frames = 0
-        """All frames so far, including those dropped from the ring."""
+        """Number of frames so far, including those dropped from the ring."""
         self.wall_offset_s: float | None = None
         """None before the first frame."""
 
@@ -56,26 +56,25 @@ class FlightRecorder:
 
     @property
     def last(self) -> Entry | None:
-        """The latest frame; None before the first."""
+        """Latest frame; None before the first."""
         return self._entries[-1] if self._entries else None
 
 
 class _Tap(Protocol):
-    """The same as `flasher.driver.Tap`."""
+    """Same as `flasher.driver.Tap`."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None: ...
 
 
-class Unechoed:
-    """A driver's tap that hides an adapter's echoes from other taps, so that a trace shows each
-    sent frame once. `taps` is called at each frame: more may be added later.
+class EchoFilter:
+    """Driver's tap that hides an adapter's echoes from other taps, so that a trace shows each sent
+    frame once. `taps` is called at each frame: more may be added later.
     """
 
     def __init__(self, taps: Callable[[], Sequence[_Tap]]) -> None:
         self._taps = taps
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Pass one frame on, unless it is an echo."""
         if frame.is_echo:
             return
         for tap in self._taps():

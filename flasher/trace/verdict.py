@@ -1,4 +1,4 @@
-"""Judges an observed upgrade: how it ended, where, the likely cause, the next step.
+"""Verdict on an upgrade in a trace: its result, phase, likely cause and next step.
 
 Causes that concern the whole bus (a second tool, no acknowledgement, two devices) are checked
 first, as their symptoms look like the fault of a phase.
@@ -16,15 +16,15 @@ from flasher.trace.story import Cause, TraceVerdict
 from flasher.wording import explanation
 
 _SILENT_S: Final = 1.0
-"""A tool silent for this long, when it should send, has stopped."""
+"""Silence after which a tool that should send has stopped."""
 _ACK_WAIT_S: Final = 0.4
-"""A packet without an answer for this long is unanswered, even if sent only once."""
+"""Silence after which a packet is unanswered, even if sent only once."""
 _RESETS: Final = 3
-"""This many unanswered resets are not the begin of a truncated trace."""
+"""Number of unanswered resets that are not the begin of a truncated trace."""
 _ERRORS: Final = 3
-"""This many error frames since the last progress are the reason, not a coincidence."""
+"""Number of error frames since the last progress that are the reason, not a coincidence."""
 _EXTRA_ACKS: Final = 3
-_DEAD_AGAIN: Final = frozenset({Cause.NO_BOOT_VERSION, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN})
+_NO_RETURN: Final = frozenset({Cause.NO_BOOT_VERSION, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN})
 
 
 class _Found(NamedTuple):
@@ -33,10 +33,10 @@ class _Found(NamedTuple):
 
 
 def judge(upgrade: ObservedUpgrade, until_s: float, *, is_alone: bool = False) -> TraceVerdict:
-    """The verdict. The trace continues until `until_s`; `is_alone` when only the tool sent
-    anything.
+    """Judge an upgrade in a trace that continues until `until_s`; `is_alone` means that only the
+    tool sent frames.
     """
-    found = _completed(upgrade) or _spoiled(upgrade, is_alone=is_alone)
+    found = _completed(upgrade) or _bus_cause(upgrade, is_alone=is_alone)
     if found is None:
         silent_s = until_s - upgrade.last_at_s
         match upgrade.phase:
@@ -48,7 +48,7 @@ def judge(upgrade: ObservedUpgrade, until_s: float, *, is_alone: bool = False) -
                 found = _at_end(upgrade)
             case _:
                 found = _before_update(upgrade, until_s)
-    if upgrade.earlier is not None and found.cause in _DEAD_AGAIN:
+    if upgrade.earlier is not None and found.cause in _NO_RETURN:
         # The device did not come back: what happened before says more than that.
         return replace(upgrade.earlier, text=f"{upgrade.earlier.text} Then: {found.text}")
     packet = upgrade.current if upgrade.phase is Phase.TRANSFER else None
@@ -83,7 +83,7 @@ def _completed(upgrade: ObservedUpgrade) -> _Found | None:
 
 
 def _is_other(upgrade: ObservedUpgrade) -> bool:
-    """True when the image holds exactly one version and the device answers another."""
+    """True if the image contains exactly one version and the device answers another."""
     known = upgrade.image_versions
     return len(known) == 1 and upgrade.running_version not in known
 
@@ -101,7 +101,7 @@ def _other_version(upgrade: ObservedUpgrade) -> _Found:
 # -- causes of the whole bus -----------------------------------------------------------------------
 
 
-def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
+def _bus_cause(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
     node = upgrade.target.node.name
     if upgrade.intrusions and not upgrade.is_one_tool:
         unexplained = "; ".join(upgrade.intrusions[:3])
@@ -233,7 +233,7 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
 
 
 def _stopped(text: str, silent_s: float) -> _Found:
-    """The verdict when the tool should have sent next: it stopped, or the recording did."""
+    """Verdict for a tool that should have sent next: it stopped, or the recording did."""
     if silent_s >= _SILENT_S:
         return _Found(Cause.TOOL_STOPPED, f"{text} The trace goes on for {silent_s:.2f} s.")
     return _Found(Cause.RECORDING_ENDS, text)
@@ -244,7 +244,7 @@ def _pieces(count: int) -> str:
 
 
 def _short(silent_s: float) -> str:
-    """Addition for a trace that ends before a wait is over."""
+    """Addition to the text of a trace that ends before a wait is over."""
     if silent_s >= _SILENT_S:
         return f" The trace goes on for {silent_s:.2f} s."
     return " The trace ends here: either the tool gave up, or the recording was stopped."
@@ -258,7 +258,7 @@ def _times(count: int) -> str:
 
 
 def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
-    """Remarks beside the verdict, without repeating it."""
+    """Return remarks besides the verdict, without repeating it."""
     found = []
     names = upgrade.boot_names
     if upgrade.restarts and cause is not Cause.DEVICE_RESTARTED:

@@ -1,4 +1,4 @@
-"""Passive bus watching: an engine that sends nothing, and the latest messages.
+"""Bus monitor engine that sends nothing, and a table of the latest messages.
 
 `Watcher` is driven like every other engine, so a live bus, the mock and a test share the same code;
 `replay` feeds it the frames of a file. `MessageTable` keeps the latest message of each kind, its
@@ -19,17 +19,17 @@ from flasher.trace.decoder import BusEvent, Decoder, Kind
 RATE_WINDOW_S: Final = 5.0
 """Period over which rates are counted."""
 CHANGE_SHOWN_S: Final = 1.0
-"""A changed field stays marked this long, or until it repeats unchanged later."""
+"""Time for which a changed field stays marked."""
 _RATE_SAMPLES: Final = 10_000
-"""Times kept for one rate: more than a bus carries in the window."""
+"""Maximum number of times kept for a rate: more than a bus carries in the window."""
 _AFTER_LAST_S: Final = 1.0
-"""A message incomplete this long after the last frame is cut short."""
+"""Time after the last frame at which an incomplete message counts as damaged."""
 _AT_ONCE: Final = float("-inf")
 
 
 @dataclass(frozen=True)
 class TimedFrame:
-    """A received frame, not decoded."""
+    """Received frame, not decoded."""
 
     at: float
     frame: Frame
@@ -37,36 +37,36 @@ class TimedFrame:
 
 @dataclass(frozen=True)
 class Pulse:
-    """A moment to refresh a screen."""
+    """Event at which a screen is refreshed."""
 
     at: float
 
 
 @dataclass(frozen=True)
 class Filter:
-    """Selects events; an empty part accepts everything.
+    """Selects events; an empty part accepts all.
 
-    `nodes` match senders and receivers, `words` match parts of titles, in either case.
+    `nodes` match senders and receivers, `words` match parts of titles, ignoring case.
     """
 
     nodes: frozenset[str] = frozenset()
     words: tuple[str, ...] = ()
     trouble_only: bool = False
 
-    def accepts(self, seen: BusEvent) -> bool:
-        if self.nodes and not self.nodes & {seen.sender, seen.receiver}:
+    def accepts(self, event: BusEvent) -> bool:
+        if self.nodes and not self.nodes & {event.sender, event.receiver}:
             return False
-        title = seen.title.lower()
+        title = event.title.lower()
         if self.words and not any(word.lower() in title for word in self.words):
             return False
-        return seen.is_trouble or not self.trouble_only
+        return event.is_trouble or not self.trouble_only
 
 
 EVERYTHING: Final = Filter()
 
 
 class Watcher:
-    """The engine. Its events are `BusEvent`, `TimedFrame` with `raw`, `Pulse` with `pulse_s`.
+    """Bus monitor engine. Its events are `BusEvent`, `TimedFrame` if `raw`, `Pulse` if `pulse_s`.
 
     Ends after `count` accepted events, or `duration_s` seconds after its first `tick`; otherwise it
     runs until it is cancelled.
@@ -94,7 +94,6 @@ class Watcher:
         self._cancelled = False
         self._events: list[object] = []
         self.frames = 0
-        """Frames received."""
 
     @property
     def done(self) -> bool:
@@ -142,9 +141,9 @@ class Watcher:
         return taken
 
     def _take(self, found: Iterable[BusEvent]) -> None:
-        for seen in found:
-            if self._left != 0 and self._filter.accepts(seen):
-                self._events.append(seen)
+        for event in found:
+            if self._left != 0 and self._filter.accepts(event):
+                self._events.append(event)
                 if self._left is not None:
                     self._left -= 1
 
@@ -175,7 +174,7 @@ def replay(
 
 
 def _pass_time(watcher: Watcher, until: float) -> None:
-    """Tick the watcher for everything due before `until`."""
+    """Tick the watcher for every deadline before `until`."""
     while (due := watcher.deadline()) is not None and due < until:
         watcher.tick(until if due == _AT_ONCE else due)
 
@@ -185,13 +184,13 @@ def _pass_time(watcher: Watcher, until: float) -> None:
 
 @dataclass
 class MessageHistory:
-    """The latest message of one kind, and its history."""
+    """Latest message of one kind, with count, rate and changes."""
 
-    seen: BusEvent
+    event: BusEvent
     count: int = 0
     first_at: float = 0.0
     changed_at: dict[str, float] = field(default_factory=dict)
-    """When each field last changed."""
+    """Time of each field's last change."""
     times: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_SAMPLES))
 
     def changed(self, now: float) -> set[str]:
@@ -199,7 +198,7 @@ class MessageHistory:
         return {name for name, at in self.changed_at.items() if now - at <= CHANGE_SHOWN_S}
 
     def rate_hz(self, now: float) -> float | None:
-        """Messages per second, over the last seconds; None before the second one."""
+        """Messages per second over the last seconds; None before the second message."""
         while self.times and now - self.times[0] > RATE_WINDOW_S:
             self.times.popleft()
         if self.count < 2:
@@ -212,9 +211,9 @@ Key = tuple[int, str, int]
 
 
 class MessageTable:
-    """The latest events, in the order of CAN ids and commands.
+    """Latest events, in the order of CAN ids and commands.
 
-    Anything but a message of the documents has one line for each kind and id, and foreign frames
+    Undocumented and damaged messages have one line for each kind and CAN id, and foreign frames
     share one line: a babbling bus cannot fill the memory.
     """
 
@@ -224,24 +223,24 @@ class MessageTable:
     def __len__(self) -> int:
         return len(self._lines)
 
-    def add(self, seen: BusEvent) -> frozenset[str]:
-        """Add an event; returns the names of the fields that changed."""
-        key = _key(seen)
+    def add(self, event: BusEvent) -> frozenset[str]:
+        """Add an event; return the names of the fields that changed."""
+        key = _key(event)
         line = self._lines.get(key)
         if line is None:
-            line = self._lines[key] = MessageHistory(seen, first_at=seen.at)
+            line = self._lines[key] = MessageHistory(event, first_at=event.at)
             changed = frozenset[str]()
         else:
-            before = {shown.name: shown.value for shown in line.seen.fields}
+            before = {shown.name: shown.value for shown in line.event.fields}
             changed = frozenset(
                 shown.name
-                for shown in seen.fields
+                for shown in event.fields
                 if shown.name not in before or before[shown.name] != shown.value
             )
-        line.seen = seen
+        line.event = event
         line.count += 1
-        line.times.append(seen.at)
-        line.changed_at.update(dict.fromkeys(changed, seen.at))
+        line.times.append(event.at)
+        line.changed_at.update(dict.fromkeys(changed, event.at))
         return changed
 
     def lines(self) -> Iterator[MessageHistory]:
@@ -249,9 +248,9 @@ class MessageTable:
             yield self._lines[key]
 
 
-def _key(seen: BusEvent) -> Key:
-    if seen.kind is Kind.MESSAGE and seen.command is not None:
-        return seen.can_id, "", seen.command
-    if seen.kind in (Kind.FOREIGN, Kind.ERROR_FRAME):
-        return 1 << 32, seen.kind.value, 0  # after everything else
-    return seen.can_id, seen.kind.value, 0
+def _key(event: BusEvent) -> Key:
+    if event.kind is Kind.MESSAGE and event.command is not None:
+        return event.can_id, "", event.command
+    if event.kind in (Kind.FOREIGN, Kind.ERROR_FRAME):
+        return 1 << 32, event.kind.value, 0  # after everything else
+    return event.can_id, event.kind.value, 0

@@ -333,7 +333,7 @@ class BenchController:
                 now = event.at
                 rows = tuple(
                     SeenMessage(
-                        line.seen, frozenset(line.changed(now)), line.count, line.rate_hz(now)
+                        line.event, frozenset(line.changed(now)), line.count, line.rate_hz(now)
                     )
                     for line in board.lines()
                 )

@@ -159,7 +159,7 @@ def test_the_same_message_with_the_same_title_of_two_nodes_has_two_lines() -> No
     frames = [*at(0.0, traffic.frames(0x712, 0x11, 0x3300, b"")),
               *at(0.1, traffic.frames(0x732, 0x11, 0x5200, b""))]  # fmt: skip
     board, _ = board_of(frames)
-    assert [line.seen.can_id for line in board.lines()] == [0x712, 0x732]
+    assert [line.event.can_id for line in board.lines()] == [0x712, 0x732]
 
 
 def test_the_rate_counts_the_last_five_seconds() -> None:
@@ -198,6 +198,6 @@ def test_lines_come_in_the_order_of_ids_with_foreign_frames_last() -> None:
     board, _ = board_of(frames)
 
     def title(line: MessageHistory) -> str:
-        return line.seen.title
+        return line.event.title
 
     assert list(map(title, board.lines())) == ["running information", "reset", "foreign frame"]

@@ -250,9 +250,9 @@ def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str
     wrapped = [
         part
         for line in lines
-        for shown in line.seen.fields
-        if line.seen.is_alarm and shown.name == "faults"
-        for part in wrap(f"FAULTS of the {line.seen.sender}: {shown.text}", width)
+        for shown in line.event.fields
+        if line.event.is_alarm and shown.name == "faults"
+        for part in wrap(f"FAULTS of the {line.event.sender}: {shown.text}", width)
     ]
     if len(wrapped) <= room:
         return wrapped
@@ -271,9 +271,9 @@ def _by_field(lines: list[MessageHistory], now: float, title: str, *, wide: bool
     for line in lines:
         changed = line.changed(now)
         head, tail = _head(line, wide=wide), _tail(line, now, wide=wide)
-        if not line.seen.in_dialect:
-            head[-1] = Text(line.seen.marked_title, no_wrap=False, overflow="fold")
-        for shown in line.seen.fields or (None,):
+        if not line.event.in_dialect:
+            head[-1] = Text(line.event.marked_title, no_wrap=False, overflow="fold")
+        for shown in line.event.fields or (None,):
             cells = [Text(), Text(), Text()] if shown is None else _cells(shown, changed)
             table.add_row(*head, *cells, *tail)
             head, tail = [Text()] * len(head), [Text()] * len(tail)
@@ -287,10 +287,10 @@ def _by_message(lines: list[MessageHistory], now: float, title: str, *, wide: bo
     for line in lines:
         changed = line.changed(now)
         words = []
-        for shown in line.seen.fields:
+        for shown in line.event.fields:
             mark, style = ("*", _CHANGED) if shown.name in changed else ("", "")
             words.append(Text(shown.words(mark=mark), style=style))
-        if not line.seen.in_dialect:  # first: text after it may be cut
+        if not line.event.in_dialect:  # first: text after it may be cut
             words.insert(0, Text(NOT_IN_DIALECT))
         fields = Text(", ").join(words)
         table.add_row(*_head(line, wide=wide), fields, *_tail(line, now, wide=wide))
@@ -335,7 +335,7 @@ def _column(
 
 
 def _head(line: MessageHistory, *, wide: bool) -> list[Text]:
-    seen = line.seen
+    seen = line.event
     style = _TROUBLE if seen.is_trouble else ""
     cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
     if wide:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flasher.bus.echoes import Echoes
 from flasher.protocol.frame import Frame
-from flasher.trace.taps import FlightRecorder, Unechoed
+from flasher.trace.taps import EchoFilter, FlightRecorder
 
 OWN = Frame(0x752, b"\x01")
 ANSWER = Frame(0x725, b"\x02")
@@ -12,7 +12,7 @@ ANSWER = Frame(0x725, b"\x02")
 
 def recorded(*frames: tuple[float, bool, Frame]) -> list[tuple[float, bool, Frame]]:
     flight, link = FlightRecorder(), Echoes()
-    tap = Unechoed(lambda: [flight])
+    tap = EchoFilter(lambda: [flight])
     for now, sent, frame in frames:
         if sent:
             link.sent(frame)
