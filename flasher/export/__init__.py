@@ -1,1 +1,1 @@
-"""Exports for engineers' tools: a Wireshark dissector, a DBC, decoded signals."""
+"""Exports for engineering tools: Wireshark dissector, DBC, decoded signals, trace formats."""

@@ -1,4 +1,4 @@
-"""Converts a trace to another format, with remarks on frames if the format has them."""
+"""Trace conversion to another format, with remarks on frames if the format supports them."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from flasher.trace.source import explain_path, frames_until_damage, trace_file
 from flasher.trace.story import Step, Story
 
 _Place = tuple[int | None, float]
-"""CAN id (None: any) and seconds since the first frame, exactly as in the story."""
+"""CAN id (None for any) and seconds since the first frame, exactly as in the story."""
 _ANY: Final = None
 
 
 @dataclass(frozen=True)
 class Converted:
-    """Result of a conversion."""
+    """Result of a trace conversion."""
 
     frames: int
     remarks: int
     """Number of frames with a remark."""
     damage: str
-    """Where and why reading stopped; empty at the end of the trace."""
+    """Place and reason at which reading stopped; empty at the end of the trace."""
 
 
-def convert(trace: Path, to: Path, *, called: Path) -> Converted:
-    """Write a trace in the format of `to`'s suffix; messages name it `called`. Raises UsageError,
+def convert(trace: Path, to: Path, *, name: Path) -> Converted:
+    """Write a trace in the format of `to`'s suffix; messages call it `name`. Raises UsageError,
     and OSError when the disk is full.
     """
     remarks: dict[_Place, list[str]] = {}
@@ -43,7 +43,7 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
         parts = (verdict.text, verdict.likely, verdict.remedy)
         writer = PcapngWriter(to, "\n".join(filter(None, parts)))
     else:
-        writer = writer_of(to, name=str(called))
+        writer = writer_of(to, name=str(name))
     damage: list[str] = []
     frames = remarked = 0
     start: float | None = None
@@ -67,13 +67,13 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
     return Converted(frames, remarked, " ".join(damage))
 
 
-def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
+def convert_joined(trace: Path, to: Path, *, name: Path) -> Converted:
     """Write each intact message of a trace as one CAN FD frame, as the DBC describes them. Raises
-    as `convert`.
+    UsageError and OSError like `convert`.
     """
     damage: list[str] = []
     frames = 0
-    writer = writer_of(to, name=str(called))
+    writer = writer_of(to, name=str(name))
     try:
         for message in joined_frames(frames_until_damage(trace_file(trace), damage)):
             writer(message)
@@ -84,7 +84,7 @@ def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
 
 
 def _remarks(story: Story) -> dict[_Place, list[str]]:
-    """Trouble, at the frame that showed it, and the end of each upgrade, at its last frame."""
+    """Return trouble at the frame that showed it, and the end of each upgrade at its last frame."""
     found: dict[_Place, list[str]] = defaultdict(list)
     upgrades = story.upgrades
     for line in (*story.steps, *(line for upgrade in upgrades for line in upgrade.steps)):

@@ -1,9 +1,9 @@
-"""DBC export of the messages.
+"""DBC export: message definitions for CANalyzer and similar tools.
 
 A DBC describes single frames and has no messages of several frames. So it describes each message as
-one CAN FD frame on the same id (`joined_frames` makes them from a trace): the first 64 bytes, from
-the header on, with the command as multiplexer. A DBC has no place for texts, bytes without a
-meaning of their own, bytes after byte 64, and the CRC, whose position varies.
+one CAN FD frame with the same id (`joined_frames` makes them from a trace): the first 64 bytes,
+from the header on, with the command as multiplexer. A DBC cannot describe texts, opaque bytes,
+bytes after byte 64, and the CRC, whose position varies.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FD_SIZE: Final = 64
 """Bytes of each frame: programs refuse frames shorter than the DBC states."""
 _DATA_AT: Final = PREFIX_SIZE + COMMAND_SIZE
 _NAME_MAX: Final = 32
-"""Characters of a name; longer ones go into an attribute, as Vector's tools write them."""
+"""Maximum length of a name; longer ones go into an attribute, as Vector's tools write them."""
 _LONG_NAME: Final = "SystemSignalLongSymbol"
 _COMMAND: Final = "command"
 _NODE_OF_ALL: Final = "Vector__XXX"
@@ -47,7 +47,7 @@ _COMMENT: Final = (
 @dataclass(frozen=True)
 class _Signal:
     name: str
-    """Its full name, unique in a message."""
+    """Full name, unique in a message."""
     mux: int
     start_bit: int
     bits: int
@@ -57,7 +57,7 @@ class _Signal:
 
 
 def dbc() -> str:
-    """The DBC as text, in both dialects."""
+    """Create the DBC text for the messages of both dialects."""
     described = _messages()
     names = _short_names(signal.name for signals, _ in described.values() for signal in signals)
     nodes = sorted({sender for sender, _ in ROUTES.values()})
@@ -96,7 +96,7 @@ def dbc() -> str:
 
 
 def _messages() -> dict[int, tuple[list[_Signal], dict[int, str]]]:
-    """Signals, and titles by commands, of each id that carries a message."""
+    """Return the signals, and the titles by command, of each CAN id with messages."""
     found: dict[int, tuple[list[_Signal], dict[int, str]]] = {}
 
     def add(can_id: int, command: int, title: str, layout: Iterable[tuple[str, Codec]]) -> None:
@@ -115,7 +115,7 @@ def _messages() -> dict[int, tuple[list[_Signal], dict[int, str]]]:
 
 
 def _signals(command: int, prefix: str, layout: Iterable[tuple[str, Codec]]) -> Iterator[_Signal]:
-    """Numbers and flags in the first 64 bytes."""
+    """Yield numbers and flags in the first 64 bytes."""
     at = _DATA_AT
     for name, codec in layout:
         size, bit, whole = codec.size_bytes, 8 * at, f"{prefix}_{name}"
@@ -152,7 +152,7 @@ def _declared(signal: _Signal, names: dict[str, str]) -> str:
 
 
 def _short_names(names: Iterable[str]) -> dict[str, str]:
-    """A unique name of at most 32 characters for each."""
+    """Map each name to a unique name of at most 32 characters."""
     short: dict[str, str] = {}
     numbers = count()
     for name in names:
@@ -186,7 +186,7 @@ def joined_frames(frames: Iterable[tuple[float, Frame]]) -> Iterator[can.Message
 
 
 def joined(message: Message, at_s: float) -> can.Message:
-    """One message as a CAN FD frame."""
+    """Convert a message to a CAN FD frame."""
     data = encode(message)[:FD_SIZE]
     return can.Message(
         timestamp=at_s,

@@ -1,4 +1,4 @@
-"""Writes decoded signals to a measurement file (ASAM MDF 4). Needs the extra `mf4`."""
+"""Signal export to a measurement file (ASAM MDF 4). Needs the extra `mf4`."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ class _Channel:
 
 @dataclass
 class _Group:
-    """The messages of one title, which share a time axis."""
+    """Messages of one title, which share a time axis."""
 
     times_s: list[float] = field(default_factory=list)
     channels: dict[str, _Channel] = field(default_factory=dict)
 
 
 def write_mf4(rows: Iterable[SignalRow], to: Path) -> int:
-    """Write the numbers and flags of all messages, a channel each; returns the number of channels.
+    """Write the numbers and flags of all messages; return the number of channels.
+
     Raises OSError.
     """
     groups: dict[str, _Group] = {}
@@ -63,7 +64,7 @@ def write_mf4(rows: Iterable[SignalRow], to: Path) -> int:
 
 
 def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
-    """Name, unit and value of everything that can be plotted."""
+    """Yield name, unit and value of each field that can be plotted."""
     prefix, command = key(event.title), event.command or 0
     item = BY_KEY.get((event.can_id, command))
     codecs = dict(

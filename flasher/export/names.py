@@ -11,5 +11,5 @@ _NO_WORD: Final = re.compile(r"[^a-z0-9]+")
 
 
 def key(title: str) -> str:
-    """A message title or the name of a bit as a part of such a name."""
+    """Convert a message title or flag name to a part of a value name."""
     return _NO_WORD.sub("_", title.lower()).strip("_")

@@ -1,4 +1,4 @@
-"""Traces as rows of values, one per message, for tables, notebooks and plots."""
+"""Signal export: traces as rows of values, one per message, for tables, notebooks and plots."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ Value = str | int | None
 FIXED_COLUMNS: Final = (
     "time_s", "stamp_s", "frame", "id", "sender", "receiver", "kind", "message",
 )  # fmt: skip
-"""Columns of every row; those of fields follow."""
+"""Columns of every row, followed by those of fields."""
 
 
 @dataclass(frozen=True)
 class SignalRow:
-    """One message, or one stretch of damaged bytes."""
+    """Message, or stretch of damaged bytes, with its time."""
 
     time_s: float
-    """Time of its last frame, since the first frame of the trace."""
+    """Time of the last frame in seconds since the first frame of the trace."""
     stamp_s: float
-    """The same as stored in the trace: since 1970, or since some start."""
+    """The same time as stored in the trace: since 1970, or since some start."""
     frame: int
-    """Number of the frame that completed it, from 1, as Wireshark counts."""
+    """Number of the frame that completed the message, from 1, as Wireshark counts."""
     event: BusEvent
 
     def values(self) -> dict[str, Any]:
-        """All values by column name; a list has a column for each of its values."""
+        """Values by column name; a list has a column for each of its values."""
         event = self.event
         fixed = (
             self.time_s, self.stamp_s, self.frame, f"{event.can_id:03X}", event.sender,
@@ -46,7 +46,7 @@ class SignalRow:
         return {**dict(zip(FIXED_COLUMNS, fixed, strict=True)), **dict(self.fields())}
 
     def fields(self) -> Iterator[tuple[str, Value]]:
-        """Names and values of the fields: `running_information.voltage_mv`."""
+        """Yield names and values of the fields, such as `running_information.voltage_mv`."""
         prefix = key(self.event.title)
         for field in self.event.fields:
             yield from _columns(f"{prefix}.{field.name}", field)
@@ -68,8 +68,8 @@ def rows(
     wanted: Callable[[str], bool] = lambda _title: True,
     damage: list[str] | None = None,
 ) -> Iterator[SignalRow]:
-    """The messages of a trace whose titles are `wanted`, ordered by their ends. `damage`, if given,
-    receives where reading stopped. Raises UsageError for a file that is not a trace.
+    """Yield the messages of a trace whose titles are `wanted`, ordered by their ends. The place at
+    which reading stopped is added to `damage`. Raises UsageError for a file that is not a trace.
     """
     decoder = TimedDecoder()
     first_s: float | None = None
@@ -94,7 +94,7 @@ def rows(
 
 
 def csv_text(rows: Sequence[SignalRow]) -> str:
-    """A table with a column for each field of the rows."""
+    """Format rows as CSV with a column for each field."""
     file = io.StringIO()
     lines = [row.values() for row in rows]
     columns = dict.fromkeys((*FIXED_COLUMNS, *(name for line in lines for name in line)))
@@ -112,7 +112,7 @@ def _cell(value: Value | float) -> str:
 
 
 def trace_rows(trace: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
-    """The messages of a trace as rows for a table: `pandas.DataFrame(trace_rows(path))`.
+    """Yield the messages of a trace as rows for a table: `pandas.DataFrame(trace_rows(path))`.
 
     Columns are time_s (since the first frame), stamp_s (as in the file), frame (its number, as in
     Wireshark), id, sender, receiver, kind, message, and one for each field, with its unit in the

@@ -1,8 +1,8 @@
 """Generator of the Wireshark dissector `welling.lua`.
 
-Ids, messages, fields, time limits and sentences come from the program's own tables. The script
-implements only what tables cannot hold: reassembly as in `flasher.protocol.wire`, the course of an
-upgrade as in `flasher.trace.observed_upgrade`. The tests compare tshark's result with this
+CAN ids, messages, fields, time limits and texts come from the program's own tables. The script
+implements only what tables cannot express: reassembly as in `flasher.protocol.wire`, the course of
+an upgrade as in `flasher.trace.observed_upgrade`. The tests compare tshark's result with this
 program's decoder.
 """
 
@@ -47,13 +47,13 @@ _ANSWERS: Final[dict[type[messages.UpgradeMessage], tuple[type[messages.UpgradeM
     messages.Packet: (messages.Ack, messages.Nak),
     messages.EndOfTransfer: (messages.Complete, messages.Nak),
 }
-"""Answers of a bootloader (4.1)."""
+"""Answers of a bootloader (table 9)."""
 _OWN_FILTERS: Final = {"number": "packet", "total": "packets"}
 """Upgrade fields that a packet, its ACK and its NAK share as one filter."""
 
 
 def dissector(version: str) -> str:
-    """The script, for Wireshark from 4.0 on; `version` is this program's."""
+    """Create the script, for Wireshark from 4.0 on; `version` is this program's."""
     script = (files("flasher.export") / _SCRIPT).read_text(encoding="utf-8")
     assert script.count(_MARK) == 1  # noqa: S101  the two files belong together
     return script.replace(_MARK, _lua({"version": version, **_tables()}))
@@ -103,7 +103,7 @@ def _tables() -> dict[str, Any]:
 
 
 def _item(item: Item) -> dict[str, Any]:
-    """A message of chapter 3."""
+    """Convert an application message to a table."""
     answer = answer_of(item)
     return {
         "id": item.can_id,
@@ -120,7 +120,7 @@ def _item(item: Item) -> dict[str, Any]:
 
 
 def _row(row: type[messages.UpgradeMessage]) -> dict[str, Any]:
-    """An upgrade message with the values that its fields allow."""
+    """Convert an upgrade message to a table, with the values that its fields allow."""
     title = TITLES[row]
     return {
         "command": row.COMMAND.value,
@@ -160,7 +160,7 @@ def _field(filter_name: str, name: str, codec: Codec) -> dict[str, Any]:
 
 
 def _kind(filter_name: str, codec: Codec) -> dict[str, Any]:
-    """The decoder of a field's bytes in Lua."""
+    """Return the decoder of a field's bytes in Lua."""
     match codec:
         case AddressField():
             return {"kind": "address"}
@@ -193,7 +193,7 @@ def _bit(codec: FlagsField, mask: int) -> dict[str, Any]:
 
 
 def _lua(value: object, indent: str = "") -> str:
-    """A value in Lua syntax."""
+    """Format a value in Lua syntax."""
     deeper = f"{indent}  "
     match value:
         case bool():

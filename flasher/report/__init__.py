@@ -1,1 +1,1 @@
-"""Self-contained HTML pages with charts, and JUnit XML."""
+"""Reports: self-contained HTML pages with charts, and JUnit XML."""

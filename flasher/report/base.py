@@ -1,4 +1,4 @@
-"""HTML rendering: templates, escaping, and the parts common to all pages.
+"""HTML rendering: template environment, escaping, and filters common to all pages.
 
 A page is one file with its style inside, without scripts or external resources (its
 Content-Security-Policy forbids both). Every value passes HTML escaping and `visible`, which escapes
@@ -20,12 +20,12 @@ from flasher.translation import Translator, translator
 from flasher.wording import wording
 
 TEXT_LIMIT: Final = 400
-"""Characters of one text on a page; longer ones end in an ellipsis."""
+"""Maximum number of characters of a text on a page; longer ones end in an ellipsis."""
 _UNSAFE_CATEGORIES: Final = ("C", "M", "Zl", "Zp")
-"""Unicode: control, format (text direction), surrogates, unassigned; combining marks; separators
-of lines and paragraphs."""
+"""Unicode categories: control, format (text direction), surrogates, unassigned; combining marks;
+separators of lines and paragraphs."""
 PAGE_STYLE: Final = Path(__file__).parent / "templates" / "page.css"
-"""The style sheet of all documents."""
+"""Style sheet of all documents."""
 _ELLIPSIS: Final = "\N{HORIZONTAL ELLIPSIS}"
 
 
@@ -39,7 +39,7 @@ class Status(Enum):
 
 
 def visible(text: str) -> str:
-    """Escape characters without a shape of their own; newline and tab are kept."""
+    """Escape invisible and combining characters; newline and tab are kept."""
     return "".join(
         char.encode("unicode_escape").decode()
         if unicodedata.category(char).startswith(_UNSAFE_CATEGORIES) and char not in "\n\t"
@@ -49,17 +49,17 @@ def visible(text: str) -> str:
 
 
 def shortened(text: str, limit: int = TEXT_LIMIT) -> str:
-    """Cut `text` to `limit` characters with an ellipsis."""
+    """Truncate `text` to `limit` characters with an ellipsis."""
     return text if len(text) <= limit else text[: limit - 1].rstrip() + _ELLIPSIS
 
 
 def counted(number: int) -> str:
-    """A whole number with commas: 65,535."""
+    """Format a whole number with commas: 65,535."""
     return f"{number:,}"
 
 
 def percent(share: float) -> str:
-    """A share of 1 in percent: 87 %, 0.4 %, 0 %; more than the whole line gives a text."""
+    """Format a share of 1 in percent: 87 %, 0.4 %, 0 %; a share above 1 as text."""
     if share > 1.02:  # time stamps are wrong by less
         return "more than the line carries"
     value = min(share, 1) * 100
@@ -67,7 +67,7 @@ def percent(share: float) -> str:
 
 
 def render_page(template: str, language: str = "en", **context: Any) -> str:
-    """Render `template` (a file in `templates/`) with `context` in a language.
+    """Render a template of `templates/` with `context` in a language.
 
     Raises jinja2.UndefinedError for a name missing from `context`.
     """
@@ -80,8 +80,8 @@ def _finalize(value: object) -> object:
 
 
 def environment(loader: BaseLoader, translate: Translator) -> Environment:
-    """The template environment for `loader` in a language; its templates raise what `render_page`
-    does. They have `_` (translation) and `lang`.
+    """Create the template environment of a language. It has the globals `_` (translation) and
+    `lang`; its templates raise jinja2.UndefinedError for a missing name.
     """
     made = Environment(
         loader=loader,

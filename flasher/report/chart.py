@@ -1,9 +1,8 @@
-"""Chart layout: positions of every dot, bar and tick; `templates/charts.html` draws them.
+"""Chart layout: answer times by packet number, histograms, distributions on one line.
 
-Answer time over packet number, a histogram, and a distribution on one line.
-
-Pure functions. A chart has a width in CSS pixels, so that its text has its full size on phones and
-desktops (`WIDTHS`). Long series are drawn as stretches, so that a chart has a bounded size.
+Pure functions; `templates/charts.html` draws their results. A chart has a width in CSS pixels, so
+that its text has its full size on phones and desktops (`WIDTHS`). Long series are drawn as
+stretches, so that a chart has a bounded size.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from flasher.report.scale import Axis, Tick, duration_text, linear_ticks, slices
 from flasher.trace.figures import Distribution, Ranked
 
 WIDTHS: Final = {"wide": 880, "narrow": 340}
-"""Drawing width for each class of the style sheet; a page holds both and shows one."""
+"""Drawing width by class of the style sheet; a page contains both drawings and shows one."""
 _DOTS_PER_WIDTH: Final = 0.5
-"""Beyond this many samples a pixel, stretches show minimum, median and maximum."""
+"""Samples per pixel above which stretches show minimum, median and maximum."""
 _STRETCH_WIDTH: Final = 6
 _LEFT: Final = 58
 _RIGHT: Final = 14
@@ -38,7 +37,7 @@ _SPREAD_HEIGHT: Final = 54
 
 
 class ChartArea(NamedTuple):
-    """The drawing and the area inside its axes, in CSS pixels."""
+    """Size of a drawing, and the area inside its axes, in CSS pixels."""
 
     width: float
     height: float
@@ -50,9 +49,7 @@ class ChartArea(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """One packet: its number, the time of its answer in seconds (None: no answer), its repetitions
-    and its NAKs.
-    """
+    """Packet with its answer time in seconds (None without an answer), repetitions and NAKs."""
 
     number: int
     seconds: float | None
@@ -61,7 +58,7 @@ class Sample:
 
 
 class MarkKind(Enum):
-    """Meaning of a mark under the plot; the value is its word."""
+    """Kind of a mark below the plot; the value is its name."""
 
     REPEATED = "repeated"
     NAK = "NAK"
@@ -69,12 +66,12 @@ class MarkKind(Enum):
 
     @property
     def short(self) -> str:
-        """A word that fits left of the plot."""
+        """Name that fits left of the plot."""
         return {"repeated": "again", "NAK": "NAK", "no answer": "silent"}[self.value]
 
 
 class Mark(NamedTuple):
-    """An event of one packet, or of some in a stretch."""
+    """Mark of a packet, or of some packets in a stretch."""
 
     x: float
     kind: MarkKind
@@ -82,7 +79,7 @@ class Mark(NamedTuple):
 
 
 class Lane(NamedTuple):
-    """A row of marks of one kind."""
+    """Row of marks of one kind."""
 
     kind: MarkKind
     y: float
@@ -90,7 +87,7 @@ class Lane(NamedTuple):
 
 
 class Dot(NamedTuple):
-    """One answer."""
+    """Answer time of a packet."""
 
     x: float
     y: float
@@ -98,7 +95,7 @@ class Dot(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """The answers of some packets in a row: from the fastest to the slowest, and the median."""
+    """Answer times of consecutive packets: fastest, slowest and median."""
 
     x: float
     top: float
@@ -110,7 +107,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class LatencyChart:
-    """Answer time over packet number."""
+    """Chart of answer time over packet number."""
 
     frame: ChartArea
     x_ticks: tuple[Tick, ...]
@@ -119,13 +116,13 @@ class LatencyChart:
     stretches: tuple[Stretch, ...]
     lanes: tuple[Lane, ...]
     per_stretch: int
-    """At most this many packets in one stretch; 1 where each packet has its dot."""
+    """Maximum number of packets in a stretch; 1 for a chart of dots."""
     description: str
 
 
 def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
-    """Lay out the chart of these packets, in order, `width` CSS pixels wide. Raises ValueError for
-    none.
+    """Lay out the answer times of packets, in order, `width` CSS pixels wide. Raises ValueError
+    without packets.
     """
     if not samples:
         raise ValueError("no packets")
@@ -159,7 +156,7 @@ def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
 
 
 def _places(count: int, frame: ChartArea) -> Callable[[float], float]:
-    """Position of the sample with an index."""
+    """Return a function from the index of a sample to its position."""
     begin, end = frame.left + 4, frame.right - 4
     if count == 1:
         return lambda _: (begin + end) / 2
@@ -167,7 +164,7 @@ def _places(count: int, frame: ChartArea) -> Callable[[float], float]:
 
 
 def _number_ticks(samples: Sequence[Sample], frame: ChartArea) -> Iterable[Tick]:
-    """Ticks at round packet numbers; where numbers are missing, at round counts of packets."""
+    """Yield ticks at round packet numbers, or at round counts of packets if numbers are missing."""
     begin, end, intervals = frame.left + 4, frame.right - 4, _intervals_for(frame.width)
     first, last = samples[0].number, samples[-1].number
     if last - first == len(samples) - 1:
@@ -248,7 +245,7 @@ def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
 
 
 class HistogramBar(NamedTuple):
-    """One bin of a histogram."""
+    """Bar of a histogram."""
 
     x: float
     y: float
@@ -259,7 +256,7 @@ class HistogramBar(NamedTuple):
 
 @dataclass(frozen=True)
 class HistogramChart:
-    """Value counts in bins; `x_axis` has the values, `y_ticks` the counts."""
+    """Histogram; `x_axis` has the values, `y_ticks` the counts."""
 
     frame: ChartArea
     x_axis: Axis
@@ -269,9 +266,9 @@ class HistogramChart:
 
 
 def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> HistogramChart:
-    """Lay out a histogram of times in seconds (or of value counts), `width` CSS pixels wide. Bins
-    have one width on paper: on a logarithmic axis they grow with the values. Raises ValueError for
-    no values.
+    """Lay out a histogram of times in seconds (or of value counts), `width` CSS pixels wide. Bars
+    have equal width: on a logarithmic axis bins grow with the values. Raises ValueError without
+    values.
     """
     times = Counter(values)
     if not times:
@@ -307,14 +304,14 @@ def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> Hi
 
 
 def _value_at(axis: Axis, share: float) -> float:
-    """The value at this share of the way along the axis."""
+    """Value at a share of the axis length."""
     if axis.is_log:
         return axis.low * math.pow(axis.high / axis.low, share)
     return axis.low + (axis.high - axis.low) * share
 
 
 class Figure(NamedTuple):
-    """A named value of a spread."""
+    """Named value of a distribution."""
 
     name: str
     value_s: float
@@ -323,7 +320,7 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class Spread:
-    """A distribution on one line, from minimum to maximum."""
+    """Distribution drawn on one line, from minimum to maximum."""
 
     frame: ChartArea
     x_axis: Axis

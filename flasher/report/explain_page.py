@@ -1,7 +1,7 @@
 """HTML page of `flasher explain --html`: the story of a trace.
 
-`render` arranges; the templates print. Everything that could grow with the trace (steps, packets
-with trouble, talkers, upgrades) is limited, and the page shows how much was left out.
+Python arranges, the templates print. Lists that grow with the trace (steps, packets with trouble,
+senders, upgrades) are limited, and the page shows how much was left out.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from flasher.translation import ENGLISH, Translator
 from flasher.wording import wording
 
 UPGRADES_SHOWN: Final = 8
-"""Upgrades of one trace drawn in full; the others have a line in a table."""
+"""Maximum number of upgrades shown in full; the others have a line in a table."""
 ATTEMPTS_DRAWN: Final = 3
-"""Last attempts with a latency chart; with several upgrades only the last one."""
+"""Number of last attempts with a chart of answer times; 1 with several upgrades."""
 PACKETS_SHOWN: Final = 200
-"""Packets with trouble that are listed, over all upgrades."""
+"""Maximum number of listed packets with trouble, over all upgrades."""
 TALKERS_SHOWN: Final = 100
 REMARKS_SHOWN: Final = 40
 _LIFELINES: Final = 4
@@ -53,11 +53,11 @@ _WORDS: Final = {
 }
 
 Drawings = dict[str, chart.LatencyChart]
-"""One drawing for each width."""
+"""Drawings by width."""
 
 
 class PhaseRow(NamedTuple):
-    """A phase, with its position as shares of the upgrade."""
+    """Phase of an upgrade, with its position as shares of the upgrade."""
 
     name: str
     attempt: int
@@ -68,7 +68,7 @@ class PhaseRow(NamedTuple):
 
 
 class SpreadRow(NamedTuple):
-    """A distribution of the link report, with its drawings; None without data."""
+    """Distribution of the link report, with its drawings; None without data."""
 
     name: str
     distribution: Distribution | None
@@ -76,22 +76,22 @@ class SpreadRow(NamedTuple):
 
 
 class LatencyView(NamedTuple):
-    """The latency chart of one attempt."""
+    """Chart of the answer times in an attempt."""
 
     attempt: int
     drawings: Drawings
 
 
-class _Room(NamedTuple):
-    """Limits for one upgrade on the page."""
+class _Limits(NamedTuple):
+    """Limits for each upgrade on the page."""
 
     items: int
     attempts: int
     packets: int
 
     @classmethod
-    def for_upgrades(cls, count: int) -> _Room:
-        """The limits for each of `count` upgrades."""
+    def for_upgrades(cls, count: int) -> _Limits:
+        """Create the limits for a page with `count` upgrades."""
         if count <= 1:
             return cls(sequence.ITEMS_SHOWN, ATTEMPTS_DRAWN, PACKETS_SHOWN)
         items = max(_ITEMS_LEAST, sequence.ITEMS_SHOWN // count)
@@ -100,7 +100,7 @@ class _Room(NamedTuple):
 
 @dataclass(frozen=True)
 class UpgradeView:
-    """Template data of one upgrade."""
+    """Template data of an upgrade."""
 
     story: UpgradeStory
     status: Status
@@ -110,40 +110,40 @@ class UpgradeView:
     latencies: tuple[LatencyView, ...]
     spreads: tuple[SpreadRow, ...]
     histogram: dict[str, chart.HistogramChart] | None
-    """Answer times of packets sent once; None for only a few."""
+    """Answer times of packets sent once; None for too few."""
     troubled: tuple[PacketStory, ...]
     troubled_count: int
     remarks: tuple[str, ...]
 
 
 def render(story: Story) -> str:
-    """The whole page as HTML text."""
+    """Render the page as HTML text."""
     return render_page("explain.html", **story_context(story, ENGLISH))
 
 
 def story_context(story: Story, translate: Translator) -> dict[str, Any]:
-    """Data for the page's template. `translate`: for texts that are laid out here."""
+    """Create the template data of the page. `translate` is for texts that are laid out here."""
     shown = story.upgrades[:UPGRADES_SHOWN]
-    room = _Room.for_upgrades(len(shown))
+    limits = _Limits.for_upgrades(len(shown))
     status = status_of(story.verdict.cause)
     return {
         "story": story,
         "status": status,
         "word": _WORDS[status],
         "started": _wall_text(story.started_at),
-        "upgrades": [_view(upgrade, room, translate) for upgrade in shown],
+        "upgrades": [_view(upgrade, limits, translate) for upgrade in shown],
         "more_upgrades": [
             (upgrade, status_of(upgrade.verdict.cause))
             for upgrade in story.upgrades[UPGRADES_SHOWN:]
         ],
-        "outside": _drawn(story.steps, "", room.items, translate),
+        "outside": _diagrams(story.steps, "", limits.items, translate),
         "talkers": story.talkers[:TALKERS_SHOWN],
         "talkers_left_out": story.talkers_left_out + max(0, len(story.talkers) - TALKERS_SHOWN),
     }
 
 
 def status_of(cause: Cause) -> Status:
-    """Rate the end of an upgrade."""
+    """Rate the result of an upgrade."""
     if cause.is_good:
         return Status.GOOD
     if not cause.is_upgrade:
@@ -152,7 +152,7 @@ def status_of(cause: Cause) -> Status:
 
 
 def _wall_text(seconds: float | None) -> str:
-    """Wall time as text; empty for none, or outside the calendar."""
+    """Format wall time; empty for None, and for times outside the calendar."""
     if seconds is None:
         return ""
     try:
@@ -161,7 +161,7 @@ def _wall_text(seconds: float | None) -> str:
         return ""
 
 
-def _view(upgrade: UpgradeStory, room: _Room, translate: Translator) -> UpgradeView:
+def _view(upgrade: UpgradeStory, limits: _Limits, translate: Translator) -> UpgradeView:
     status = status_of(upgrade.verdict.cause)
     troubled = [each for each in upgrade.packets if not each.is_clean or each.answered_at_s is None]
     more = len(upgrade.remarks) - REMARKS_SHOWN
@@ -171,11 +171,11 @@ def _view(upgrade: UpgradeStory, room: _Room, translate: Translator) -> UpgradeV
         status=status,
         word=_WORDS[status],
         phases=tuple(_phases(upgrade)),
-        sequence=_drawn(upgrade.steps, upgrade.target, room.items, translate),
-        latencies=tuple(_latencies(upgrade.packets, room.attempts)),
+        sequence=_diagrams(upgrade.steps, upgrade.target, limits.items, translate),
+        latencies=tuple(_latencies(upgrade.packets, limits.attempts)),
         spreads=tuple(_spreads(upgrade)),
         histogram=_histogram(upgrade.packets),
-        troubled=tuple(troubled[: room.packets]),
+        troubled=tuple(troubled[: limits.packets]),
         troubled_count=len(troubled),
         remarks=(*remarks, f"{more:,} more remarks") if more > 0 else remarks,
     )
@@ -201,7 +201,7 @@ def _share(value: float) -> float:
 
 
 def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyView]:
-    """A chart for each of the last attempts with packets."""
+    """Yield a chart for each of the last attempts with packets."""
     by_attempt: dict[int, list[chart.Sample]] = {}
     for packet in packets:
         sample = chart.Sample(packet.number, packet.answer_s, packet.tries - 1, packet.naks)
@@ -236,10 +236,10 @@ def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
 # -- steps as a sequence diagram ------------------------------------------------------------------
 
 
-def _drawn(
+def _diagrams(
     lines: Sequence[StoryLine], target: str, most: int, translate: Translator
 ) -> dict[str, list[sequence.Part]]:
-    """The diagram of these steps for each width."""
+    """Lay out the sequence diagram of steps for each width."""
     participants = _participants(lines, target)
     items = sequence.thinned([_item(line, participants, translate) for line in lines], most)
     return {
@@ -249,7 +249,7 @@ def _drawn(
 
 
 def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
-    """The tool, the target, then the names used most; the rest are combined."""
+    """Return tool, target, and the most frequent names; the rest are combined."""
     named = Counter(
         name
         for line in lines
@@ -259,9 +259,9 @@ def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
     )
     tool = any(isinstance(line, Step) and _TOOL in (line.sender, line.receiver) for line in lines)
     first = [_TOOL, target] if target else [_TOOL] * (tool or not named)
-    room = _LIFELINES - len(first)
-    others = [name for name, _ in named.most_common(room)]
-    if len(named) > room:
+    free = _LIFELINES - len(first)
+    others = [name for name, _ in named.most_common(free)]
+    if len(named) > free:
         others[-1:] = [_OTHERS]
     return [*first, *others]
 

@@ -11,11 +11,11 @@ from typing import Final
 from flasher.errors import printable
 
 TEXT_LIMIT: Final = 2000
-"""Characters of one text; what is longer is cut."""
+"""Maximum number of characters of a text; the rest is cut off."""
 
 
 class JUnitResult(Enum):
-    """Result of a test case; the value is its element."""
+    """Result of a test case; the value is its XML element."""
 
     PASSED = ""
     FAILURE = "failure"
@@ -25,7 +25,7 @@ class JUnitResult(Enum):
 
 @dataclass(frozen=True)
 class JUnitCase:
-    """One test case; `message`, `type` and `details` explain why it did not pass."""
+    """Test case; `message`, `type` and `details` explain why it did not pass."""
 
     classname: str
     name: str
@@ -41,7 +41,7 @@ class JUnitCase:
 
 @dataclass(frozen=True)
 class JUnitSuite:
-    """A group of test cases."""
+    """Group of test cases."""
 
     name: str
     cases: Sequence[JUnitCase]
@@ -50,7 +50,7 @@ class JUnitSuite:
 
 
 def junit_xml(name: str, suites: Iterable[JUnitSuite], time_s: float | None = None) -> bytes:
-    """Render the suites; `time_s` is the total duration, by default the sum of the cases."""
+    """Write the suites as XML; `time_s` is the total duration, by default the sum of the cases."""
     root = ET.Element("testsuites", name=_safe(name))
     root.extend(map(_suite, suites))
     # The schema has no "skipped" here.
@@ -105,5 +105,5 @@ def _case(case: JUnitCase) -> ET.Element:
 
 
 def _safe(text: str) -> str:
-    """Text that XML can hold: no control characters except line ends, limited in length."""
+    """Truncate a text and escape control characters except line ends, which XML does not allow."""
     return "\n".join(printable(line) for line in text[:TEXT_LIMIT].split("\n"))

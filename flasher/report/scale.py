@@ -1,4 +1,4 @@
-"""Axes of charts: ticks, labels and positions.
+"""Chart axes: ticks, labels and positions.
 
 Pure functions; lengths on paper are in units of the drawing, values in units of the caller.
 """
@@ -11,26 +11,26 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 LOG_RANGE: Final = 30.0
-"""A range of values wider than this factor uses a logarithmic scale."""
+"""Ratio of largest to smallest value above which a scale is logarithmic."""
 _STEPS: Final = (1, 2, 5, 10)
-"""Round steps, times a power of ten."""
+"""Round tick distances, times a power of ten."""
 _ROUNDING: Final = 1e-9
 _UNITS: Final = (("s", 1.0), ("ms", 1e-3), ("\N{MICRO SIGN}s", 1e-6))
-_LEAST: Final = 1e-12
+_ZERO_BELOW: Final = 1e-12
 """Smaller values count as 0: no clock measures them."""
-_SAME: Final = 1e-6
+_EQUAL_WITHIN: Final = 1e-6
 """Values closer than this share count as equal: no tick could separate them."""
 
 
 class Tick(NamedTuple):
-    """A mark of an axis: its value and position."""
+    """Tick of an axis: its value and position."""
 
     value: float
     at: float
 
 
 def nice_step(span: float, intervals: int) -> float:
-    """The smallest step of 1, 2 or 5 times a power of ten that divides `span` into at most
+    """Return the smallest of 1, 2 or 5 times a power of ten that divides `span` into at most
     `intervals`. Raises ValueError unless both are positive.
     """
     if span <= 0 or intervals <= 0:
@@ -44,9 +44,9 @@ def nice_step(span: float, intervals: int) -> float:
 
 
 def linear_ticks(low: float, high: float, intervals: int = 5) -> list[float]:
-    """At least two round values, from at or below `low` to at or above `high`."""
-    if high - low <= max(_SAME * max(abs(low), abs(high)), _LEAST):
-        high = low + (abs(low) if abs(low) > _LEAST else 1.0)
+    """Return at least two round values, from at or below `low` to at or above `high`."""
+    if high - low <= max(_EQUAL_WITHIN * max(abs(low), abs(high)), _ZERO_BELOW):
+        high = low + (abs(low) if abs(low) > _ZERO_BELOW else 1.0)
     step = nice_step(high - low, intervals)
     first = math.floor(low / step + _ROUNDING)
     last = math.ceil(high / step - _ROUNDING)
@@ -54,8 +54,8 @@ def linear_ticks(low: float, high: float, intervals: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float, intervals: int = 9) -> list[float]:
-    """1, 2, 5 times the powers of ten around `low` to `high`; beyond `intervals` only the powers,
-    or every second, third, ... of them.
+    """Return 1, 2, 5 times the powers of ten around `low` to `high`; for more than `intervals` only
+    the powers, or every second, third, ... of them.
 
     Raises ValueError unless 0 < low <= high.
     """
@@ -75,14 +75,14 @@ def log_ticks(low: float, high: float, intervals: int = 9) -> list[float]:
 
 
 def wants_log(values: Iterable[float]) -> bool:
-    """True when all values are positive and a linear axis would hide the small ones."""
+    """True if all values are positive and a linear axis would hide the small ones."""
     kept = list(values)
-    return bool(kept) and min(kept) > _LEAST and max(kept) / min(kept) > LOG_RANGE
+    return bool(kept) and min(kept) > _ZERO_BELOW and max(kept) / min(kept) > LOG_RANGE
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Maps values to positions from `begin` to `end` on paper; `end` may be less than `begin`."""
+    """Axis that maps values to positions from `begin` to `end`, which may be less than `begin`."""
 
     low: float
     high: float
@@ -101,8 +101,8 @@ class Axis:
         from_zero: bool = False,
         intervals: int = 5,
     ) -> Axis:
-        """An axis for `values`, logarithmic if the range needs it. `from_zero` starts a linear one
-        at 0. Without values it goes from 0 to 1.
+        """Create an axis for `values`, logarithmic if their range needs it. `from_zero` starts a
+        linear one at 0. Without values it goes from 0 to 1.
         """
         kept = list(values) or [0.0, 1.0]
         is_log = wants_log(kept)
@@ -125,8 +125,8 @@ class Axis:
         return self.begin + share * (self.end - self.begin)
 
     def duration_label(self, seconds: float) -> str:
-        """Label of a tick of a time axis; on a linear axis all have one unit and enough decimals to
-        differ.
+        """Label of a tick on a time axis; on a linear axis all labels have one unit and enough
+        decimals to differ.
         """
         if self.is_log or len(self.ticks) < 2 or self.high < 0:
             return duration_text(seconds)
@@ -139,7 +139,7 @@ class Axis:
 
 
 def whole_ticks(first: int, last: int, begin: float, end: float, intervals: int = 6) -> list[Tick]:
-    """Ticks at whole numbers from `first` to `last`, such as packet numbers; always includes
+    """Return ticks at whole numbers from `first` to `last`, such as packet numbers, always with
     `first`.
     """
     if last <= first:
@@ -153,7 +153,7 @@ def whole_ticks(first: int, last: int, begin: float, end: float, intervals: int 
 
 
 def slices(count: int, most: int) -> list[tuple[int, int]]:
-    """Divide `count` things into at most `most` stretches of similar length: begin and end
+    """Divide `count` things into at most `most` stretches of similar length; return begin and end
     (exclusive) of each.
     """
     parts = min(count, most)
@@ -161,7 +161,7 @@ def slices(count: int, most: int) -> list[tuple[int, int]]:
 
 
 def duration_text(seconds: float | None) -> str:
-    """A duration with three digits and a suitable unit: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
+    """Format a duration with three digits and a unit: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
     if seconds is None:
         return "\N{EN DASH}"
     size = abs(seconds)
@@ -171,19 +171,19 @@ def duration_text(seconds: float | None) -> str:
     if size == 0:
         return "0 s"
     if size >= 0.9995:
-        return f"{_three(seconds)} s"
+        return f"{_three_digits(seconds)} s"
     if size >= 0.0009995:
-        return f"{_three(seconds * 1e3)} ms"
-    return f"{_three(seconds * 1e6)} \N{MICRO SIGN}s"
+        return f"{_three_digits(seconds * 1e3)} ms"
+    return f"{_three_digits(seconds * 1e6)} \N{MICRO SIGN}s"
 
 
-def _three(value: float) -> str:
-    """`value` with three digits, without trailing zeros."""
+def _three_digits(value: float) -> str:
+    """Format `value` with three digits, without trailing zeros."""
     digits = max(0, 2 - math.floor(math.log10(abs(value))))
     text = f"{value:.{digits}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def _clean(value: float) -> float:
-    """Rounded to 12 digits, so that 0.1 + 0.2 is 0.3."""
+    """Round to 12 digits, so that 0.1 + 0.2 is 0.3."""
     return float(f"{value:.12g}")

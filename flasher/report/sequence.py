@@ -19,9 +19,9 @@ from flasher.report.scale import duration_text
 from flasher.translation import ENGLISH, Translator
 
 ITEMS_SHOWN: Final = 240
-"""At most this many items in one diagram."""
+"""Maximum number of items in a diagram."""
 _MARGIN_STEPS: Final = 3
-"""Items kept before and after trouble when a dialogue is thinned."""
+"""Number of items kept before and after trouble when a dialogue is thinned."""
 _PART_HEIGHT: Final = 760
 _TIME_WIDTH: Final = 62
 _LINE_HEIGHT: Final = 15
@@ -32,7 +32,7 @@ _LABEL_LINES: Final = 4
 _LABEL_WIDTH_MIN: Final = 170
 _EDGE: Final = 8
 _QUIET_S: Final = 1.0
-"""Pauses from this length on get a block."""
+"""Length from which a pause is drawn as a block."""
 _NAME_LIMIT: Final = 20
 _MARK: Final = "! "
 """Prefix of trouble, which colour alone must not mark."""
@@ -43,13 +43,13 @@ class ItemKind(Enum):
 
     ARROW = "arrow"
     BLOCK = "block"
-    """A box across all lifelines: many messages in one, or a remark."""
+    """Box across all lifelines: a summary of messages, or a remark."""
 
 
 @dataclass(frozen=True)
 class DiagramItem:
-    """One event. An arrow goes from `sender` to `receiver`; a receiver that is not a participant
-    means all of them.
+    """Item of a diagram. An arrow goes from `sender` to `receiver`; a receiver that is not a
+    participant means all of them.
     """
 
     kind: ItemKind
@@ -60,11 +60,11 @@ class DiagramItem:
     receiver: str = ""
     is_trouble: bool = False
     end_s: float | None = None
-    """When an event with a duration ended."""
+    """End of an item with a duration."""
 
 
 class Lifeline(NamedTuple):
-    """The vertical line of a participant."""
+    """Vertical line of a participant."""
 
     name: str
     x: float
@@ -72,7 +72,7 @@ class Lifeline(NamedTuple):
 
 @dataclass(frozen=True)
 class DiagramRow:
-    """A positioned item. `tips` are the ends of an arrow's heads; `title` is the bold part of the
+    """Positioned item. `tips` are the ends of an arrow's heads; `title` is the bold part of the
     label, at the beginning of its first line.
     """
 
@@ -80,7 +80,7 @@ class DiagramRow:
     time: str
     top: float
     y: float
-    """The arrow's line, or a block's lower edge."""
+    """Line of an arrow, or lower edge of a block."""
     begin_x: float
     tips: tuple[float, ...]
     label_x: float
@@ -91,7 +91,7 @@ class DiagramRow:
 
 @dataclass(frozen=True)
 class Part:
-    """A page's height of a diagram, complete in itself."""
+    """Part of a diagram with a page's height and its own lifelines."""
 
     width: float
     height: float
@@ -116,13 +116,13 @@ def thinned(items: Sequence[DiagramItem], most: int = ITEMS_SHOWN) -> list[Diagr
     previous = -1
     for index in sorted(kept):
         if index > previous + 1:
-            shown.append(_left_out(items[previous + 1 : index]))
+            shown.append(_omitted_block(items[previous + 1 : index]))
         shown.append(items[index])
         previous = index
     return shown
 
 
-def _left_out(items: Sequence[DiagramItem]) -> DiagramItem:
+def _omitted_block(items: Sequence[DiagramItem]) -> DiagramItem:
     troubles = sum(item.is_trouble for item in items)
     text = f"{troubles:,} of them with trouble" if troubles else ""
     title = f"{len(items):,} {'step' if len(items) == 1 else 'steps'} not drawn"
@@ -135,8 +135,7 @@ def diagram(
     width: float,
     translate: Translator = ENGLISH,
 ) -> list[Part]:
-    """Lay out the diagram in parts, from top to bottom, `width` CSS pixels wide; none without
-    items.
+    """Lay out a diagram in parts, from top to bottom, `width` CSS pixels wide; none without items.
 
     Raises ValueError without participants.
     """
@@ -166,7 +165,7 @@ def _part(rows: Sequence[DiagramRow], lifelines: tuple[Lifeline, ...], width: fl
 
 
 def _lifelines(participants: Sequence[str], width: float) -> tuple[Lifeline, ...]:
-    """Spread the participants evenly from left to right."""
+    """Distribute the participants evenly from left to right."""
     begin, end = _TIME_WIDTH + 34.0, width - 40.0
     if len(participants) == 1:
         return (Lifeline(participants[0], (begin + end) / 2),)
@@ -190,7 +189,7 @@ def _with_pauses(items: Iterable[DiagramItem], translate: Translator) -> Iterabl
 
 
 def time_text(seconds: float) -> str:
-    """Time since the beginning, for the left column."""
+    """Format seconds since the beginning, for the left column."""
     return f"{seconds:.3f} s" if seconds < 1000 else f"{seconds:.1f} s"
 
 
@@ -226,7 +225,7 @@ def _block(item: DiagramItem, top: float, width: float) -> DiagramRow:
 
 
 def _label(item: DiagramItem, room: float) -> tuple[str, tuple[str, ...]]:
-    """The bold part of the first line, and all lines: the title, then the text."""
+    """Return the bold part of the first line, and all lines: the title, then the text."""
     label = f"{item.title}{item.text}"
     wide = sum(unicodedata.east_asian_width(char) in "WF" for char in label)
     columns = max(8, int(room / _CHAR_WIDTH / (1 + wide / max(1, len(label)))))

@@ -196,7 +196,7 @@ def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
 
     check_not_read(file, _OUT, [trace])
     with writing(file, _OUT) as part:
-        made = (convert_joined if joined else convert)(trace, part, called=file)
+        made = (convert_joined if joined else convert)(trace, part, name=file)
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
     _warn(output, trace, made.damage, made=made.frames)
