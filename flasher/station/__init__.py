@@ -1,4 +1,4 @@
-"""The end-of-line station: recipes, sockets, records and reports of flashed units.
+"""End-of-line station: flashes units in sockets by a recipe, and records their verdicts.
 
-The first rule: PASS is shown only after it is on disk, and a PASS on disk is true.
+PASS is shown only after it is on disk, and a PASS on disk is true.
 """

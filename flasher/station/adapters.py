@@ -1,5 +1,5 @@
-"""Finds the adapters of a station's sockets by serial number or USB path, and makes the set-up of
-the sockets' processes.
+"""Finds the adapters of a station's sockets by serial number or USB path, and creates the settings
+of the sockets' processes.
 
 `detect` lists the connected adapters (see `flasher.bus.detect`), and `resolve` assigns them.
 """
@@ -96,7 +96,7 @@ def _resolve(socket: SocketConfig, detected: Sequence[DetectedAdapter]) -> Resol
 
 
 def check_samples(sockets: Iterable[Resolved], recipe: LoadedRecipe) -> None:
-    """Raise ImageError when the recipe has a firmware sample and a socket a physical adapter."""
+    """Raises ImageError for a recipe with a firmware sample if a socket has a physical adapter."""
     samples = [target.image for target in recipe.targets if is_sample(target.image)]
     for each in sockets if samples else ():
         if each.bus is None:
@@ -116,8 +116,8 @@ def worker_setups(
     speed: float = 1.0,
     leave_after_s: float = 1.0,
 ) -> list[WorkerSetup]:
-    """Make the set-up of each socket's process. Virtual units are numbered from `first_number` on,
-    in turn over the sockets, up to `units` of them. Raises ImageError as `check_samples`.
+    """Create the settings of each socket's process. Virtual units are numbered from `first_number`,
+    in turn over the sockets, up to `units`. Raises ImageError as `check_samples`.
     """
     check_samples(sockets, recipe)
     files = {str(path): sha256 for path, sha256 in recipe.files.items()}

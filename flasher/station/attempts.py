@@ -1,5 +1,6 @@
-"""Limits on guessing PINs and passwords. A try is counted before it is checked, so that parallel
-tries count too. Times are arguments: seconds on a monotonic clock.
+"""Rate limits against guessing PINs and passwords. Times are seconds on a monotonic clock.
+
+A try is counted before it is checked, so that parallel tries count too.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _NEVER: Final = float("-inf")
 
 
 class BackOff:
-    """Counts tries since the last right one; after each `TRIES_MAX` a pause begins."""
+    """Counts wrong tries; after each `TRIES_MAX` of them a pause begins."""
 
     def __init__(self) -> None:
         self._tries = 0
@@ -35,7 +36,7 @@ class BackOff:
         self._last_s = _NEVER
 
     def wait_s(self, now: float) -> float:
-        """The time until the next try is allowed; 0 when it is."""
+        """Seconds until the next try is allowed; 0 if it is allowed now."""
         return max(self._open_at_s - now, 0.0)
 
     def count(self, now: float) -> None:
@@ -48,7 +49,7 @@ class BackOff:
             self._tries, self._pauses, self._open_at_s = 0, self._pauses + 1, now + pause_s
 
     def reset(self) -> None:
-        """Forget all tries, after a right one."""
+        """Forget all tries, after a correct one."""
         self._tries, self._pauses, self._open_at_s = 0, 0, _NEVER
 
     def is_forgotten(self, now: float) -> bool:
@@ -56,14 +57,14 @@ class BackOff:
 
 
 class Rate:
-    """Limits tries, right ones included, to `limit` in any period of `RATE_S`."""
+    """Limits tries, correct ones included, to `limit` in any period of `RATE_S`."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._begun_s: deque[float] = deque()
 
     def wait_s(self, now: float) -> float:
-        """The time until the next try is allowed; 0 when it is."""
+        """Seconds until the next try is allowed; 0 if it is allowed now."""
         while self._begun_s and now - self._begun_s[0] >= RATE_S:
             self._begun_s.popleft()
         if len(self._begun_s) < self._limit:
@@ -94,8 +95,10 @@ class Attempts:
         self._badges: dict[tuple[str, str], _OfBadge] = {}
 
     def begin(self, address: str, badge: str | None, now: float) -> float:
-        """Begin a try. Returns 0 if it may be checked; else the seconds to wait, without counting
-        it. `badge`: the badge whose PIN is tried; "" for the password; None: nothing is compared.
+        """Start a try. Returns 0 if it may be checked; else the seconds to wait, and it does not
+        count.
+
+        `badge`: the badge whose PIN is tried; "" for the password; None: nothing is compared.
         """
         self._prune(now)
         limits: list[Rate | BackOff] = [
@@ -114,12 +117,12 @@ class Attempts:
         return wait_s
 
     def pause_s(self, address: str, badge: str, now: float) -> float:
-        """Seconds left of the pause after too many tries of a badge; 0 without one."""
+        """Seconds that remain of a pause after too many tries of a badge; 0 without a pause."""
         of_badge = self._badges.get((badge, address), _OfBadge())
         return of_badge.back_off.wait_s(now)
 
-    def was_right(self, address: str, badge: str) -> None:
-        """Forget the tries of a badge at an address, after a right one."""
+    def forget(self, address: str, badge: str) -> None:
+        """Forget the tries of a badge at an address, after a correct one."""
         self._badges[badge, address].back_off.reset()
 
     def _prune(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""The state of a running station, built from its events: the content of every view."""
+"""Current state of a station, built from its events. The terminal and the pages display it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ STEPS: Final = {
 """Steps of a run, for people."""
 _PAGES_MAX: Final = 100
 """Maximum number of pages whose last reply is stored."""
-NO_BADGES: Final = text("No badge table: people are taken at their word.")
+NO_BADGES: Final = text("No badge table: operator names are not checked.")
 
 
 def _doing(step: StepName, target: str, try_number: int) -> str:
@@ -65,7 +65,7 @@ def _doing(step: StepName, target: str, try_number: int) -> str:
 
 @dataclass
 class Row:
-    """The display of one socket. Its texts are safe to show."""
+    """Displayed state of one socket. Its texts are safe to show."""
 
     socket: str
     state: SocketState = SocketState.STARTING
@@ -77,11 +77,11 @@ class Row:
     note: str = ""
     """An error, or the next action of the operator."""
     code: str = ""
-    """Code of the last run, while its unit is in the socket and did not pass."""
+    """Code of the last run, while its unit is in the socket without a PASS."""
     is_virtual: bool = False
     """Its units are virtual: it makes no products."""
-    borne: str = ""
-    """The label of the virtual unit in it, which a trainee has to type."""
+    virtual_label: str = ""
+    """Label of the virtual unit in the socket, which a trainee has to type."""
 
 
 @dataclass(frozen=True)
@@ -91,23 +91,23 @@ class ScanReply:
     text: str = ""
     is_refusal: bool = False
     number: int = 0
-    """Number that orders the replies of all sources."""
+    """Sequence number of replies to all sources."""
 
 
 @dataclass(frozen=True)
-class Spoken:
-    """The last reply to each page, and the last one to all other sources."""
+class Replies:
+    """The last reply to each page, and the last reply to all other sources."""
 
     to_all: ScanReply = ScanReply()
     to_pages: Mapping[str, ScanReply] = field(default_factory=dict)
 
     def to(self, source: str) -> ScanReply:
-        """The newest reply that this source may see: its own, or the last to all."""
+        """The newest reply that a source may see: its own, or the last to all."""
         return max(
             self.to_all, self.to_pages.get(source, ScanReply()), key=lambda each: each.number
         )
 
-    def with_answer(self, text: str, source: str, *, is_refusal: bool) -> Spoken:
+    def with_answer(self, text: str, source: str, *, is_refusal: bool) -> Replies:
         before = max((each.number for each in self.to_pages.values()), default=0)
         answer = ScanReply(text, is_refusal, max(before, self.to_all.number) + 1)
         if not source.startswith(PAGE):
@@ -118,7 +118,7 @@ class Spoken:
 
 @dataclass
 class Board:
-    """The display of a station; `apply` updates it with each event."""
+    """Displayed state of a station; `apply` updates it with each event."""
 
     rows: dict[str, Row] = field(default_factory=dict)
     title: str = ""
@@ -131,20 +131,20 @@ class Board:
     page: str = ""
     """URL of the operator page; empty without one."""
     records_fault: str = ""
-    """Why the last record was not saved; empty when it was."""
-    spoken: Spoken = Spoken()
+    """Reason why the last record was not saved; "" if it was."""
+    replies: Replies = Replies()
     scanners: set[str] = field(default_factory=set)
-    """Sources of scans so far, without pages."""
+    """Sources of scans so far, except pages."""
     prompt: str = ""
-    """The next action for the label that was scanned last."""
+    """Next action for the label that was scanned last."""
     pin_of: str = ""
     """Person whose PIN is typed next: typed text must not be shown. Empty: no PIN is awaited."""
     has_badges: bool = True
-    """False after the start of a station without a badge table."""
+    """False if the station was started without a badge table."""
     labels: dict[str, str] = field(default_factory=dict)
     """Labels of the virtual units in sockets, by socket."""
     ended: dict[str, RunEnded] = field(default_factory=dict)
-    """The last run of each unit, by serial number."""
+    """Last run of each unit, by serial number."""
     refused: list[ScanRefused] = field(default_factory=list)
     waiting: dict[str, str] = field(default_factory=dict)
     """Sources of accepted labels without a socket, by label."""
@@ -160,13 +160,13 @@ class Board:
 
     @property
     def last_reply(self) -> str:
-        """The reply to the last scan outside pages, or a prompt."""
-        return self.spoken.to_all.text
+        """Reply to the last scan outside pages, or a prompt."""
+        return self.replies.to_all.text
 
     @property
     def is_refusal(self) -> bool:
-        """True when `last_reply` is a refusal."""
-        return self.spoken.to_all.is_refusal
+        """True if `last_reply` is a refusal."""
+        return self.replies.to_all.is_refusal
 
     def apply(self, event: StationEvent) -> None:
         match event:
@@ -181,18 +181,18 @@ class Board:
             case ScanAccepted() | ScanRefused():
                 self._scanned(event)
             case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed() | ScannerChanged():
-                self._beside(event)
+                self._apply_device_event(event)
             case OperatorPrompted("", text, _, source):
                 # The next event accepts the scan that it belongs to.
                 self.prompt = shown(text)
-                self.speak(self.prompt, source=source)
+                self.reply(self.prompt, source=source)
             case UnitArrived(socket, _, label):
                 self.labels[socket] = label
-                self.rows[socket].borne = printable(label)
+                self.rows[socket].virtual_label = printable(label)
                 self.arrived.add(label)
             case UnitRemoved(socket):
                 self.labels.pop(socket, None)
-                self.rows[socket].borne = ""
+                self.rows[socket].virtual_label = ""
             case WorkerFailed(socket, reason, restart_in_s):
                 if restart_in_s is None:
                     self.broken[socket] = reason
@@ -208,11 +208,11 @@ class Board:
         self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in event.sockets}
         self.has_badges = event.has_badges
         if not self.has_badges:
-            self.speak(NO_BADGES)
+            self.reply(NO_BADGES)
         if virtual:
             self.title = f"{self.virtual_words} {self.title}"
 
-    def _beside(
+    def _apply_device_event(
         self, event: PinAwaited | PinEnded | LabelPrinted | LabelFailed | ScannerChanged
     ) -> None:
         """Apply an event of PINs, labels or scanners."""
@@ -225,7 +225,7 @@ class Board:
         self.pin_of = printable(event.person) if isinstance(event, PinAwaited) else ""
         if isinstance(event, PinAwaited):
             sentence = printable(event.text)
-            self.speak(
+            self.reply(
                 text(
                     "{text}: type the PIN of {name}, or scan CANCEL.",
                     text=sentence,
@@ -236,7 +236,7 @@ class Board:
     def _scanner(self, event: ScannerChanged) -> None:
         name = printable(event.scanner)
         self.lost_scanners.pop(name, None)
-        self.speak(beside_words(event), is_refusal=not event.is_ready)
+        self.reply(device_event_text(event), is_refusal=not event.is_ready)
         if not event.is_ready:
             self.lost_scanners[name] = event
 
@@ -245,7 +245,7 @@ class Board:
             self.unprinted.pop(event.serial, None)
             return
         self.unprinted[event.serial] = event
-        self.speak(beside_words(event), is_refusal=True)
+        self.reply(device_event_text(event), is_refusal=True)
         row = self.rows.get(event.socket)
         if row is not None and row.serial == printable(event.serial):
             row.note = self.last_reply
@@ -258,7 +258,7 @@ class Board:
                 del self.waiting[event.text]
             reason, remedy = shown(event.reason), shown(event.remedy)
             reply = text("{text}: {reason} {remedy}", text=sentence, reason=reason, remedy=remedy)
-            self.speak(reply, event.source, is_refusal=True)
+            self.reply(reply, event.source, is_refusal=True)
         else:
             meaning = text(event.meaning)
             if event.socket and event.meaning != Word.SOCKET.value.lower():
@@ -275,16 +275,16 @@ class Board:
             elif event.meaning == Word.CANCEL.value.lower():
                 kept = {n: source for n, source in self.waiting.items() if source != event.source}
                 self.waiting = kept
-            self.speak(reply, event.source)
+            self.reply(reply, event.source)
         self.prompt = ""
 
-    def speak(self, answer: str, source: str = "", *, is_refusal: bool = False) -> None:
-        """Show a reply at the source of its scan; names the source if there are several."""
+    def reply(self, answer: str, source: str = "", *, is_refusal: bool = False) -> None:
+        """Show a reply where the scan came from; names the source if there are several."""
         if source and not source.startswith(PAGE):
             self.scanners.add(source)
             if len(self.scanners) > 1:
                 answer = text("{source}: {said}", source=source_words(source), said=answer)
-        self.spoken = self.spoken.with_answer(answer, source, is_refusal=is_refusal)
+        self.replies = self.replies.with_answer(answer, source, is_refusal=is_refusal)
 
     def _socket(self, event: StationEvent) -> None:
         if isinstance(event, RecordNotSaved):
@@ -329,18 +329,18 @@ class Board:
 
     @property
     def exchanged(self) -> frozenset[str]:
-        """Units whose last runs ended because they were exchanged."""
+        """Units whose last run ended because they were exchanged."""
         changed = codes.UNIT_CHANGED.name
         return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
     @property
     def bad_units(self) -> tuple[RunEnded, ...]:
-        """Units whose last run is not a PASS."""
+        """Last runs of units that did not pass."""
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
 
 
-def beside_words(event: LabelFailed | ScannerChanged) -> str:
-    """Format an event of a label or a scanner, with its remedy."""
+def device_event_text(event: LabelFailed | ScannerChanged) -> str:
+    """Text of an event of a label or a scanner, with its remedy."""
     if isinstance(event, LabelFailed):
         return text(
             "No label for {serial}: {reason} {remedy}",

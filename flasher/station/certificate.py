@@ -1,7 +1,6 @@
-"""The certificate of a unit: an HTML page that prints on one A4 sheet, with an annex. It is made
-from the records alone.
+"""Certificate of a unit: an HTML page for one A4 sheet with an annex, made from the records.
 
-A unit that did not pass gets a certificate too, whose first line states that.
+The certificate of a unit that did not pass states that in its first line.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ from flasher.station.records.store import Store
 from flasher.station.sealed import LEFT_OUT, Sealed, as_text, plain
 
 EARLIER_SHOWN: Final = 50
-"""Earlier runs in the table; the page gives the number of the others."""
+"""Maximum number of earlier runs in the table; the page states how many others there are."""
 _WRITES_ON_SHEET: Final = 4
-"""With more or longer ones, the annex lists all in full."""
+"""Maximum number of writes on the sheet; otherwise the annex lists them."""
 _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
 _ROW: Final = ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
@@ -74,21 +73,21 @@ class Proof:
     record_sha256: str = ""
     """SHA-256 over the run with its steps, writes, targets and attachments."""
     is_kept: bool = False
-    """The head of its audit row is stored in another place than beside the key."""
+    """The head of its audit row is stored in another place than the key's folder."""
     is_beside: bool = False
-    """The head of its audit row is stored beside the key."""
+    """The head of its audit row is stored in the key's folder."""
     examined_at: str = ""
-    """When all records up to its audit row were last examined; empty: never."""
+    """Time of the last examination of all records up to its audit row; "" without one."""
     content: Mapping[str, Any] = field(default_factory=dict)
-    """The rows of the run, which the certificate contains."""
+    """Rows of the run, which the certificate contains."""
     row: Mapping[str, Any] = field(default_factory=dict)
     """The signed audit row."""
     seal: str = ""
-    """Signed lines of an existing certificate; empty: make them."""
+    """Signed lines of an existing certificate; "" to make them."""
 
 
 def proven(store: Store, life: UnitLife) -> Proof:
-    """Examine the last run of a unit. Raises UnprovenError when its records were changed."""
+    """Examine the last run of a unit. Raises UnprovenError if its records were changed."""
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
         return Proof()
@@ -126,7 +125,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
     """Values for the template certificate.html. Raises UsageError for a unit without runs."""
     last = life.last
     if last is None:
-        raise UsageError(f"{life.serial} has no run: there is nothing to certify.")
+        raise UsageError(f"{life.serial} has no run to certify.")
     status, word, sentence = UNIT_WORDS[life.state]
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed
@@ -203,7 +202,7 @@ def _code(last: RunDetails, record_sha256: str, head: ChainHead) -> Markup:
 
 
 def code_lines(last: RunDetails, record_sha256: str, head: ChainHead) -> tuple[str, ...]:
-    """The text of the QR code."""
+    """Text of the QR code."""
     run = last.run
     return (
         "flasher record 1",

@@ -1,7 +1,7 @@
-"""Checks whether a certificate is signed by a station, unchanged, and of a run in the records.
+"""Checks the signature of a certificate, and compares it with the run in the records.
 
-A certificate is given as the HTML file that flasher wrote, a PDF that a browser printed of it, the
-lines of its signed content, or the text of its QR code.
+A certificate is the HTML file that flasher wrote, a PDF of it that a browser printed, the lines of
+its signed content, or the text of its QR code.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
 
 
 def _check_code(store: Store, code_text: str) -> CheckedCertificate:
-    """Check the text of a QR code, which has the number of the run, its hashes and signature."""
+    """Check the text of a QR code: run number, hashes and signature."""
     run_line = re.search(r"\nrun (\d{1,18}) ", code_text)
     try:
         run_id = RunId(int(run_line[1])) if run_line else RunId(0)
@@ -193,19 +193,19 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
 
 
 def _languages(page_text: str) -> Iterable[str]:
-    """In which languages the page may be; a print does not name its own."""
+    """Possible languages of the page; a print does not contain its language."""
     named = _LANGUAGE.search(page_text)
     return (named[1],) if named and named[1] in NAMES else NAMES
 
 
 def _closest(pages: Sequence[str], page_text: str) -> str:
-    """The page with most words of the file."""
+    """The page with the most words of the file."""
     words = set(page_text.split())
     return max(pages, key=lambda page: len(words & set(" ".join(_parsed(page).text).split())))
 
 
 def _difference_of_page(page: str, data: bytes, prints: list[str]) -> str:
-    """Where the file, or the pages of a PDF, differ from the page; empty where they do not, and for
+    """Where the file, or a page of the PDF, differs from the expected page; "" if nowhere, or for
     signed lines alone.
     """
     if prints:
@@ -216,7 +216,7 @@ def _difference_of_page(page: str, data: bytes, prints: list[str]) -> str:
 
 
 class _Text(HTMLParser):
-    """Extracts the visible text of a page, and the heads of its tables."""
+    """Extracts the visible text of a page and the headings of its tables."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -253,7 +253,7 @@ def _text_of(page: str) -> str:
 
 
 def _bare(text: str) -> str:
-    """Normalise a text: without spaces, line breaks and ligatures, which printing may change."""
+    """Remove spaces, line breaks and ligatures, which printing may change."""
     return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
 
 
@@ -272,7 +272,7 @@ def _difference(expected: str, found: str) -> str:
 
 def _difference_of_print(page: str, pages: list[str]) -> str:
     """Describe the first difference of a print from its page; "" without one. Lines that a browser
-    prints at the edges of the paper, and repeated heads of tables, are ignored.
+    prints at the edges, and repeated headings of tables, are ignored.
     """
     parser = _parsed(page)
     expected = _bare("".join(parser.text))
@@ -297,13 +297,13 @@ def _difference_of_print(page: str, pages: list[str]) -> str:
 
 
 def _edge(title: str) -> re.Pattern[str]:
-    """Matches lines that a browser prints at the edges of the paper: date, title, address, page."""
+    """Matches lines that a browser prints at the edges: date, title, address, page."""
     escaped = re.escape(unicodedata.normalize("NFKC", title))
     return re.compile(rf"(?:[\d/.,:\- ]+|AM|PM|{escaped}|about:blank|\w{{2,5}}://\S+|\d+/\d+|\s)+")
 
 
 def _pages_of_pdf(data: bytes) -> Iterator[str]:
-    """The text of each page. Raises UsageError for a file that cannot be read."""
+    """Text of each page. Raises UsageError for an unreadable file."""
     from pypdf import PdfReader  # noqa: PLC0415  only for a PDF
     from pypdf.errors import PyPdfError  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Starts processes of a station that get no Ctrl-C and no SIGTERM: the station ends them."""
+"""Starts processes that ignore Ctrl-C and SIGTERM, so that the station can end them in order."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from multiprocessing import resource_tracker
 
 
 @contextmanager
-def deaf_from_birth() -> Iterator[None]:
-    """Block signals while the block runs: processes that this thread starts in it never get Ctrl-C,
-    a hangup, or SIGTERM, which service managers send to all processes of a service, not even while
-    they start. This process gets pending signals afterwards. Does nothing on Windows.
+def signals_blocked() -> Iterator[None]:
+    """Block signals while the block runs: processes that this thread starts in it never receive
+    Ctrl-C, a hangup, or SIGTERM, which service managers send to all processes of a service, even
+    while they start. This process receives pending signals afterwards. Does nothing on Windows.
     """
     if os.name == "nt":
         yield

@@ -1,6 +1,6 @@
-"""Codes of the ends of runs, each with its outcome, its meaning and the operator's action.
+"""Result codes of runs, each with its outcome, meaning and the operator's action.
 
-Codes are stored in the records: the meaning of a code never changes.
+The records store codes: the meaning of a code never changes.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from flasher.station.records.model import RunState
 
 _NEXT: Final = text("Take the unit out.")
 _REPAIR: Final = text("Put the unit aside as bad, with this code on its tag.")
-_TECHNICIAN: Final = text("Call the technician; the unit is not judged.")
+_TECHNICIAN: Final = text("Call the technician; the unit has no verdict.")
 
 
 class Code(NamedTuple):
-    """A code. `may_retry` is False when another try cannot help, or could do harm."""
+    """A result code. `may_retry` is False if another try cannot help or could do harm."""
 
     name: str
     outcome: RunState
@@ -36,7 +36,7 @@ def _error(name: str, meaning: str, action: str = _TECHNICIAN, *, may_retry: boo
 
 
 OK: Final = Code(
-    "OK", RunState.PASS, text("done and verified as the recipe asks"), _NEXT, may_retry=False
+    "OK", RunState.PASS, text("done and verified as the recipe requires"), _NEXT, may_retry=False
 )
 OPERATOR_ABORT: Final = Code(
     "OPERATOR_ABORT",
@@ -66,7 +66,7 @@ OLD_VERSION: Final = _fail(
     may_retry=False,
 )
 IN_USE: Final = _fail(
-    "IN_USE", text("the battery gives current"), text("Switch its loads off, then scan again.")
+    "IN_USE", text("the battery supplies current"), text("Switch its loads off, then scan again.")
 )
 NOT_FOR_DEVICE: Final = _fail(
     "NOT_FOR_DEVICE",
@@ -78,9 +78,9 @@ NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", text("its bootloader does not anno
 ERASE_FAILED: Final = _fail("ERASE_FAILED", text("the bootloader does not begin the transfer"))
 TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", text("the transfer failed"))
 REFUSED: Final = _fail("REFUSED", text("the device refused the image at the end"), may_retry=False)
-UNCONFIRMED: Final = _fail("UNCONFIRMED", text("the final answer of the bootloader never came"))
+UNCONFIRMED: Final = _fail("UNCONFIRMED", text("the bootloader did not send its final answer"))
 OTHER_VERSION: Final = _fail(
-    "OTHER_VERSION", text("the device runs another version than it was given")
+    "OTHER_VERSION", text("the device runs another version than the image")
 )
 NOT_RUNNING: Final = _fail("NOT_RUNNING", text("the new application does not answer"))
 MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", text("the memory differs from the image"))
@@ -122,7 +122,7 @@ NOT_OBSERVED: Final = _error(
         "the computer stalled or its adapter was away, and the station could not observe whether"
         " the unit stayed in the socket"
     ),
-    text("Scan the unit again; it is not judged."),
+    text("Scan the unit again; it has no verdict."),
 )
 TWO_DEVICES: Final = _error(
     "TWO_DEVICES",
@@ -131,7 +131,7 @@ TWO_DEVICES: Final = _error(
 )
 SECOND_TOOL: Final = _error(
     "SECOND_TOOL",
-    text("a second tool speaks on the bus"),
+    text("another tool sends on the bus"),
     text("Disconnect the other tool, then scan again."),
 )
 BUS: Final = _error(
@@ -142,7 +142,8 @@ BUS: Final = _error(
 )
 POWER: Final = _error("POWER", text("the power command failed"), may_retry=True)
 CANNOT_VERIFY: Final = _error(
-    "CANNOT_VERIFY", text("a target cannot be asked, so it cannot be verified without a new flash")
+    "CANNOT_VERIFY",
+    text("a target has no version query: only a new flash can verify it"),
 )
 RECIPE: Final = _error("RECIPE", text("the recipe does not fit its own images or this unit"))
 RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", text("the records could not be written"))
@@ -152,12 +153,12 @@ TRACE_NOT_SAVED: Final = _error(
 PROCESS_DIED: Final = _error(
     "PROCESS_DIED",
     text("the process of the socket ended"),
-    text("Scan the unit again; it is not judged."),
+    text("Scan the unit again; it has no verdict."),
 )
 PROCESS_HUNG: Final = _error(
     "PROCESS_HUNG",
     text("the process of the socket hung"),
-    text("Scan the unit again; it is not judged."),
+    text("Scan the unit again; it has no verdict."),
 )
 INTERNAL: Final = _error("INTERNAL", text("an internal error: a bug of flasher"))
 
@@ -188,10 +189,10 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.CANCELLED: OPERATOR_ABORT,
     Ending.UP_TO_DATE: RECIPE,
 }
-"""Codes of failed upgrades, by the ending of the upgrade."""
+"""Codes of failed upgrades, by the upgrade's ending."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
 """Codes after which a power cycle may reach the bootloader again."""
 OF_ANOTHER: Final = frozenset({UNIT_CHANGED.name, NOT_OBSERVED.name})
-"""Names of the codes after which another unit may be in the socket."""
+"""Names of codes after which another unit may be in the socket."""
 OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED, NO_BOOTLOADER, NO_RESTART})
 """Codes of a unit that stopped answering."""

@@ -43,7 +43,7 @@ BusValue = bool | int | float | str
 
 
 class MockUnits(TomlTable):
-    """Virtual units of a socket without an adapter: shares of faulty ones, from 0 to 1."""
+    """Virtual units of a socket without an adapter: shares of faulty units, from 0 to 1."""
 
     bad: Share = 0.0
     """Units that refuse the image, or do not run it afterwards."""
@@ -52,11 +52,11 @@ class MockUnits(TomlTable):
     dead: Share = 0.0
     """Units that never answer."""
     exchanged: Share = 0.0
-    """Units that are exchanged for the next one while they are flashed, and put in again later."""
+    """Units that are exchanged for the next one while they are flashed, and return later."""
     mislabelled: Share = 0.0
     """Units whose stored serial number differs from their label."""
     seed: int = Field(default=1, ge=0)
-    """Seed of the draw: the same seed and serial number give the same unit."""
+    """Random seed: the same seed and serial number give the same unit."""
 
     @model_validator(mode="after")
     def _check_sum(self) -> MockUnits:
@@ -79,7 +79,7 @@ class SocketConfig(TomlTable):
     usb_path: str = ""
     """USB path of the adapter, such as "1-1.4"; for adapters without a serial number."""
     bus: dict[str, BusValue] = Field(default_factory=dict)
-    """Further keywords of python-can's bus."""
+    """Further arguments of python-can's bus."""
     power: str = ""
     """Command that switches the unit's power, run without a shell, such as "relay 3 {on|off}"."""
     mock: MockUnits | None = None
@@ -130,7 +130,7 @@ class ScannerConfig(TomlTable):
     baudrate: int = Field(default=9600, ge=300, le=4_000_000)
     """Baud rate of the serial port."""
     socket: str = ""
-    """The socket that it is mounted at, to which its labels are assigned; empty: none."""
+    """Socket at which the scanner is mounted, and to which its labels are assigned; empty: none."""
 
     @model_validator(mode="after")
     def _check_place(self) -> ScannerConfig:
@@ -174,12 +174,10 @@ class StationConfig(TomlTable):
     keys: str = ""
     """Folder of the signing key; empty: a folder of this user."""
     heads: tuple[str, ...] = Field(default=(), max_length=8)
-    """Places that store copies of the signed heads of the audit trail, in addition to the one
-    beside the key: a folder, best on another computer, or the URL of a PostgreSQL database; or a
-    list of them.
-    """
+    """Places for copies of the signed heads of the audit trail: folders, best on another computer,
+    or URLs of PostgreSQL databases; one text, or a list."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
-    """How long a write waits while another program locks the database."""
+    """Time limit of a write while another program locks the database."""
     badges: str = ""
     """The badge table (TOML) of the people who may work here; empty: no badges."""
     shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
@@ -258,9 +256,7 @@ def load_config(path: Path) -> StationConfig:
 def mock_config(
     count: int, units: MockUnits, *, name: str = "mock", records: str = "records.sqlite"
 ) -> StationConfig:
-    """Make a station of sockets 1 to `count` with virtual units. Raises UsageError for a count
-    above `SOCKETS_MAX`.
-    """
+    """Settings of a station with virtual units in sockets 1 to `count`. Raises UsageError."""
     if not 1 <= count <= SOCKETS_MAX:
         raise UsageError(f"A station has 1 to {SOCKETS_MAX} sockets, not {count}.")
     sockets = tuple(SocketConfig(name=str(number + 1), mock=units) for number in range(count))

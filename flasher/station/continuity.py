@@ -1,25 +1,25 @@
-"""Detects that the unit in a socket may have been exchanged since it was identified; pure.
+"""Detects that the unit in a socket may have been exchanged, or lost power, since it was
+identified.
 
-A `Continuity` is a driver's tap for one target of a run. `lost` is the evidence that the unit may
-have been exchanged, or had no power:
+A `Continuity` is a driver's tap for one target of a run; it does no I/O. `lost` is the evidence:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
-  switched its power (R28); or after a silence in which it has not confirmed the reset or its image;
+switched its power (R28); or after a silence in which it has not confirmed the reset or its image;
 - it announces itself in the middle of a transfer, or an application answers, which is erased then;
 - before the run has sent anything that restarts it, the watcher counts another power-up of a device
-  that it knew, also in the time before the run; or the first one of a device that was silent for
-  some time when the run began;
-- a version answer, whoever asked for it, or an announced boot version, differs from the first one
-  in a field that the run has not written.
+that it knew, also in the time before the run; or the first one of a device that was silent for
+some time when the run began;
+- a version answer, to any tool, or an announced boot version, differs from the first one in a field
+that the run has not written.
 
-It does not detect an application that fell silent: its next request does.
+An application that stops answering is not detected here, but by its next request.
 
-Not evidence, because a single unit may cause it: announcements of one burst, however many; another
-burst after every reset that was sent and not ignored, as the first one may have come too late; a
-burst so soon after a reset that no unit can have been exchanged, although the confirmation was
-lost; a burst after the end of a transfer, or none; a restart of devices that the battery supplies
-while the battery restarts. Time in which this computer did not read the bus does not count; where
-another unit could have come in that time unnoticed, `unobserved` reports it.
+Not evidence, because one unit may cause it: announcements of one burst, however many; another burst
+after every reset that was sent and not ignored, as the first one may have come too late; a burst so
+soon after a reset that no unit can have been exchanged, although the confirmation was lost; a burst
+after the end of a transfer, or none; a restart of devices that the battery supplies while the
+battery restarts. Time in which this computer did not read the bus does not count; if another unit
+could have been connected in it unnoticed, `unobserved` reports it.
 """
 
 from __future__ import annotations
@@ -45,23 +45,23 @@ from flasher.station.recipe_file import LoadedTarget
 _FIELDS: Final = ("model", "serial_number", "hardware_version")
 """Fields of a version answer that must not change; the firmware version may."""
 _WRITE: Final = HEADER + Mode.WRITE.to_bytes(MODE_SIZE, "big")
-"""Begins a message that may restart a device."""
+"""First bytes of a message that may restart a device."""
 _SPACINGS_OF_QUIET: Final = 6
 _QUIET_MIN_S: Final = 0.3
 _PACE_TOLERANCE: Final = 1.5
 _EXCHANGE_S: Final = 0.25
 """A unit cannot be exchanged within so short a silence."""
 _ANNOUNCED_ON: Final = 2
-"""A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
-announcement may have been on its way."""
+"""Announcements after a reset, without a pause, from which a bootloader is regarded as ignoring it
+(R18): one may have been queued."""
 _UNOBSERVED: Final = (
-    "This computer did not listen {}: another unit could have come, and would announce itself in"
-    " the same way."
+    "This computer did not listen {}: another unit could have been connected, and would"
+    " announce itself in the same way."
 )
 
 
 class Continuity:
-    """Judges the traffic of one target since it was identified.
+    """Watches the traffic of one target for evidence of an exchange since it was identified.
 
     `blind_s`: a longer time between two calls is unobserved.
     """
@@ -80,18 +80,18 @@ class Continuity:
         timings = loaded.profile.timings
         self.watcher = watcher
         self.lost = ""
-        """Evidence of an exchange, as a sentence; empty without any."""
+        """Evidence of an exchange, as a sentence; "" without any."""
         self.unobserved = (
             _UNOBSERVED.format("before the run began") if was_missed and not goes_on else ""
         )
-        """Unobserved time in which another unit could have come; empty without any."""
+        """Unobserved time in which a unit could have been exchanged, as a sentence, or ""."""
         self.is_running = False
         """Its application has answered since the last restart."""
         self.is_told_to_update = False
         """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
         self._goes_on, self._was_silent = goes_on, was_silent and not goes_on
-        """A restart is no evidence; a start is evidence, since the run began with silence."""
+        """A restart is not evidence; a start is, because the run began with silence."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -105,9 +105,7 @@ class Continuity:
         self._longest_pause_s = 0.0
         """Longest pause between two announcements before identification."""
         self._blind_s, self._missed_s = blind_s, 0.0
-        """Unobserved time since the last announcement, or since the reset of a device that has not
-        announced itself.
-        """
+        """Unobserved time since the last announcement, or since a reset without one."""
         self._now, self._listened_s, self._reset_s = -inf, 0.0, -inf
         """Time of the last call, observed time up to then, and observed time up to the last reset.
         """
@@ -122,14 +120,13 @@ class Continuity:
         self._announced_on = 0
         """Announcements of the current burst since the last reset."""
         self._awaits_confirmation = self._awaits_complete = self._awaits_application = False
-        """A reset was sent to a running application, and is not confirmed; the end of the transfer
-        was sent, and is not confirmed; or no application has sent a frame since it.
-        """
+        """Awaited: the confirmation of a reset; that of the end of the transfer; a frame of the
+        application then."""
         self._requested_s: float | None = None
         """Observed time up to the request of the current transfer; None: no transfer."""
         self._is_identified = False
         self._has_acted = False
-        """The run has sent a message after which the unit may restart, or switched its power."""
+        """The run has sent a message that may restart the unit, or switched its power."""
         self._boot_version = ""
         self._known: dict[str, frozenset[str]] = {}
         """Valid values of each identity field; empty before the first answer."""
@@ -141,8 +138,8 @@ class Continuity:
     # -- reports of the run -----------------------------------------------------------------------
 
     def begin(self, content: Content | None) -> None:
-        """Note that the unit was identified by this version answer; None: it did not answer. From
-        now on it must stay. A unit that cannot be asked must stay from the first update command on.
+        """Note the first version answer of the unit; None: no answer. It must remain from now on; a
+        unit without a version query, from the first update command.
         """
         if self._is_identified or self.watcher.request is None:
             return
@@ -153,7 +150,7 @@ class Continuity:
 
     @property
     def has_answered(self) -> bool:
-        """True when it has sent a version answer, before the run or in it."""
+        """True if it has sent a version answer, before the run or in it."""
         return bool(self._known)
 
     def _stay(self) -> None:
@@ -163,14 +160,14 @@ class Continuity:
         self._gap_s = max(self.quiet_s, _PACE_TOLERANCE * self._longest_pause_s)
 
     def settle(self) -> None:
-        """Note that its application has answered the run: it has started again."""
+        """Note that its application has answered the run, so it has started again."""
         self.is_running, self.is_told_to_update = True, False
         self._awaits_confirmation = self._awaits_complete = False
         self._requested_s = None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
-        """Note a complete image on a target that cannot be asked: it may start."""
+        """Note a complete image on a target without a version query, which may now start."""
         self.is_told_to_update = False
         if self._awaits_application:
             self._burst_until = self._now + self._timings.application_start_timeout_s
@@ -182,7 +179,7 @@ class Continuity:
         self._announced_on = _ANNOUNCED_ON  # the power may go a moment later
 
     def allow(self, content: Content) -> None:
-        """Note that the run is about to write these values: old and new ones are both valid."""
+        """Note that the run is about to write these values: old and new ones are valid."""
         for name, text in _identity(content).items():
             if name in self._known:
                 self._known[name] |= {text}
@@ -255,7 +252,7 @@ class Continuity:
             self._compare(watcher.answer)
 
     def _returns(self) -> bool:
-        """Note a frame of the unit. Returns True after a silence that allows an exchange."""
+        """Process a frame of the unit. Returns True after a silence that allows an exchange."""
         before, self._heard_s = self._heard_s, self._listened_s
         if self._listened_s - self._resumed_s > BACKLOG_S:
             self._missed_unheard_s = 0.0
@@ -326,7 +323,7 @@ class Continuity:
         self._burst_until = inf
 
     def _take_power_up(self, now: float, *, was_heard: bool) -> None:
-        """Judge a power-up of a device that was known or silent before."""
+        """Check a power-up of a device that was known or silent before."""
         if self._has_acted or now <= self._supplied_until:
             return
         # A socket holds its unit from the identification on; before, another one may be put in.
@@ -340,7 +337,7 @@ class Continuity:
             self._lose("only announced its bootloader before, and runs an application now")
 
     def _take_announcement(self, now: float, *, has_returned: bool) -> None:
-        """Judge an announcement; `has_returned`: it follows a silence that allows an exchange."""
+        """Check an announcement; `has_returned`: it follows a silence that allows an exchange."""
         since_s = self._pause_s
         goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
         self._judge_missed(since_s, goes_on=goes_on, is_caused=now <= self._burst_until)
@@ -372,8 +369,8 @@ class Continuity:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
 
     def _count_caused(self, *, goes_on: bool) -> bool:
-        """Count an announcement. Returns True for the first one of a burst that the run has caused,
-        after which it expects no further burst.
+        """Count an announcement. Returns True for the first one of a burst that the run has caused;
+        no further burst is expected then.
         """
         is_caused = self._now <= self._burst_until
         if goes_on:
@@ -383,7 +380,7 @@ class Continuity:
         return is_caused and not goes_on
 
     def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
-        """Judge whether another unit may have been put in during unobserved time."""
+        """Check whether a unit may have been exchanged during unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
             was_sent = self._announced_on < _ANNOUNCED_ON or self.is_told_to_update

@@ -1,7 +1,7 @@
-"""Events of a running station, published in the order in which they happen.
+"""Events of a running station, published in order.
 
-Views (the terminal's table, JSON lines, web pages) are drawn from these alone. Only `RunEnded`
-reports a PASS, and it is published after the outcome is in the records on disk.
+The terminal's table, JSON lines and web pages show nothing else. Only `RunEnded` reports a PASS; it
+is published after the outcome is in the records on disk.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ class SocketState(LowerCaseInJson, StrEnum):
     """State of a socket, as screens show it."""
 
     STARTING = "STARTING"
-    """Its process opens the adapter."""
+    """Its process is opening the adapter."""
     EMPTY = "EMPTY"
-    """It holds no unit, and no label waits for one."""
+    """No unit, and no label that waits for one."""
     SILENT = "SILENT"
-    """No frames are received: it holds no unit, or one that sleeps."""
+    """No frames are received: no unit, or a sleeping one."""
     SCAN = "SCAN"
-    """A unit waits for its label, or a label for its unit; `SocketChanged.text` names which."""
+    """A unit waits for its label, or a label for its unit: see `SocketChanged.text`."""
     RUNNING = "RUNNING"
     SAVING = "SAVING"
-    """The run is over, but its outcome is not on disk yet: not a PASS."""
+    """The run has ended, but its outcome is not on disk yet: not a PASS."""
     PASS = "PASS"  # noqa: S105  the word is no password
     FAIL = "FAIL"
     RECHECK = "RECHECK"
@@ -46,7 +46,7 @@ class SocketState(LowerCaseInJson, StrEnum):
 
     @property
     def is_verdict(self) -> bool:
-        """True while a finished unit waits to be taken out."""
+        """True while a finished unit is still in the socket."""
         return self in (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
 
 
@@ -71,25 +71,25 @@ class StationStarted(Timed):
     sockets: tuple[str, ...]
     recovered: tuple[RunId, ...]
     virtual_sockets: tuple[str, ...] = ()
-    """Sockets whose units are virtual: they make no products."""
+    """Sockets with virtual units."""
     has_badges: bool = False
-    """People scan badges, whose roles decide what they may override."""
+    """The station has a badge table: roles decide who may override it."""
 
 
 @dataclass(frozen=True)
 class SocketChanged(Timed):
-    """The state of a socket, or its text, changed."""
+    """The state or text of a socket changed."""
 
     socket: str
     state: SocketState
     serial: str = ""
     text: str = ""
-    """One sentence: what the socket waits for, or what is wrong."""
+    """A sentence: what the socket waits for, or its error."""
 
 
 @dataclass(frozen=True)
 class UnitArrived(Timed):
-    """A unit was put into the socket. `label`: the label of a virtual unit, else empty."""
+    """A unit was put into the socket. `label`: label of a virtual unit; "" for a real one."""
 
     socket: str
     how: str
@@ -98,7 +98,7 @@ class UnitArrived(Timed):
 
 @dataclass(frozen=True)
 class UnitRemoved(Timed):
-    """The unit was taken out: no frame of it was received for the configured time."""
+    """The unit was removed: it has sent nothing for the configured time."""
 
     socket: str
 
@@ -110,15 +110,15 @@ class ScanAccepted(Timed):
     text: str
     meaning: str
     socket: str = ""
-    """The socket that it applies to; empty while none is chosen."""
+    """Socket that the scan applies to; "" while none is chosen."""
     source: str = ""
-    """The scanner or page that it came from, such as "scanner left"."""
+    """Scanner or page of the scan, for example "scanner left"."""
 
 
 @dataclass(frozen=True)
 class ScanRefused(Timed):
-    """A scan was refused and had no effect, or an accepted scan that still waited was dropped.
-    `code` is stable; `remedy` is one action.
+    """A scan was refused without effect, or an accepted scan was dropped while it waited. `code` is
+    stable; `remedy` is one action.
     """
 
     text: str
@@ -127,7 +127,7 @@ class ScanRefused(Timed):
     remedy: str
     socket: str = ""
     source: str = ""
-    """The scanner or page that it came from."""
+    """Scanner or page of the scan."""
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ class ScannerChanged(Timed):
 
 @dataclass(frozen=True)
 class PinAwaited(Timed):
-    """The next scan or line is the PIN of this person: views must not show it."""
+    """The next scan or typed line is this person's PIN: it must not be displayed."""
 
     person: str
     text: str
-    """The scan that needs the PIN."""
+    """Scan that needs the PIN."""
     limit_s: float
 
 
@@ -166,7 +166,7 @@ class OperatorPrompted(Timed):
     text: str
     limit_s: float | None = None
     source: str = ""
-    """Source of the label concerned; empty when no scan is."""
+    """Source of the label concerned; "" if no scan is."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class RunStarted(Timed):
     run_id: RunId
     kind: RunKind
     is_virtual: bool = False
-    """The unit is virtual: no product."""
+    """True for a virtual unit."""
 
 
 @dataclass(frozen=True)
@@ -220,13 +220,13 @@ class StepEnded(Timed):
 
     @property
     def name(self) -> str:
-        """The name in the records: the step, with the target if it is a step of one target."""
+        """Name in the records: the step, with the target if it has one."""
         return f"{self.step.value} {self.target}".strip()
 
 
 @dataclass(frozen=True)
 class RunEnded(Timed):
-    """A run has ended **and its outcome is on disk**. `action`: what the operator has to do."""
+    """A run has ended **and its outcome is on disk**. `action`: the operator's next action."""
 
     socket: str
     serial: str
@@ -238,9 +238,9 @@ class RunEnded(Timed):
     action: str
     duration_s: float
     verified: tuple[tuple[str, Verified], ...] = ()
-    """How far each target was verified, in the recipe's order."""
+    """Verification level of each target, in the recipe's order."""
     is_virtual: bool = False
-    """The unit was virtual: no product."""
+    """True for a virtual unit."""
 
 
 @dataclass(frozen=True)
@@ -294,19 +294,19 @@ class WorkerFailed(Timed):
     socket: str
     reason: str
     restart_in_s: float | None
-    """None: no new one starts until the station is restarted."""
+    """None: the process starts again only with the station."""
 
 
 @dataclass(frozen=True)
 class FiguresChanged(Timed):
-    """Totals of this recipe and lot since the station started."""
+    """Totals of the recipe and lot since the station started."""
 
     figures: Figures
 
 
 @dataclass(frozen=True)
 class StationStopped(Timed):
-    """The station has ended, with all of its processes."""
+    """The station and all of its processes have ended."""
 
     station: str
 

@@ -14,7 +14,7 @@ from flasher.protocol.text import printable
 from flasher.station.board import Board
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
-"""Less free disk space is reported."""
+"""Less free disk space than this is reported."""
 CLOCK_SHIFT_MAX_S: Final = 5.0
 """Greatest change of UTC relative to the monotonic clock since the start of the station."""
 LOOK_EVERY_S: Final = 5.0
@@ -28,13 +28,14 @@ class HealthCheck:
     name: str
     is_good: bool
     text: str
-    """The state found, for people."""
+    """Result for people."""
 
 
 class HealthWatch:
-    """Checks the health of a station; disk and clock every `LOOK_EVERY_S`. `folder`: the files of
-    the records; `utc` and `monotonic_s`: the two clocks; `unkept` returns the places that lack the
-    last heads.
+    """Checks the health of a station; disk and clock every `LOOK_EVERY_S`.
+
+    `folder`: the files of the records; `utc` and `monotonic_s`: the clocks; `unkept` returns the
+    places that lack the last chain heads.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class HealthWatch:
             sentence = text("cannot be read: {names}", names=_few(board.lost_scanners))
             checks.append(HealthCheck(text("scanners"), is_good=False, text=sentence))
         if unkept := self._unkept():
-            sentence = text("not kept yet in: {names}", names=_few(unkept))
+            sentence = text("not stored yet in: {names}", names=_few(unkept))
             checks.append(HealthCheck(text("heads"), is_good=False, text=sentence))
         return (*checks, *self._seen)
 

@@ -1,5 +1,6 @@
-"""Decodes the key events of a scanner (a Linux input device) into scans. Keys are read with the US
-layout, the default of scanners. Times are arguments, in seconds.
+"""Decodes the key events of a scanner (a Linux input device) into scans.
+
+Uses the US keyboard layout, the default of scanners. Times are arguments, in seconds.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _ROWS: Final = (
     (86, "\\", "|"),
     (98, "/", "/"),
 )
-"""Code of the first key of a row, the characters of its keys, and those with shift."""
+"""Code of a row's first key, characters of its keys, and characters with shift."""
 _CHARS: Final = {
     first + at: pair for first, *both in _ROWS for at, pair in enumerate(zip(*both, strict=True))
 }
@@ -38,9 +39,7 @@ _RELEASED, _PRESSED = 0, 1
 
 
 class ScanBuilder:
-    """Builds scans from characters. Calls `submit` with each complete scan, and `damaged` for each
-    incomplete one.
-    """
+    """Builds scans from characters. Calls `submit` with each scan, or `damaged` for a part."""
 
     def __init__(self, submit: Callable[[str], None], damaged: Callable[[], None]) -> None:
         self._submit = submit
@@ -59,7 +58,7 @@ class ScanBuilder:
             self._is_damaged = True
 
     def end(self, at_s: float) -> None:
-        """End the scan."""
+        """Complete the scan."""
         if self._text and at_s - self._at_s > PAUSE_S:
             self._is_damaged = True
         if self._is_damaged:
@@ -73,15 +72,15 @@ class ScanBuilder:
         self._is_damaged = True
 
     def drop(self) -> None:
-        """Discard an unfinished scan, and report it as damaged."""
+        """Discard an unfinished scan and report it as damaged."""
         if self._text or self._is_damaged:
             self._damaged()
         self._text, self._is_damaged = "", False
 
 
 class KeyDecoder:
-    """Decodes the events of an input device. `held` returns the codes of keys held down now; it is
-    called after the device lost events.
+    """Decodes events of an input device. `held` returns the codes of keys that are down now; it is
+    called after the device dropped events.
     """
 
     def __init__(self, builder: ScanBuilder, held: Callable[[], Collection[int]]) -> None:

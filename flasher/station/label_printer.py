@@ -1,6 +1,4 @@
-"""Prints labels in a thread, one at a time, each within a time limit. The station never waits for
-the printer.
-"""
+"""Prints labels in a background thread, one at a time, with a time limit for each."""
 
 from __future__ import annotations
 
@@ -68,7 +66,7 @@ class LabelPrinter:
         self._thread.start()
 
     def submit(self, job: LabelJob) -> None:
-        """Queue a label, and return at once."""
+        """Queue a label and return at once."""
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
@@ -76,13 +74,11 @@ class LabelPrinter:
             self._wake()
 
     def take(self) -> list[tuple[LabelJob, str]]:
-        """Returns the labels finished since the last call, each with the reason why it was not
-        printed, or "".
-        """
+        """Labels finished since the last call, each with the reason of a failure, or ""."""
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Print the waiting labels within one time limit, and end the thread."""
+        """Print the queued labels within one time limit, and end the thread."""
         try:
             self._jobs.put_nowait(None)
         except queue.Full:
@@ -103,9 +99,9 @@ class LabelPrinter:
             self._wake()
 
     def _send_in_time(self, data: bytes) -> None:
-        """Send a label in another thread, and give up after the time limit, since Windows has no
-        time limits for devices, or for programs that started others. While a label hangs, no other
-        one is sent. Raises NotPrinted, and all exceptions of sending.
+        """Send a label in another thread with a time limit, since Windows has none for devices or
+        child processes. While one hangs, no other label is sent. Raises NotPrinted, or what sending
+        raised.
         """
         self._await_sent()
         failures: list[Exception] = []
@@ -123,7 +119,7 @@ class LabelPrinter:
             raise failures[0]
 
     def _await_sent(self) -> None:
-        """Wait until a label that is being sent is done. Raises NotPrinted after the time limit."""
+        """Wait until the label is sent. Raises NotPrinted after the time limit."""
         if self._sending is not None:
             self._sending.join(self._limit_s)
             if self._sending.is_alive():
@@ -135,7 +131,7 @@ class LabelPrinter:
 
 
 def printer_of(config: LabelConfig) -> Send:
-    """Returns the function that sends labels to the configured printer."""
+    """The function that sends labels to the configured printer."""
     if config.command:
         return lambda data, limit_s: run_command(config.command, data, limit_s)
     kind, _, place = config.printer.partition(":")

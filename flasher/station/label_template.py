@@ -37,7 +37,7 @@ def _neutral(value: object) -> str:
 
 
 def _hex(value: object) -> str:
-    """Escape a value for a field with ^FH: other than plain characters as UTF-8 bytes, `_5E`."""
+    """Escape a value for a field with ^FH: all but plain characters as UTF-8 bytes (`_5E`)."""
     return "".join(
         char if char in _PLAIN else "".join(f"_{byte:02X}" for byte in char.encode())
         for char in str(value)
@@ -45,7 +45,7 @@ def _hex(value: object) -> str:
 
 
 class LabelTemplate:
-    """Loads a template, and tries it with the values of a sample. Raises UsageError."""
+    """A label template, tried with sample values when it is loaded. Raises UsageError."""
 
     def __init__(self, path: Path, sample: dict[str, object]) -> None:
         raw = read(path, FILE_MAX_SIZE, what="label template")
@@ -68,7 +68,7 @@ class LabelTemplate:
             raise UsageError(what, where=where, remedy=known) from error
 
     def fill(self, values: dict[str, object]) -> bytes:
-        """Fill in the template. Raises all exceptions of the template."""
+        """Fill in the template. Raises any exception of the template."""
         made: list[str] = []
         size = 0
         for part in self._template.generate(values):
@@ -80,7 +80,7 @@ class LabelTemplate:
 
 
 def values_of(run: RunRecord, groups: dict[str, str]) -> dict[str, object]:
-    """The values of a run for a template. `groups`: the groups of its serial number."""
+    """Values of a run for a template. `groups`: groups of its serial number."""
     ended_at = (run.ended_at or run.begun_at).astimezone()
     return {
         "serial": run.serial,

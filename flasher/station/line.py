@@ -1,13 +1,12 @@
-"""The line of a station as a pure state machine: it assigns labels to sockets, starts runs, and
-decides what each socket shows.
+"""Logic of a station without I/O: assigns labels to sockets, starts runs, and sets what sockets
+show.
 
     scans, presence of units, messages of the sockets' processes, results of saving, the time
         -> Line ->
     events, claims, aborts, and entries of the audit trail
 
-It does no I/O and reads no clock: times are seconds on the station's monotonic clock. `Station`
-carries out its effects and feeds back their results. `flasher.station.scans` has the rule that
-assigns labels to sockets.
+Times are seconds on the station's monotonic clock. `Station` executes the effects and feeds back
+their results. `flasher.station.scans` has the rule that assigns labels to sockets.
 """
 
 from __future__ import annotations
@@ -71,19 +70,19 @@ from flasher.station.socket import (
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
-"""After this time a label without its unit, or a socket without its label, is dropped."""
+"""Time limit for the unit of a label, or the label of a socket; then it is dropped."""
 CARD_LIMIT_S: Final = 15.0
-"""The label has to follow the card of its socket within this time."""
+"""Time limit for the label after the card of its socket."""
 SHORT_OUTAGE_S: Final = 3.0
-"""A socket shows its last verdict for this time; a restart of its process takes less."""
+"""A socket still shows its last verdict in an outage of this time; its process restarts faster."""
 REACH_S: Final = 2.0
-"""A unit that appears sooner after the prompt was in the socket before."""
+"""A unit that appears sooner after the prompt was already in the socket."""
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 READ_S: Final = 2.0
-"""A label scanned again sooner was read twice, or by two people, before the refusal was read."""
+"""A label scanned again sooner was read twice, or by two people who had not read the refusal."""
 NOTE_S: Final = 15.0
-"""A socket shows for this time that a card or label was dropped."""
+"""Time for which a socket shows that a card or label was dropped."""
 _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
@@ -92,12 +91,12 @@ _NOTHING: Final = text("Nothing to do.")
 _CHANGED: Final = Refused(
     codes.UNIT_CHANGED.name,
     text("The unit was exchanged, or had no power."),
-    text("See which unit it is, then scan again."),
+    text("Check which unit it is, then scan again."),
 )
 
 
-def _forgotten(reason: str, remedy: str = _AGAIN) -> Refused:
-    """The refusal of a scan that was accepted and is dropped."""
+def _dropped(reason: str, remedy: str = _AGAIN) -> Refused:
+    """Refusal of a scan that was accepted and is now dropped."""
     return Refused("FORGOTTEN", reason, remedy)
 
 
@@ -106,7 +105,7 @@ def _forgotten(reason: str, remedy: str = _AGAIN) -> Refused:
 
 @dataclass(frozen=True)
 class NotClaimed:
-    """The records refused the claim. `code` is a stable word; `stops_line` stops the line."""
+    """The records refused the claim. `stops_line` stops the line."""
 
     code: str
     reason: str
@@ -132,8 +131,8 @@ SocketInput = (
     | RunEnded
     | NotSaved
 )
-"""`RunStarted`: the claim is in the records. `RunResult`: the process reported the end of the run,
-which is on disk with `RunEnded`."""
+"""`RunStarted`: the claim is in the records. `RunResult`: the process has reported the end of the
+run. `RunEnded`: it is on disk."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ class AbortRun:
 
 @dataclass(frozen=True)
 class CheckPin:
-    """Compare a PIN with its hash; then call `Line.pin_checked`. Pass no scan before."""
+    """Compare a PIN with its hash; then call `Line.pin_checked`. Scans wait for it."""
 
     pin: Pin
     pin_hash: str
@@ -168,14 +167,14 @@ class Reprint:
 
 @dataclass(frozen=True)
 class Audit:
-    """Add an action of a person to the audit trail."""
+    """Append an action of a person to the audit trail."""
 
     what: AuditEvent
     data: Mapping[str, str]
 
 
 Effect = Order | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
-"""An order is to be claimed, with one of its results; an event is to be published."""
+"""An `Order` is claimed, and the result fed back; a `StationEvent` is published."""
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -186,11 +185,10 @@ CheckSerial = Callable[[str], object]
 
 
 class Line:
-    """All sockets and the scans. After each call, `take` returns the effects in order.
+    """Sockets and scans of a station. After each call, `take` returns the effects in order.
 
-    `arrival_limit_s`: a label with a scanned socket waits this long for its unit; then the run
-    starts all the same and reports the fault. `crew`: people with badges; None: names are not
-    checked.
+    `arrival_limit_s`: time that a label with a scanned socket waits for its unit; then the run
+    starts and reports the fault. `crew`: people with badges; None: names are not checked.
     """
 
     def __init__(
@@ -208,37 +206,37 @@ class Line:
         self.operator = operator
         self.lot = lot
         self.stopped: LineStopped | None = None
-        """Why the line is stopped; None while it runs."""
+        """Reason why the line is stopped; None while it runs."""
         self._pin_from: Source | None = None
         """Source of the PIN that is being checked."""
         self.is_closing = False
-        """True when no further run may begin."""
+        """True if no further run may start."""
         self._check_serial = check_serial
         self._arrival_limit_s = arrival_limit_s
         self._scans_labels = scans_labels
         self._crew = crew or Crew(())
         self._effects: list[Effect] = []
         self._waiting: dict[str, Waiting] = {}
-        """Scans that wait for another scan of the same source, by its name."""
+        """Scans that wait for another scan of the same source, by the source's name."""
         self._reason = ""
         """Reason from a REASON command, for the next label."""
         self._reasons: dict[str, str] = {}
-        """Reasons by label, so that a run that starts in between does not take another one's."""
+        """Reasons by label, so that a run in between does not use another one's."""
 
     @property
     def is_checking_pin(self) -> bool:
-        """True while a PIN is being checked: pass no scan meanwhile."""
+        """True while a PIN is being checked; scans have to wait."""
         return self._pin_from is not None
 
     def take(self) -> list[Effect]:
-        """The effects since the last call; call again after feeding back a result."""
+        """Effects since the last call; call again after feeding back a result."""
         effects, self._effects = self._effects, []
         return effects
 
     # -- the table of a socket --------------------------------------------------------------------
 
     def feed(self, name: str, what: SocketInput, now: float) -> None:
-        """Handle an input of a socket. A pair missing in the table is a bug (KeyError)."""
+        """Process an input of a socket. Raises KeyError (a bug) for one that the table lacks."""
         socket = self.sockets[name]
         self._TABLE[socket.phase][type(what)](self, socket, what, now)
         self._go_on(now)
@@ -258,29 +256,29 @@ class Line:
             socket.out_since_s = now
         socket.out_of_service = what.reason or text("It cannot work.")
         reason = text("Socket {socket} is out of service.", socket=socket.name)
-        self._drop_scans(socket, _forgotten(reason, text("Scan it again when it works again.")))
+        self._drop_scans(socket, _dropped(reason, text("Scan it again when it works again.")))
         # The socket cannot be observed now. A unit that was silent before stays doubtful.
         socket.own, socket.is_own_known, socket.presence_number = None, False, 0
         if socket.occupancy is not Occupancy.SILENT:
             socket.occupancy = Occupancy.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
-        """A unit appeared, reported its serial number, or fell silent."""
+        """A unit was detected, reported its serial number, or stopped sending."""
         socket.presence_number = what.number
         if not what.is_there:
-            reason = text("Its unit sends nothing any more.")
-            why = _forgotten(reason, text("Scan it again when it is connected."))
+            reason = text("Its unit stopped sending.")
+            why = _dropped(reason, text("Scan it again when it is connected."))
             self._silent(socket, now, why, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
             why = _CHANGED
             if what.was_missed and not what.is_power_up:
-                reason = text("This computer stalled, and did not see whether the unit stayed.")
+                reason = text("This computer stalled: the unit may have been exchanged meanwhile.")
                 why = Refused(codes.NOT_OBSERVED.name, reason, _CHANGED.remedy)
             self._silent(socket, now, why, is_certain=False)
         elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
             # It may have come after its card or label was scanned, in place of a silent one.
-            self._drop_for(socket, now, _CHANGED, keeps_label=socket.binding is Binding.NAMED)
+            self._drop_for(socket, now, _CHANGED, keeps_label=socket.binding is Binding.PROMPTED)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.note_unit(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
@@ -289,8 +287,8 @@ class Line:
         if socket.phase is not SocketPhase.REST:
             return
         if what.label and self._scans_labels and not socket.label:
-            self._scan_borne(socket, what.label, now)
-        elif (is_new or was_silent) and socket.label and socket.binding is Binding.NAMED:
+            self._scan_virtual_label(socket, what.label, now)
+        elif (is_new or was_silent) and socket.label and socket.binding is Binding.PROMPTED:
             self._arrived_where_named(socket, what.label, now)
         elif (
             socket.awaits_label
@@ -299,15 +297,15 @@ class Line:
         ):
             serial = waiting.label
             waiting.forget()
-            self._bind(socket, serial, Binding.SAID, now, waiting.source)
+            self._bind(socket, serial, Binding.CONFIRMED, now, waiting.source)
         elif is_new:
             self._arrived_elsewhere(socket)
 
     def _silent(self, socket: Socket, now: float, why: Refused, *, is_certain: bool) -> None:
-        """The unit may have been removed: drop the scans for it."""
+        """The unit may have been removed: drop its scans."""
         # No unit came for its label yet, or the unit reported another serial number.
         awaits = socket.begin_at_s is None or socket.is_of_another(socket.label)
-        awaits = awaits and socket.binding is Binding.NAMED
+        awaits = awaits and socket.binding is Binding.PROMPTED
         if not socket.fall_silent(is_certain=is_certain):
             return
         self._emit(UnitRemoved(socket.name))
@@ -316,29 +314,31 @@ class Line:
         self._drop_for(socket, now, why, keeps_label=awaits)
 
     def _drop_for(self, socket: Socket, now: float, why: Refused, *, keeps_label: bool) -> None:
-        """Drop the scans for a unit, and show that on its socket for a while."""
+        """Drop the scans of a unit, and show that on its socket for a while."""
         if self._drop_scans(socket, why, keeps_label=keeps_label):
             socket.note = text("{reason} {remedy}", reason=why.reason, remedy=why.remedy)
             socket.note_until_s = now + NOTE_S
 
-    def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
-        if not borne and now < socket.bound_at_s + REACH_S:
-            reason = text("A unit was in socket {socket} already.", socket=socket.name)
+    def _arrived_where_named(self, socket: Socket, virtual_label: str, now: float) -> None:
+        if not virtual_label and now < socket.bound_at_s + REACH_S:
+            reason = text("A unit was already in socket {socket}.", socket=socket.name)
             remedy = text("Scan it again with the card of its socket.")
-            self._drop_label(socket, _forgotten(reason, remedy))
-        elif borne and borne != socket.label:
+            self._drop_label(socket, _dropped(reason, remedy))
+        elif virtual_label and virtual_label != socket.label:
             reason = text(
-                "The unit in socket {socket} bears {label}.", socket=socket.name, label=borne
+                "The unit in socket {socket} has the label {label}.",
+                socket=socket.name,
+                label=virtual_label,
             )
-            why = Refused("OTHER_UNIT", reason, text("Scan {label}.", label=borne))
-            self._refuse(socket.let_go(), why, socket, socket.source)
+            why = Refused("OTHER_UNIT", reason, text("Scan {label}.", label=virtual_label))
+            self._refuse(socket.release_label(), why, socket, socket.source)
         else:
             # The unit may have woken up: identify it before anything begins.
-            socket.begin_at_s = now if borne else now + IDENTIFY_S
+            socket.begin_at_s = now if virtual_label else now + IDENTIFY_S
 
     def _arrived_elsewhere(self, socket: Socket) -> None:
         named = next(
-            (e for e in self.sockets.values() if e.label and e.binding is Binding.NAMED), None
+            (e for e in self.sockets.values() if e.label and e.binding is Binding.PROMPTED), None
         )
         if named is not None and socket.awaits_label:
             sentence = text(
@@ -383,7 +383,7 @@ class Line:
             socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
 
     def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
-        """A part of a run is not saved: the run cannot pass, and no other one starts."""
+        """A part of a run was not saved: the run cannot pass, and no other one starts."""
         if socket.phase is SocketPhase.SAVE:
             socket.note = what.reason
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
@@ -391,7 +391,7 @@ class Line:
     # -- scans ------------------------------------------------------------------------------------
 
     def scan(self, raw: str, now: float, source: Source = UNNAMED) -> None:
-        """Handle a scan of a source."""
+        """Process a scan."""
         scanned = raw.strip()
         crew = self._crew
         person = crew.find(scanned)
@@ -414,8 +414,8 @@ class Line:
             self._emit(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # A PIN typed too late or too often: no message may show it.
-            reason = text("No PIN is awaited, and it is no serial number of this recipe.")
-            remedy = text("Scan first what needs the PIN.")
+            reason = text("No PIN is expected, and it is not a serial number of this recipe.")
+            remedy = text("First scan the command that needs the PIN.")
             self._refuse(HIDDEN, Refused("NO_PIN_AWAITED", reason, remedy), source=source)
         else:
             self._answer(
@@ -426,7 +426,7 @@ class Line:
     def _answer(
         self, shown: str, source: Source, understand: Callable[[], tuple[str, Socket | None]]
     ) -> None:
-        """Handle a scan, and report whether it was accepted; `shown` is its text for people."""
+        """Process a scan, and report whether it was accepted; `shown` is its text for people."""
         try:
             meaning, socket = understand()
         except Refused as refused:
@@ -437,7 +437,7 @@ class Line:
                 self._emit(ScanAccepted(shown, meaning, name, source.name))
 
     def _understand(self, raw: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
-        """The meaning of a scan, and its socket. Raises Refused."""
+        """Meaning of a scan, and its socket. Raises Refused."""
         understood = understand(raw)
         if isinstance(understood, Label):
             self._crew.check_assigned()
@@ -467,7 +467,7 @@ class Line:
 
     @staticmethod
     def _in_doubt(waiting: Waiting) -> Refused:
-        """The refusal of a scan that may belong to one that was refused before it."""
+        """Refusal of a scan that may belong to a refused one before it."""
         if not waiting.text:
             return Refused(
                 "NO_SOCKET",
@@ -477,13 +477,13 @@ class Line:
         return Refused(
             "CARD_WAITS" if waiting.card is not None else "LABEL_WAITS",
             text("{text} waits, and something else was scanned after it.", text=waiting.text),
-            text("Scan {text} again, then what belongs to it; or scan CANCEL.", text=waiting.text),
+            text("Scan {text} again, then its card or label; or scan CANCEL.", text=waiting.text),
         )
 
     # -- badges and PINs --------------------------------------------------------------------------
 
     def _take_pin(self, asked: Asked, scanned: str, source: Source, now: float) -> None:
-        """Handle a scan while a PIN is awaited; it is never shown."""
+        """Process a scan or typed line as the awaited PIN; it is never displayed."""
         if scanned.upper() == Word.CANCEL.value:
             self._end_pin(asked, Refused("CANCELLED", text("It was cancelled."), _NOTHING))
         elif is_form(scanned):
@@ -496,7 +496,7 @@ class Line:
             self._pin_from = source
             self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
         else:
-            reason = text("That is no PIN: it has {form}.", form=FORM_WORDS)
+            reason = text("That is not a PIN: a PIN has {form}.", form=FORM_WORDS)
             name = printable(asked.person.name)
             remedy = text("Type the PIN of {name}, or scan CANCEL.", name=name)
             self._refuse(HIDDEN, Refused("NO_PIN", reason, remedy), source=source)
@@ -509,7 +509,7 @@ class Line:
             return
         if is_right:
             crew.asked = None
-            crew.was_right(asked.person.name, source)
+            crew.forget_tries(asked.person.name, source)
             word, argument = asked.word, asked.argument
             waiting = self._waiting.setdefault(asked.source.name, Waiting(asked.source))
             self._emit(PinEnded(asked.person.name, is_right=True))
@@ -527,7 +527,7 @@ class Line:
         self._go_on(now)
 
     def _end_pin(self, asked: Asked, why: Refused) -> None:
-        """Refuse the override that waited for its PIN."""
+        """Refuse the command that waited for a PIN."""
         self._crew.asked = None
         self._emit(PinEnded(asked.person.name, is_right=False))
         self._refuse(printable(asked.text)[:80], why)
@@ -535,7 +535,7 @@ class Line:
     # -- labels and commands ----------------------------------------------------------------------
 
     def _take_label(self, serial: str, waiting: Waiting, now: float) -> Socket | None:
-        """The socket for a label; None while the label waits for one. Raises Refused."""
+        """Socket of a label; None while the label waits for a card. Raises Refused."""
         card = waiting.card
         if card is not None:
             self._take_for_card(card, serial, waiting, now)
@@ -547,19 +547,19 @@ class Line:
         placed = place(self.sockets, serial, waiting.source)
         for other in self._waiting.values():
             if other.label == serial and other is not waiting:  # its last scan counts
-                self._drop_waiting(other, _forgotten(text("It was scanned elsewhere."), _NOTHING))
+                self._drop_waiting(other, _dropped(text("It was scanned elsewhere."), _NOTHING))
         if placed is None:
             self._keep_waiting(serial, waiting, now)
             return None
         socket, why = placed
         self._bind(socket, serial, why, now, waiting.source)
-        if why is not Binding.SAID and not socket.is_due(now):
+        if why is not Binding.CONFIRMED and not socket.is_due(now):
             source = waiting.source.name
             self._emit(OperatorPrompted(socket.name, socket.wanted, source=source))
         return socket
 
     def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
-        """Handle a label from a socket's own scanner. Raises Refused."""
+        """Process a label from a socket's own scanner. Raises Refused."""
         self._crew.check_assigned()
         self._check_label(serial)
         self._check_takes(socket)
@@ -570,8 +570,8 @@ class Line:
         return socket
 
     def _take_for_card(self, card: Socket, serial: str, waiting: Waiting, now: float) -> None:
-        """Handle a label after the card of its socket. Raises Refused, which uses up the card: a
-        second reading of the label must not be taken for one that was scanned alone.
+        """Process a label after the card of its socket. Raises Refused, which drops the card: a
+        second reading of the label must not count as a label without a card.
         """
         try:
             self._check_label(serial)
@@ -591,7 +591,7 @@ class Line:
         was_here = socket.label == serial
         for each in self.sockets.values():
             if each.label == serial:
-                each.let_go()  # it was moved
+                each.release_label()  # it was moved
         for other in self._waiting.values():
             if other.label == serial:
                 other.forget()
@@ -600,15 +600,15 @@ class Line:
         )
         for other in self._waiting.values():
             if other.card is socket and other is not waiting:
-                self._drop_waiting(other, _forgotten(reason))
-        self._drop_label(socket, _forgotten(reason))  # was scanned for it before
+                self._drop_waiting(other, _dropped(reason))
+        self._drop_label(socket, _dropped(reason))  # was scanned for it before
         waiting.forget()
-        self._bind(socket, serial, Binding.SAID, now, waiting.source)
+        self._bind(socket, serial, Binding.CONFIRMED, now, waiting.source)
         if was_here:
             socket.begin_at_s = now  # scanned twice: do not wait for its first message
 
     def _label_of(self, own: str | None) -> Waiting | None:
-        """The waiting label of the unit that reports this serial number."""
+        """Waiting label of the unit that reports this serial number."""
         found = (each for each in self._waiting.values() if each.label and each.label == own)
         return next(found, None)
 
@@ -619,7 +619,7 @@ class Line:
             raise Refused("LINE_STOPPED", reason, remedy)
 
     def _check_label(self, serial: str) -> None:
-        """Raises Refused for a label that is not of this recipe or cannot be run now."""
+        """Raises Refused for a label of another recipe, or of a unit that cannot be run now."""
         self._check_line()
         try:
             self._check_serial(serial)
@@ -635,8 +635,8 @@ class Line:
         if not any(each.can_work for each in self.sockets.values()):
             raise Refused(
                 "SOCKET_BROKEN",
-                text("No socket works."),
-                text("Mend one of them, then scan it again."),
+                text("No socket is in service."),
+                text("Repair one of them, then scan it again."),
             )
         waiting.label, waiting.forget_at_s = serial, now + SCAN_LIMIT_S
         shown, before = printable(serial), was_in(self.sockets, serial)
@@ -669,7 +669,7 @@ class Line:
             serial = waiting.label
             check_fits(self.sockets, socket, serial)
             waiting.forget()
-            self._bind(socket, serial, Binding.SAID, now, waiting.source)
+            self._bind(socket, serial, Binding.CONFIRMED, now, waiting.source)
         else:
             # Its label waits until it is known whether it is another one.
             waiting.card, waiting.is_in_doubt, socket.is_chosen = socket, False, True
@@ -706,14 +706,14 @@ class Line:
         socket = self._named(argument)
         check_free(socket)
         reason = text("Socket {socket} is free.", socket=socket.name)
-        self._drop_scans(socket, _forgotten(reason, text("Scan it again when it is connected.")))
+        self._drop_scans(socket, _dropped(reason, text("Scan it again when it is connected.")))
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
             socket.occupancy = Occupancy.EMPTY
         return socket
 
     def _cancel(self, _argument: str, _now: float, waiting: Waiting) -> None:
-        """Drop the scans of this source that wait."""
+        """Drop the waiting scans of this source."""
         bound = [each for each in self.sockets.values() if each.label]
         own = [each for each in bound if each.source == waiting.source]
         if not (own or waiting.text or self._reason):
@@ -721,10 +721,10 @@ class Line:
         self._forget_card(waiting)
         self._reason = ""
         for socket in own:
-            self._reasons.pop(socket.let_go(), None)
+            self._reasons.pop(socket.release_label(), None)
 
     def _check_waits_nowhere(self, bound: list[Socket]) -> None:
-        """Raises Refused for a CANCEL when scans wait at another source."""
+        """Raises Refused for a CANCEL if scans wait at another source."""
         waits: list[tuple[str, Source, str]] = [
             (
                 each.label,
@@ -786,11 +786,11 @@ class Line:
             self._emit(ScanAccepted(word, _RESUME))
             self._emit(LineResumed())
             for socket in self.sockets.values() if self._scans_labels else ():
-                if socket.awaits_label and socket.borne:  # it was refused meanwhile
-                    self._scan_borne(socket, socket.borne, now)
+                if socket.awaits_label and socket.virtual_label:  # it was refused meanwhile
+                    self._scan_virtual_label(socket, socket.virtual_label, now)
         else:
-            reason = text("It still cannot be saved.")
-            self._refuse(word, Refused("STILL_NOT_SAVED", reason, text("Repair the cause first.")))
+            reason = text("The outcome still cannot be saved.")
+            self._refuse(word, Refused("STILL_NOT_SAVED", reason, text("Remove the cause first.")))
         self._go_on(now)
 
     # -- the time, and due actions ----------------------------------------------------------------
@@ -803,7 +803,7 @@ class Line:
                     if waiting.label
                     else text("No label was scanned for it.")
                 )
-                self._drop_waiting(waiting, _forgotten(reason))
+                self._drop_waiting(waiting, _dropped(reason))
                 waiting.is_in_doubt = False
             if waiting.is_in_doubt and waiting.forget_at_s is None:
                 waiting.forget_at_s = now + SCAN_LIMIT_S
@@ -811,20 +811,20 @@ class Line:
                 del self._waiting[waiting.source.name]
         asked = self._crew.asked
         if asked is not None and not self.is_checking_pin and now >= asked.until_s:
-            self._end_pin(asked, Refused("NO_PIN", text("No PIN came."), _AGAIN))
+            self._end_pin(asked, Refused("NO_PIN", text("No PIN was entered in time."), _AGAIN))
         for socket in self.sockets.values():
             if socket.out_of_service and now - socket.out_since_s >= SHORT_OUTAGE_S:
                 socket.is_last_there = False
             waits = socket.label and socket.begin_at_s is None and socket.phase is SocketPhase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
-                remedy = text("Scan it again with its unit.")
-                self._drop_label(socket, _forgotten(text("Its unit did not come."), remedy))
+                remedy = text("Connect its unit, then scan it again.")
+                self._drop_label(socket, _dropped(text("Its unit was not connected."), remedy))
             if socket.note_until_s is not None and now >= socket.note_until_s:
                 self._clear_drop_note(socket)
         self._go_on(now)
 
     def _go_on(self, now: float) -> None:
-        """Start the runs that are due, then report the sockets that changed."""
+        """Start due runs, then report changed sockets."""
         for socket in self.sockets.values():
             came_at_s = max(socket.bound_at_s, socket.arrived_at_s)
             if socket.label and socket.is_unidentified and now >= came_at_s + IDENTIFY_S:
@@ -844,23 +844,23 @@ class Line:
                 self._emit(SocketChanged(socket.name, state, serial, text))
 
     def _bind(self, socket: Socket, serial: str, why: Binding, now: float, source: Source) -> None:
-        """Assign the label to the unit in this socket, or to the one that will arrive."""
+        """Assign a label to the unit in this socket, or to the next one."""
         if self._reason:
             self._reasons[serial], self._reason = self._reason, ""
         was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
         socket.label, socket.binding, socket.source = serial, why, source
         socket.note, socket.note_until_s = "", None
         socket.begin_at_s, socket.bound_at_s = None, now
-        if why is Binding.NAMED:
+        if why is Binding.PROMPTED:
             return  # show the unit that has passed until it is removed
         socket.last, socket.is_last_there = None, False
-        if not socket.sees_units or (was_here and why is Binding.SAID):
+        if not socket.sees_units or (was_here and why is Binding.CONFIRMED):
             socket.begin_at_s = now  # it may be in its bootloader and send nothing
-        elif why is Binding.SAID or (why is Binding.ONLY and was_here):
+        elif why is Binding.CONFIRMED or (why is Binding.ONLY_SOCKET and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
     def _drop_scans(self, socket: Socket, why: Refused, *, keeps_label: bool = False) -> bool:
-        """Drop the card and the label that wait at a socket; False without any."""
+        """Drop the waiting card and label of a socket; False without any."""
         cards = [each for each in self._waiting.values() if each.card is socket]
         for waiting in cards:
             self._drop_waiting(waiting, why)
@@ -868,14 +868,14 @@ class Line:
         return bool(cards) or is_label
 
     def _drop_label(self, socket: Socket, why: Refused) -> bool:
-        label = socket.let_go()
+        label = socket.release_label()
         if label:
             self._refuse(label, why, socket, socket.source)
         return bool(label)
 
     def _drop_waiting(self, waiting: Waiting, why: Refused) -> None:
-        """Drop the waiting scan of a source, and report it there. A label that follows a dropped
-        card must not go elsewhere.
+        """Drop the waiting scan of a source, and report it there. The label after a dropped card
+        must not be assigned to another socket.
         """
         text, card = waiting.text, waiting.card
         if text:
@@ -897,12 +897,12 @@ class Line:
         self._drop_label(socket, Refused("NOT_IDENTIFIED", reason, remedy))
 
     def _forget_card(self, waiting: Waiting) -> None:
-        """Forget the waiting scan, and the label that waited at its socket."""
+        """Drop the waiting scan, and the label that waits at its socket."""
         card = waiting.card
         waiting.forget()
         if card is not None:
             reason = text("SOCKET {socket} was scanned, and not its label.", socket=card.name)
-            self._drop_label(card, _forgotten(reason, text("Scan it again with the card.")))
+            self._drop_label(card, _dropped(reason, text("Scan it again with the card.")))
 
     @staticmethod
     def _clear_drop_note(socket: Socket) -> None:
@@ -910,7 +910,7 @@ class Line:
             socket.note, socket.note_until_s = "", None
 
     def drop_all(self, why: Refused) -> None:
-        """Drop every card and label that waits."""
+        """Drop all waiting cards and labels."""
         for waiting in self._waiting.values():
             self._drop_waiting(waiting, why)
             waiting.is_in_doubt = False
@@ -918,13 +918,13 @@ class Line:
             self._drop_label(socket, why)
 
     def stop(self, code: str, reason: str, remedy: str) -> None:
-        """Start no run until RESUME. Labels are dropped, since units may be swapped meanwhile."""
+        """Start no run until RESUME, and drop labels, since units may be swapped meanwhile."""
         if self.stopped is not None:
             return
         self.stopped = LineStopped(code, reason, remedy)
         self._emit(self.stopped)
-        remedy = text("Scan it again when it goes on.")
-        self.drop_all(_forgotten(text("The line was stopped."), remedy))
+        remedy = text("Scan it again after RESUME.")
+        self.drop_all(_dropped(text("The line was stopped."), remedy))
 
     def _is_serial(self, text: str) -> bool:
         try:
@@ -949,20 +949,20 @@ class Line:
         self._effects.append(Audit(what, self._with_author(data)))
 
     def _with_author(self, data: dict[str, str]) -> dict[str, str]:
-        """The data of an audit entry, with its author where badges are used."""
+        """Add the author to the data of an audit entry, if badges are used."""
         if not self._crew.has_badges:
             return data
         return {**data, "by": "" if self._crew.person is None else self._crew.person.name}
 
-    def _scan_borne(self, socket: Socket, label: str, now: float) -> None:
-        """Assign the label of a virtual unit, as an operator does with card and label."""
+    def _scan_virtual_label(self, socket: Socket, label: str, now: float) -> None:
+        """Assign the label of a virtual unit, like an operator with card and label."""
         try:
             self._check_label(label)
         except Refused as refused:
             self._refuse(label, refused, socket)
         else:
             self._emit(ScanAccepted(label, "label", socket.name))
-            self._bind(socket, label, Binding.SAID, now, UNNAMED)
+            self._bind(socket, label, Binding.CONFIRMED, now, UNNAMED)
 
     # -- the tables -------------------------------------------------------------------------------
 
@@ -988,7 +988,7 @@ class Line:
             RunEnded: _saved,
         },
     }
-    """Handlers by phase of the socket and type of the input."""
+    """Handlers by the socket's phase and the type of the input."""
     _COMMANDS: ClassVar[Mapping[Word, Callable[[Line, str, float, Waiting], Socket | None]]] = {
         Word.SOCKET: _take_socket,
         Word.CANCEL: _cancel,

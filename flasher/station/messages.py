@@ -25,7 +25,7 @@ class RunResult:
     duration_s: float
     verified: Mapping[str, Verified] = field(default_factory=dict)
     trace_sha256: str | None = None
-    """SHA-256 of the compressed trace (`packed`); None when it could not be written."""
+    """SHA-256 of the compressed trace (`packed`); None if it could not be written."""
 
 
 @dataclass(frozen=True)
@@ -38,26 +38,24 @@ class JournalWrite:
     write_id: WriteId | None = None
     """None until the intent is recorded."""
     read_back: str | None = None
-    """None when nothing could be read back."""
+    """None if nothing could be read back."""
 
 
 class JournalError(FlasherError):
-    """A write could not be recorded: it must not be done."""
+    """A write could not be recorded, so it must not be sent."""
 
 
 class Journal(Protocol):
-    """Records the steps and writes of a run. When a method returns, its record is on disk; each
-    raises JournalError when it cannot be saved.
-    """
+    """Records the steps and writes of a run, on disk on return. Raises JournalError."""
 
     def intent(self, target: str, what: str, value: str) -> JournalWrite:
-        """Records a write before it is sent to the device."""
+        """Record a write before it is sent to the device."""
 
     def verified(self, write: JournalWrite, read_back: str | None) -> None:
-        """Records that it was done; `read_back` is None when nothing could be read back."""
+        """Record that the write is done; `read_back` is None if nothing could be read back."""
 
     def step(self, ended: StepEnded, measurements: Sequence[Measurement] = ()) -> None:
-        """Records the end of one try of a step."""
+        """Record the end of one try of a step."""
 
 
 def packed(trace: Path) -> Path:
@@ -80,7 +78,7 @@ def flash_value(version: str, sha256: str) -> str:
 
 @dataclass(frozen=True)
 class VirtualUnits:
-    """Settings of a socket with virtual units."""
+    """Settings of a socket's virtual units."""
 
     units: MockUnits
     first_number: int = 1
@@ -90,21 +88,21 @@ class VirtualUnits:
     arrive_after_s: float = 1.0
     """Time from an empty socket to the next unit."""
     leave_after_s: float = 1.0
-    """Time from the end of a run until its unit is taken out."""
+    """Time from the end of a run to the removal of its unit."""
     count: int | None = None
     """Number of units; None: no limit."""
 
 
 @dataclass(frozen=True)
 class WorkerSetup:
-    """Settings of the process of a socket, constant while it lives."""
+    """Settings of a socket's process, constant while it runs."""
 
     socket: str
     recipe: Path
     files: Mapping[str, str]
-    """SHA-256 of each file of the recipe: the process refuses to work with others."""
+    """SHA-256 of each file of the recipe: the process refuses other files."""
     bus: Mapping[str, Any] | None
-    """Keywords of python-can's bus; None: virtual units."""
+    """Arguments of python-can's bus; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
 
@@ -114,7 +112,7 @@ class WorkerSetup:
 
 @dataclass(frozen=True)
 class WriteReply:
-    """The reply to an `Ask`. `error` is empty when the record is on disk."""
+    """Reply to an `Ask`. `error` is "" if the record is on disk."""
 
     number: int
     write_id: WriteId | None = None
@@ -123,7 +121,7 @@ class WriteReply:
 
 @dataclass(frozen=True)
 class Abort:
-    """Stop the run at the request of a person."""
+    """Stop the run: a person aborted it."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,7 @@ ToWorker = Claim | WriteReply | Abort | Quit
 
 @dataclass(frozen=True)
 class AdapterReady:
-    """The adapter is open. `sees_units` is False when present units may be silent."""
+    """The adapter is open. `sees_units` is False if a present unit may send nothing."""
 
     adapter: str
     sees_units: bool
@@ -146,40 +144,38 @@ class AdapterReady:
 
 @dataclass(frozen=True)
 class Beat:
-    """Sign of life, sent regularly."""
+    """Heartbeat."""
 
 
 @dataclass(frozen=True)
 class AdapterDown:
-    """The adapter failed, or the process died; the adapter is opened again."""
+    """The adapter failed or the process died; the adapter will be opened again."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class PresenceChanged:
-    """A unit was put in or taken out, or reported its serial number. Sent again after each run and
-    after each opening of the adapter.
+    """A unit was put in or taken out, or reported its serial number. Repeated after each run and
+    after the adapter was opened.
     """
 
     is_there: bool
     how: str = ""
     label: str = ""
-    """The label of a virtual unit."""
+    """Label of a virtual unit."""
     serial: str | None = None
-    """The serial number that the unit reports; empty: it has none; None: not reported yet."""
+    """Serial number that the unit reports; "": it has none; None: not reported yet."""
     is_certain: bool = False
-    """With `is_there` False: the socket is empty; else a sleeping unit may be in it."""
+    """With `is_there` False: the socket is empty; otherwise a sleeping unit may be in it."""
     is_power_up: bool = False
-    """A bootloader announced its power-up, or the application of a unit started that had only been
-    announced by its bootloader: the unit may be another one than before.
-    """
+    """A bootloader announced its power-up, or an application started of which only the bootloader
+    had been received: another unit may have been put in."""
     was_missed: bool = False
-    """The process did not listen for a while, and the unit is only announced by its bootloader: it
-    may be another one than before.
-    """
+    """The process did not receive for a while, and only bootloader announcements arrive: another
+    unit may have been put in."""
     is_in_bootloader: bool = False
-    """Only announcements of a bootloader are received, and no frames of an application."""
+    """Only bootloader announcements are received, no frames of an application."""
     number: int = 0
     """Number of this change, counting up; always 0 for virtual units."""
 
@@ -196,13 +192,13 @@ class Ask:
 
 @dataclass(frozen=True)
 class CannotWork:
-    """The process ends and must not be restarted: the recipe changed, or a setting is wrong."""
+    """The process ends and must not be restarted: the recipe changed or a setting is wrong."""
 
     reason: str
 
 
 RunEvent = StepStarted | Progressed | OperatorPrompted
-"""Progress of a run, only displayed. The station adds the socket."""
+"""Progress of a run, for display. The station adds the socket."""
 FromWorker = (
     AdapterReady | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork
 )

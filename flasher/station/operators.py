@@ -1,4 +1,4 @@
-"""Operators of a station: badges, roles with what they may override, and PINs.
+"""Operators of a station: badges, roles, PINs, and the commands that they permit.
 
     [[person]]
     name = "Jo"
@@ -6,7 +6,7 @@
     role = "rework"
     pin = "$argon2id$..."              # printed by `flasher station pin`
 
-`Crew` only decides: times are arguments, and the station runs the slow check of a PIN.
+`Crew` does no I/O: times are arguments, and the station runs the slow check of a PIN.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from flasher.station.socket import PAGE, Source
 PIN_LIMIT_S: Final = 30.0
 """Time limit for the PIN after the command that needs it."""
 HIDDEN: Final = "****"
-"""Shown instead of scanned or typed text that may be a PIN."""
+"""Displayed instead of a scan or typed text that may be a PIN."""
 
 
 class Role(StrEnum):
-    """Role of a person, which decides the commands that he or she may give."""
+    """Role of a person: decides which commands the person may give."""
 
     OPERATOR = "operator"
     REWORK = "rework"
@@ -52,7 +52,7 @@ _ROLES: Final[Mapping[Word, frozenset[Role]]] = {
     Word.ABORT: _REWORK,
     Word.RESUME: frozenset({Role.SUPERVISOR}),
 }
-"""Roles that may give a command that overrides the station. Other commands are open to all."""
+"""Roles that may give a command that overrides the station. Anyone may give the others."""
 
 
 class Person(TomlTable):
@@ -101,8 +101,8 @@ BADGES: Final = Reader(BadgeTable, "badge table")
 
 
 def load_badges(path: Path, serial_number: SerialNumberRule) -> tuple[Person, ...]:
-    """Load the people of a badge table. Raises UsageError with all problems, among them badges that
-    could be labels of this recipe.
+    """Load the people of a badge table. Raises UsageError with all problems, for example a badge
+    code that could be a label of this recipe.
     """
     table = BADGES.load(path)
     # Without the check digit: a label that was misread must not be taken for a badge.
@@ -134,13 +134,13 @@ class Asked:
 
     @property
     def text(self) -> str:
-        """The command as it was scanned."""
+        """The command as scanned."""
         return f"{self.word.value} {self.argument}".strip()
 
 
 class Crew:
-    """The people of a station: who has a badge, who is the operator, and the command that waits for
-    a PIN. Without badges every command is allowed.
+    """People of a station: their badges, the present operator, and the command that waits for a
+    PIN. Without badges every command is allowed.
     """
 
     def __init__(self, people: Iterable[Person]) -> None:
@@ -151,9 +151,7 @@ class Crew:
         """The operator; None before the first badge is scanned."""
         self.asked: Asked | None = None
         self._tries: dict[tuple[str, str], BackOff] = {}
-        """Tries of PINs by person and source: wrong PINs at a page do not lock the person out at
-        the scanner.
-        """
+        """PIN tries by person and source: wrong PINs on a page do not block the scanner."""
 
     @property
     def codes(self) -> frozenset[str]:
@@ -167,7 +165,7 @@ class Crew:
         return self._people.get(text)
 
     def may_be_pin(self, text: str) -> bool:
-        """True for a text that may be a PIN, for example one that was typed too late."""
+        """True for a text that may be a PIN, for example a late one."""
         return self.has_pins and pins.is_form(text)
 
     def check_assigned(self) -> None:
@@ -179,7 +177,7 @@ class Crew:
 
     def check_role(self, word: Word) -> Person | None:
         """Check that the operator may give a command. Returns the operator if the command needs a
-        role, else None. Raises Refused when the operator's role may not give it.
+        role, else None. Raises Refused.
         """
         if word not in _ROLES:
             return None
@@ -189,14 +187,14 @@ class Crew:
             raise Refused(
                 "NOT_ALLOWED",
                 text("{name} may not do that.", name=printable(person.name)),
-                text("Somebody of rework, or a supervisor, has to scan the badge first.")
+                text("A rework operator or a supervisor has to scan a badge first.")
                 if Role.REWORK in _ROLES[word]
-                else text("A supervisor has to scan the badge first."),
+                else text("A supervisor has to scan a badge first."),
             )
         return person
 
     def ask(self, person: Person, word: Word, argument: str, now: float, source: Source) -> Asked:
-        """Wait for a person's PIN before a command. Raises Refused after too many wrong PINs."""
+        """Make a command wait for a person's PIN. Raises Refused after too many wrong PINs."""
         if remedy := self.lock_words(person.name, source, now):
             name = printable(person.name)
             raise Refused("PIN_LOCKED", text("Too many wrong PINs of {name}.", name=name), remedy)
@@ -204,17 +202,17 @@ class Crew:
         return self.asked
 
     def lock_words(self, name: str, source: Source, now: float) -> str:
-        """Remedy with the time to wait after too many wrong PINs; "" when a PIN is accepted."""
+        """Remedy with the time to wait after too many wrong PINs; "" if a PIN is accepted."""
         wait_s = self._tries_of(name, source).wait_s(now)
         if wait_s == 0.0:
             return ""
         return text("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
 
     def count_try(self, name: str, source: Source, now: float) -> None:
-        """Count a PIN of this person before it is checked."""
+        """Count a PIN of this person, before its check."""
         self._tries_of(name, source).count(now)
 
-    def was_right(self, name: str, source: Source) -> None:
+    def forget_tries(self, name: str, source: Source) -> None:
         self._tries_of(name, source).reset()
 
     def _tries_of(self, name: str, source: Source) -> BackOff:

@@ -1,7 +1,7 @@
-"""Patterns of serial numbers with bounded matching time, and check digits by python-stdnum.
+"""Serial-number patterns with bounded matching time, and check digits by python-stdnum.
 
-Recipes come from outside, and matching a regular expression such as `(A+)+` can take years. So
-patterns are a subset of Python's regular expressions: characters, classes, named groups that are
+Recipes are untrusted, and matching a regular expression such as `(A+)+` can take years. Patterns
+are therefore a subset of Python's regular expressions: characters, classes, named groups that are
 not repeated, counts (`{8}`, `{2,4}`, `?`) of single characters, and alternatives, but no unlimited
 repetition. The product of all choices is at most `WAYS_MAX`.
 """
@@ -35,7 +35,7 @@ _ALLOWED: Final = (
 
 
 class Pattern:
-    """A pattern. Raises ValueError for one that is invalid or not bounded."""
+    """A compiled pattern. Raises ValueError for an invalid or unbounded one."""
 
     def __init__(self, text: str) -> None:
         if len(text) > PATTERN_MAX:
@@ -57,9 +57,7 @@ class Pattern:
         return tuple(self._compiled.groupindex)
 
     def match(self, text: str) -> dict[str, str] | None:
-        """The named groups if the pattern matches the whole text, else None. Groups that did not
-        take part in the match are empty.
-        """
+        """Named groups if the pattern matches the whole text, else None. Unused groups are ""."""
         if len(text) > TEXT_MAX:
             return None
         match = self._compiled.fullmatch(text)
@@ -73,7 +71,7 @@ def pattern_of(text: str) -> Pattern:
 
 
 def _ways(text: str) -> int:
-    """Number of ways to match a text. Raises ValueError for anything outside of the subset."""
+    """Number of ways to match a text. Raises ValueError for a pattern outside the subset."""
     position, ways, depth = 0, 1, 0
     alternatives = [1]
     may_repeat = False
@@ -118,7 +116,7 @@ def _choices(token: re.Match[str]) -> int:
 
 
 def _check(form: str, is_right: Callable[[str], bool]) -> Callable[[str], bool]:
-    """Restrict a check to texts of this form, since those of stdnum accept more than allowed."""
+    """Restrict a check to texts of this form, since stdnum accepts more than allowed."""
     return lambda text: re.fullmatch(form, text) is not None and is_right(text)
 
 
@@ -132,4 +130,4 @@ CHECKS: Final = {
     "mod37-36": _check("[0-9A-Z]{2,}", mod_37_36.is_valid),
     "mod97-10": _check("[0-9A-Z]{3,}", mod_97_10.is_valid),
 }
-"""Checks by method. Each gets the text with its check characters."""
+"""Check-digit functions by method, for a text with its check characters."""

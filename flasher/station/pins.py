@@ -1,4 +1,4 @@
-"""PINs of badges: their form and their argon2 hashes."""
+"""PINs of badges: format and argon2 hashes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FORM: Final = re.compile(r"[0-9]{4,12}", re.ASCII)
 FORM_WORDS: Final = "4 to 12 digits"
 _MEMORY_MAX_KIB: Final = 1024 * 1024
 _ROUNDS_MAX: Final = 20
-"""Hashes with higher parameters are refused: checking them would delay the line."""
+"""Time cost from which a hash is refused: checking it would delay the line."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Pin:
 
 
 def is_form(text: str) -> bool:
-    """True for a text that may be a PIN."""
+    """True for a text with the format of a PIN."""
     return _FORM.fullmatch(text) is not None
 
 
@@ -41,7 +41,7 @@ def checker() -> Executor:
 
 
 def is_right(pin: Pin, pin_hash: str) -> bool:
-    """True when the hash is of this PIN. It takes about 50 ms, which slows down guessing."""
+    """True if the hash is of this PIN. Takes about 50 ms, which slows down guessing."""
     try:
         return PasswordHasher().verify(pin_hash, pin.text)
     except VerificationError:
@@ -49,7 +49,7 @@ def is_right(pin: Pin, pin_hash: str) -> bool:
 
 
 def check_hash(pin_hash: str) -> None:
-    """Raises ValueError for a text that is not the hash of a PIN; the message does not show it."""
+    """Raises ValueError for a text that is not the hash of a PIN; the message hides the text."""
     try:
         parameters = extract_parameters(pin_hash)
     except InvalidHashError:

@@ -1,4 +1,4 @@
-"""Switches the power of a unit by a command of the station file, such as `relay 3 {on|off}`.
+"""Switches a unit's power by a command of the station file, such as `relay 3 {on|off}`.
 
 A power cycle runs in a thread: the bootloader announces itself for 0.2 s after power-up, and the
 caller has to receive meanwhile.
@@ -18,23 +18,23 @@ from flasher.protocol.text import printable
 from flasher.station.config import power_command
 
 OFF_S: Final = 1.0
-"""How long the power stays off, so that the capacitors of a controller discharge."""
+"""Time that the power stays off, so that the capacitors of a controller discharge."""
 COMMAND_LIMIT_S: Final = 10.0
 Run = Callable[[Sequence[str]], None]
 
 
 class PowerControl(Protocol):
-    """Switches the unit off and on."""
+    """Switches a unit off and on."""
 
     def begin_cycle(self) -> None:
-        """Begin a power cycle, and return at once. Raises BusError if the cycle before failed."""
+        """Start a power cycle and return at once. Raises BusError if the previous one failed."""
 
     def check(self) -> None:
-        """Raises BusError when a cycle failed."""
+        """Raises BusError if a power cycle failed."""
 
 
 class PowerCommand:
-    """Switches the power of one socket. `run` runs an argument list, and raises BusError."""
+    """Switches a socket's power. `run` runs an argument list, and raises BusError."""
 
     def __init__(
         self,
@@ -53,15 +53,15 @@ class PowerCommand:
         self._failure: FlasherError | None = None
 
     def begin_cycle(self) -> None:
-        """Begin to switch off, and on again after `off_s`. Returns at once, or after the end of a
-        running cycle. Raises BusError if the cycle before failed.
+        """Switch off, and on again after `off_s`, in a thread; waits for the end of a running
+        cycle. Raises BusError if the previous one failed.
         """
         self.check()
         self._thread = threading.Thread(target=self._cycle, daemon=True)
         self._thread.start()
 
     def check(self) -> None:
-        """Wait for the end of a cycle. Raises BusError when it failed."""
+        """Wait for the end of a cycle. Raises BusError if it failed."""
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join()
@@ -79,7 +79,7 @@ class PowerCommand:
 
 
 def run_command(words: Sequence[str]) -> None:
-    """Run a power command to its end. Raises BusError when it fails or takes too long."""
+    """Run a power command. Raises BusError if it fails or takes too long."""
     where = printable(shlex.join(words))
     remedy = "Try the command by hand; correct `power` in the station file."
     try:

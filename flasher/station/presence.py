@@ -1,8 +1,7 @@
-"""Presence detection on a bus: bootloader announcements, and whether a unit is in the socket.
+"""Detects whether a unit is in the socket, and when another one may have been put in.
 
 Units send messages on their own, announce themselves at power-up, or answer version requests while
-the socket is idle; the answer may contain the serial number. A target that does none of these is
-not detected; only a person can see it.
+the socket is idle; the answer may contain the serial number. Others are not detected.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
 BLIND_S: Final = 0.15
-"""A longer time between two polls of the bus, in real seconds, counts as unobserved. Polls are 0.1
-s apart. It must stay below `PAUSE_S`, with the frames discarded before the next poll."""
+"""Seconds of real time between two polls of the bus from which it counts as unobserved. Polls are
+0.1 s apart. It must stay below `PAUSE_S`, with the frames discarded before the next poll."""
 SILENCE_S: Final = 2.0
-"""A unit that has sent nothing for this time counts as removed."""
+"""Silence after which a unit counts as removed."""
 PROBE_S: Final = 0.5
 """Interval between requests to a unit."""
 PAUSE_S: Final = 0.25
@@ -43,13 +42,13 @@ _ANNOUNCEMENT: Final = (
 )
 """First bytes of the first frame of an announcement."""
 BACKLOG_S: Final = 0.1
-"""Frames that are read so soon after unobserved time may have been sent in it."""
+"""Frames read this soon after unobserved time may have been sent in it."""
 _RHYTHM_S: Final = 1.0
-"""Pauses of a bootloader that keeps announcing recur within this time."""
+"""Maximum interval after which an equal pause of a repeating bootloader occurs again."""
 _ALIKE: Final = 1.2
-"""Two pauses within this factor of each other are alike."""
+"""Factor within which two pauses count as equal."""
 _RECURRENCES: Final = 2
-"""Units that are exchanged one after the other make alike pauses once, but hardly so often."""
+"""Units that are exchanged one after another make equal pauses once, but hardly this often."""
 
 
 class Watched(Protocol):
@@ -62,7 +61,7 @@ class Watched(Protocol):
 
 
 class TargetWatcher:
-    """Tap of a driver that records a device's announcements, traffic and version answers."""
+    """Driver tap that records a device's announcements, frames and version answers."""
 
     def __init__(self, loaded: Watched) -> None:
         timings = loaded.profile.timings
@@ -70,21 +69,21 @@ class TargetWatcher:
         self._boot = Reassembler(loaded.target.answer_id, limit_s)
         self._own_ids = frozenset(sent_ids(loaded.target))
         self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
-        """Its version request; None without a known one."""
+        """Its version request; None if unknown."""
         item = None if self.request is None else self.request.answer_item
         self._item = item
         self._answers = None if item is None else Reassembler(item.can_id, limit_s)
         self.announcements = self.begun_announcements = 0
-        """Announcements of its bootloader: complete ones, and those whose first frame came."""
+        """Numbers of announcements of its bootloader: complete ones, and first frames."""
         self.version = ""
         """The last announced boot version, escaped."""
         self.heard_at: float | None = None
         """Time of the last frame of the device."""
         self.has_sent_message = False
-        """A whole message of its bootloader, or any frame of its application, was received."""
+        """A complete message of its bootloader, or any frame of its application, was received."""
         self.announced_at: float | None = None
         self.transfer_requests = 0
-        """Number of transfer requests of its bootloader."""
+        """Number of transfer requests from its bootloader."""
         self.confirmations = 0
         """Number of confirmed writes and resets."""
         self.completions = 0
@@ -95,27 +94,27 @@ class TargetWatcher:
         """The last version answer."""
         self.power_ups = 0
         """Number of times that another unit may have been put in: announcements after a pause or
-        after traffic of the application, or traffic of the application after announcements that
-        were not expected to end."""
+        after frames of the application, or frames of the application after unlimited
+        announcements."""
         self.has_application = False
         """The application has sent a frame since the last announcement."""
         self.application_frames = 0
         self._announcing_on_s = timings.announcing_on_s
         self._announcing_s = 0.0
-        """Duration of the announcements so far."""
+        """Duration of the present burst of announcements."""
         self._burst = self._recurrences = 0
-        """Announcements since the last pause, and how often an alike pause has recurred."""
+        """Announcements since the last pause, and how often an equal pause has occurred again."""
         self._paused = (0.0, 0)
         """The last pause between announcements (0 before the first), and the number of
         announcements in the burst before it."""
         self._paused_at = float("-inf")
         """Time at which that pause ended."""
         self._is_pace_unknown = False
-        """There was only one announcement before the last pause, the first one."""
+        """Before the last pause there was only one announcement."""
         self._missed_s = 0.0
         """Unobserved time since the last announcement."""
         self.serial: str | None = None
-        """The serial number in its last answer, empty without one; None: it has not answered."""
+        """Serial number in its last answer, "" without one; None: no answer yet."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         if sent or not frame.is_payload:
@@ -123,13 +122,13 @@ class TargetWatcher:
         if frame.can_id in self._own_ids:
             self.heard_at = now
             if frame.can_id != self._boot.can_id:
-                self._hear_application()
+                self._process_application()
                 self.has_sent_message = True
         if frame.can_id == self._boot.can_id:
             self.begun_announcements += frame.data.startswith(_ANNOUNCEMENT)
             for message in self._boot.feed(frame.data, now):
                 if isinstance(message, Message):
-                    self._hear_bootloader(message, now)
+                    self._process_bootloader(message, now)
         if self._answers is not None and frame.can_id == self._answers.can_id:
             for message in self._answers.feed(frame.data, now):
                 if isinstance(message, Message):
@@ -137,15 +136,15 @@ class TargetWatcher:
 
     @property
     def is_in_bootloader(self) -> bool:
-        """True when it has sent only announcements since the first one."""
+        """True if it has sent only announcements since the first one."""
         return self.announcements > 0 and not self.has_application
 
     @property
     def is_known(self) -> bool:
-        """True when it has announced itself or its application has sent."""
+        """True if it has announced itself or its application has sent a frame."""
         return self.announcements > 0 or self.has_application
 
-    def _hear_bootloader(self, message: Message, now: float) -> None:
+    def _process_bootloader(self, message: Message, now: float) -> None:
         self.has_sent_message = True
         match decode(message):
             case BootVersion(version=version):
@@ -158,7 +157,7 @@ class TargetWatcher:
             case Complete():
                 self.completions += 1
 
-    def _hear_application(self) -> None:
+    def _process_application(self) -> None:
         if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
             self._powered_up()  # a device without an application does not start one
         self.has_application = True
@@ -198,8 +197,8 @@ class TargetWatcher:
         self.announced_at, self.has_application = now, False
 
     def _recurs(self, now: float, pause_s: float) -> bool:
-        """True for a pause of a bootloader that announces itself at a pace of its own: at once
-        where one announcement is between two alike pauses, else when such a burst recurs again.
+        """True for a pause of a bootloader that keeps announcing itself: at once if one
+        announcement is between two equal pauses, else if such a burst occurs again.
         """
         before_s, burst = self._paused
         is_alike = (
@@ -212,13 +211,13 @@ class TargetWatcher:
         return self._recurrences >= (1 if self._burst == 1 else _RECURRENCES)
 
     def _powered_up(self) -> None:
-        """Discard the earlier answers: they may be of another unit."""
+        """Discard earlier answers, which may be of another unit."""
         self.power_ups += 1
         self._announcing_s = 0.0
         self.serial = self.answer = None
 
     def _take(self, message: Message) -> None:
-        """Record a message that may be the version answer."""
+        """Process a message that may be the version answer."""
         item = self._item
         if item is None or (message.mode, message.command) != (item.mode, item.command):
             return
@@ -229,7 +228,7 @@ class TargetWatcher:
 
 
 class Presence:
-    """Presence of a unit on an idle bus; pure: frames and times are arguments."""
+    """Presence of a unit on an idle bus, without I/O: frames and times are arguments."""
 
     def __init__(self, targets: Sequence[LoadedTarget]) -> None:
         self._targets = targets
@@ -241,7 +240,7 @@ class Presence:
 
     @property
     def sees_units(self) -> bool:
-        """True when a present unit can be asked."""
+        """True if a present unit can be detected by a request."""
         return bool(self._requests)
 
     @property
@@ -249,7 +248,7 @@ class Presence:
         return sum(watcher.power_ups for watcher in self.watchers)
 
     def _is_in_bootloader(self, now: float) -> bool:
-        """True when only announcements are received."""
+        """True if only announcements are received."""
         return all(
             watcher.is_in_bootloader
             for watcher in self.watchers
@@ -257,7 +256,7 @@ class Presence:
         )
 
     def begin(self) -> None:
-        """Reset after a run or an unobserved time, when everything may have changed."""
+        """Reset after a run or unobserved time, when everything may have changed."""
         self.is_there: bool | None = None
         """None while unknown."""
         self._heard_at: float | None = None
@@ -279,7 +278,7 @@ class Presence:
         """End of the last unobserved time in which a unit could be exchanged."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Handle one frame of an idle bus."""
+        """Process a frame of an idle bus."""
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
             # The rest of an announcement that began earlier does not count.
@@ -296,7 +295,7 @@ class Presence:
             self._heard_at += missed_s
 
     def probe(self, now: float) -> list[Frame]:
-        """The frames to send now: a version request to each target that has one, when due."""
+        """Frames to send now: a version request to each target that has one, when due."""
         if self._probed_at is not None and now - self._probed_at < PROBE_S:
             return []
         self._probed_at = now
@@ -307,7 +306,7 @@ class Presence:
         return frames
 
     def change(self, now: float) -> PresenceChanged | None:
-        """The change since the last call; None without one."""
+        """Change since the last call; None without one."""
         if self._began_at is None:
             self._began_at = now
         heard = self._heard_at is not None and now - self._heard_at < SILENCE_S

@@ -1,5 +1,4 @@
-"""Recipes: how a station flashes, writes and checks one product. `recipe_file` loads a recipe with
-its images, and checks it against them and the protocol.
+"""Recipes: how a station flashes, writes and checks one product.
 
     name = "Battery 36 V, line 2"
     part = "BAT-36-10"
@@ -19,9 +18,9 @@ its images, and checks it against them and the protocol.
     item = "serial-number"
     values = ["{serial}"]
 
-Values are templates that the scan fills in: `{serial}`, `{lot}`, `{date:%Y%m%d}` and
-`{match.week}`, and no others. `{{` and `}}` stand for the brackets. Python's `str.format` is not
-used, since it can reach the attributes of objects.
+`recipe_file` loads a recipe with its images. Values are templates with the placeholders `{serial}`,
+`{lot}`, `{date:%Y%m%d}` and `{match.week}`; `{{` and `}}` are brackets. They do not use Python's
+`str.format`, which can reach the attributes of objects.
 """
 
 from __future__ import annotations
@@ -114,7 +113,7 @@ class SerialNumberRule(TomlTable):
         return self
 
     def read(self, serial: str) -> dict[str, str]:
-        """The pattern's groups in a serial number. Raises ValueError for an invalid one."""
+        """Groups of the pattern in a serial number. Raises ValueError for an invalid one."""
         groups = pattern_of(self.pattern).match(serial)
         if groups is None:
             raise ValueError(f"{serial!a:.80} does not fit the pattern {self.pattern}")
@@ -204,7 +203,7 @@ class Limit(TargetTable):
     high: float | None = None
     """The largest accepted value."""
     expected: str | None = None
-    """Template of the expected text, for a field that is no number."""
+    """Template of the expected text, for a field that is not a number."""
 
     @model_validator(mode="after")
     def _check_limits(self) -> Limit:
@@ -264,14 +263,14 @@ class Golden(TomlTable):
 
 
 class Recipe(TomlTable):
-    """A recipe. `target` and `write` are processed in their order."""
+    """A recipe. `target` and `write` are processed in order."""
 
     name: ShortText
     """Name for people."""
     part: ShortText
     """Part number of the product. Serial numbers are unique within a part."""
     revision: Annotated[str, Field(min_length=1, max_length=64)]
-    """Revision, which the records name; change it with every change of the recipe."""
+    """Revision, which is recorded; change it with every change of the recipe."""
     notes: str = ""
     """Notes for people."""
     profile: str = ""
@@ -290,7 +289,7 @@ class Recipe(TomlTable):
     "continue" is for sockets that hold the unit until the run has ended; it is recorded."""
     golden: Golden | None = None
     allow_completed_not_read_back: bool = True
-    """Let a target pass that cannot be asked for its version; it is recorded."""
+    """Let a target without a version query pass; it is recorded."""
 
     @model_validator(mode="after")
     def _check_targets(self) -> Recipe:
@@ -304,7 +303,7 @@ class Recipe(TomlTable):
         return self
 
     def rule(self, step: StepName) -> StepRule:
-        """The rule of a step; the default rule if the recipe has none."""
+        """Rule of a step, or the default rule."""
         return self.step.get(step, _USUAL)
 
 
@@ -322,7 +321,7 @@ _GROUP: Final = "match."
 
 @dataclass(frozen=True)
 class Scan:
-    """The values of a scanned label, which fill templates."""
+    """Values of a scanned label, for templates."""
 
     serial: str
     day: date
@@ -338,12 +337,12 @@ def fill(template: str, scan: Scan) -> str:
 
 
 def check_template(template: str, groups: Collection[str]) -> None:
-    """Raises ValueError for a template that these groups of the pattern cannot fill."""
+    """Raises ValueError for a template with placeholders other than these groups."""
     fill(template, Scan("", date(2000, 1, 1), "", dict.fromkeys(groups, "")))
 
 
 def uses_lot(template: str) -> bool:
-    """True when the template has a {lot}."""
+    """True if the template contains {lot}."""
     return any(part[1] == "lot" for part in _PART.finditer(template))
 
 

@@ -1,8 +1,6 @@
-"""Loads a recipe with its images from disk, checks it against them, the protocol and a sample scan
-before a shift starts, and detects later changes of its files.
+"""Loads a recipe with its images, checks it before a shift, and detects later changes of its files.
 
-The files of a recipe are in its own folder: absolute paths, `..` and links that lead out of it are
-refused.
+The files of a recipe are in its folder: absolute paths, `..` and links out of it are refused.
 """
 
 from __future__ import annotations
@@ -49,14 +47,14 @@ _SAMPLE_LOT: Final = "LOT1"
 
 @dataclass(frozen=True)
 class LoadedTarget:
-    """A target of a recipe, with its image, manifest and profile."""
+    """A target of a recipe with its loaded image, manifest and profile."""
 
     firmware: Firmware
     image: Image = field(repr=False)
     release: Release
     profile: Profile
     required: Verified
-    """The verification that it needs to pass."""
+    """Verification level that a PASS requires."""
 
     @property
     def target(self) -> Target:
@@ -68,13 +66,13 @@ class LoadedTarget:
 
     @property
     def version(self) -> str:
-        """The version in the image, else the one in the manifest; empty when neither has one."""
+        """Version in the image, or else in the manifest; "" without one."""
         return self.image.version or self.release.firmware_version or ""
 
 
 @dataclass(frozen=True)
 class LoadedRecipe:
-    """A recipe with its images, as they were loaded."""
+    """A loaded recipe with its images."""
 
     recipe: Recipe
     path: Path
@@ -88,20 +86,21 @@ class LoadedRecipe:
 
     @cached_property
     def required(self) -> Verified:
-        """The lowest of the verifications that its targets need."""
+        """Lowest verification level that a target requires."""
         return min(target.required for target in self.targets)
 
     def is_unchanged(self) -> bool:
-        """True while its files on disk are those that were loaded."""
+        """True if its files on disk still have the loaded content."""
         try:
             return all(_sha256(path) == sha256 for path, sha256 in self.files.items())
         except FlasherError:
             return False
 
     def scan(self, serial: str, day: date, lot: str = "") -> Scan:
-        """Read a scanned serial number. `lot` is used when the serial number has no lot.
+        """Parse a scanned serial number. `lot` is used if the serial number contains none.
 
-        Raises ValueError for a serial number that this recipe does not accept, or of another lot.
+        Raises ValueError for a serial number that this recipe does not accept, or of another
+        lot.
         """
         rule = self.recipe.serial_number
         groups = rule.read(serial)
@@ -111,7 +110,7 @@ class LoadedRecipe:
         return Scan(serial, day, own_lot or lot, groups)
 
     def write_plan(self, write: Write, scan: Scan) -> WritePlan:
-        """Plan the write of one `[[write]]`. Raises UsageError for a value that does not fit."""
+        """Plan a `[[write]]`. Raises UsageError for a value that does not fit."""
         try:
             values = [fill(template, scan) for template in write.values]
         except ValueError as error:
@@ -123,9 +122,9 @@ class LoadedRecipe:
 
 
 def load_recipe(path: Path) -> LoadedRecipe:
-    """Load a recipe with its images, without trying its values, as `load_checked` does.
+    """Load a recipe with its images without trying its values.
 
-    Raises UsageError with all problems of the file and of the files that it names.
+    Raises UsageError with all problems of the file and the files that it refers to.
     """
     raw = read(path, TOML_MAX_SIZE, what="recipe")
     recipe = RECIPE.parse(raw, path)
@@ -149,7 +148,7 @@ def load_recipe(path: Path) -> LoadedRecipe:
 
 
 def load_checked(path: Path, day: date) -> LoadedRecipe:
-    """Load a recipe with its images, and check everything that can be checked without a device.
+    """Load a recipe with its images, and check everything that needs no device.
 
     `day`: the day of production of the sample scan. Raises UsageError with all problems.
     """
@@ -178,7 +177,7 @@ def _sha256(path: Path) -> str:
 
 
 def inside(recipe_path: Path, name: str) -> Path:
-    """Path of a file in the recipe's folder. Raises ValueError for a name that leads out of it."""
+    """Path of a file in the recipe's folder. Raises ValueError for a path outside."""
     windows, posix = PureWindowsPath(name), PurePosixPath(name)
     if windows.anchor or windows.drive or posix.is_absolute() or ".." in windows.parts:
         raise ValueError(f"{name!a:.80} is outside of the recipe's folder")
@@ -195,8 +194,8 @@ def inside(recipe_path: Path, name: str) -> Path:
 def _load_target(
     path: Path, recipe: Recipe, firmware: Firmware
 ) -> tuple[LoadedTarget, dict[Path, str]]:
-    """Load the target with its files. Raises ValueError for a file outside of the folder, and
-    FlasherError for an unusable one.
+    """Load a target with its files. Raises ValueError for a file outside the folder, FlasherError
+    for an unusable one.
     """
     image_path = inside(path, firmware.image)
     manifest = inside(path, firmware.manifest or str(manifest_path(firmware.image)))
@@ -326,7 +325,7 @@ def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
 
 
 def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
-    """The item that a table of the recipe reads. Raises UsageError for an unreadable one."""
+    """Item that a table of the recipe reads. Raises UsageError for an unreadable one."""
     target = next(each for each in loaded.targets if each.name == part.target)
     return find_item(
         part.item, readable(target.target, target.profile.dialect), target.target, "read"
@@ -334,7 +333,7 @@ def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
 
 
 def codec_of(loaded: LoadedRecipe, limit: Limit) -> Codec:
-    """The field that a limit measures. Raises UsageError for an unknown item or field."""
+    """Field that a limit measures. Raises UsageError for an unknown item or field."""
     item = readable_of(loaded, limit)
     fields = dict(meaningful_fields(item.content))
     if limit.field not in fields:

@@ -1,4 +1,4 @@
-"""Reports of many runs: their figures and rows as JSON, CSV and JUnit XML."""
+"""Reports of runs: figures and rows as JSON, CSV and JUnit XML."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCHEMA_VERSION: Final = 1
 
 @dataclass(frozen=True)
 class Report:
-    """The runs of a filter with their figures, read on first access, which raises RecordError."""
+    """The runs of a filter and their figures, read on first access. Raises RecordError."""
 
     records: Records
     chosen: RunFilter
@@ -39,11 +39,11 @@ class Report:
 
     @cached_property
     def runs(self) -> list[ReportedRun]:
-        """The runs, the oldest first."""
+        """The runs, oldest first."""
         return self.records.table(self.chosen)
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as types of JSON; times are texts in UTC."""
+        """The report as JSON types; times are UTC texts."""
         shares = {
             "yield_share": self.figures.yield_share,
             "first_pass_share": self.figures.first_pass_share,
@@ -62,12 +62,12 @@ class Report:
         return json.dumps(self.to_dict(), indent=1) + "\n"
 
     def to_csv(self) -> str:
-        """The runs as CSV: a line of headings, and a row for each run; empty without runs."""
+        """The runs as CSV with a line of headings; "" without runs."""
         return csv_text([*map(vars, self.runs[:1]), *(vars(run).values() for run in self.runs)])
 
     def to_junit(self) -> str:
-        """The runs as JUnit XML, one test case each: FAIL is a failure, ERROR and INTERRUPTED are
-        errors, ABORTED is skipped. Golden units and active runs are left out.
+        """The runs as JUnit XML test cases: FAIL is a failure, ERROR and INTERRUPTED are errors,
+        ABORTED is skipped. Golden units and active runs are left out.
         """
         cases = [
             _junit_case(run)
@@ -85,7 +85,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_cell(value: object) -> str:
-    """Format a cell of CSV. A text that a spreadsheet would take for a formula is escaped."""
+    """Format a cell of CSV; a text that a spreadsheet would take for a formula is escaped."""
     if isinstance(value, str):
         return no_formula(value)
     if isinstance(value, bool):

@@ -1,5 +1,4 @@
-"""Runs on the station's side: `with_history` prepares the claim of a run from earlier runs of the
-unit, and `save` saves its outcome.
+"""Prepares the claim of a run from earlier runs of the unit, and saves the run's outcome.
 
 `save` can be called again after any failure; the outcome is shown only after it is saved.
 """
@@ -41,20 +40,20 @@ class ActiveRun:
     claim: Claim
     begun_s: float
     where: str = StepName.CONNECT.value
-    """The active step, with its target."""
+    """Active step, with its target."""
     journal_error: str = ""
-    """Why a record of the run could not be saved; such a run cannot pass."""
+    """Reason why a record of the run could not be saved, so that it cannot pass; or ""."""
     reported: RunResult | None = None
-    """The result that the process reported; None until then."""
+    """Result that the process reported; None before."""
     ended_s: float = 0.0
     attached: list[AttachmentFile] = field(default_factory=list)
     result: RunResult | None = None
-    """The result to be saved."""
+    """Result to be saved."""
     is_save_noted: bool = False
 
 
 def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
-    """Save the end of a run; returns what is on disk. Raises RecordError."""
+    """Save the end of a run; returns the result on disk. Raises RecordError."""
     if run.result is None:
         run.result = _judged(run)
     if not run.attached:
@@ -67,7 +66,7 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
     try:
         store.finish(run.claim.run_id, _ending(run, run.result))
     except RuleBrokenError as error:
-        # The records refuse this PASS, so the program has a bug: the unit gets no verdict.
+        # The records refuse this PASS: the unit gets no verdict, since the program has a bug.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
         store.finish(run.claim.run_id, _ending(run, run.result))
     store.files.forget_spooled(run.claim.run_id)
@@ -84,7 +83,7 @@ def _judged(run: ActiveRun) -> RunResult:
 
 
 def _attach(store: Store, run: ActiveRun) -> None:
-    """Store the trace, and check that it is the one that the process closed."""
+    """Store the trace, and check that its hash is the one that the process reported."""
     trace, closed = run.claim.trace, run.reported and run.reported.trace_sha256
     if closed is None:
         if trace.exists():
@@ -110,13 +109,13 @@ def _ending(run: ActiveRun, result: RunResult) -> RunEnd:
 
 
 def sentence(text: str) -> str:
-    """Add a full stop to a text, so that another sentence can follow."""
+    """Add a full stop if needed, so that another sentence can follow."""
     text = text.strip()
     return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
 def verified_words(result: RunResult) -> str:
-    """The verification level of each target, for people."""
+    """Verification level of each target, for people."""
     return "; ".join(f"{name}: {level.words}" for name, level in result.verified.items())
 
 
@@ -130,12 +129,12 @@ _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED
 def with_history(
     claim: Claim, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
 ) -> Claim:
-    """Add the results of the unit's earlier runs to a claim.
+    """Add results of the unit's earlier runs to a claim.
 
     Flashes count since the last PASS or FAIL, and since the last run in which the unit may have
-    been exchanged. Values that must not change are kept since the last PASS, since a run that
-    failed after its first write may have changed them; `is_reworked`: only since the last verdict,
-    so that the run reads them again.
+    been exchanged. Values that must not change are those since the last PASS, since a run that
+    failed after its first write may have changed them; with `is_reworked`, those since the last
+    verdict, so that the run reads them again.
     """
     runs = [] if life is None else list(life.runs)
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
@@ -156,13 +155,13 @@ def with_history(
 
 
 def _after(runs: list[RunDetails], ends: Callable[[RunDetails], bool]) -> list[RunDetails]:
-    """The runs after the last one for which `ends` is true."""
+    """Runs after the last one for which `ends` is true."""
     last = next((at for at in reversed(range(len(runs))) if ends(runs[at])), -1)
     return runs[last + 1 :]
 
 
 def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
-    """Values that must not change, as the first run with a write read them before it."""
+    """Values that must not change, as the first run with a write read them before that write."""
     known: dict[str, str] = {}
     for run in runs:
         if not run.writes:
@@ -175,7 +174,7 @@ def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
 
 
 def _flashed(runs: Sequence[RunDetails], recipe: LoadedRecipe) -> frozenset[str]:
-    """Targets whose last flash in these runs was of this image, and was read back."""
+    """Targets whose last flash in these runs wrote this image and was read back."""
     last: dict[str, WriteRecord] = {}
     for run in runs:
         last |= {write.target: write for write in run.writes if write.what == FLASH}

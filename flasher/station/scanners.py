@@ -1,6 +1,6 @@
-"""Scanners that the station reads directly, independent of the focus of a screen: Linux input
-devices, which it grabs, and serial ports. A thread reads each scanner, and opens it again after it
-was unplugged.
+"""Reads scanners directly, whatever window has the focus: Linux input devices and serial ports.
+
+A thread reads each scanner, and opens it again after it was unplugged.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ READ_S: Final = 0.2
 _SYS_INPUT: Final = Path("/sys/class/input")
 _DEV_INPUT: Final = Path("/dev/input")
 _TYPES_TEXT: Final = 1 << 28 | 1 << 2
-"""Keys of a device that types: Enter, and the digit 1."""
+"""Bits of the keys that a device with text input has: Enter and 1."""
 _ENDS: Final = b"\r\n\t"
 
 
@@ -34,10 +34,10 @@ class NoScanner(Exception):  # noqa: N818  it may be plugged in later
 
 
 class Reads(Protocol):
-    """An open scanner. Both methods raise OSError when it was unplugged."""
+    """An open scanner. Methods raise OSError if it was unplugged."""
 
     def read(self, limit_s: float) -> None:
-        """Read scanned characters, and wait for them up to `limit_s`."""
+        """Read scanned characters; wait for them up to `limit_s`."""
 
     def close(self) -> None: ...
 
@@ -47,7 +47,7 @@ Open = Callable[[ScanBuilder], Reads]
 
 
 class Scanner:
-    """One configured scanner, plugged in or not. A thread reads it while the block runs."""
+    """A configured scanner, plugged in or not. A thread reads it while the block runs."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class Scanner:
         publish: Callable[[StationEvent], None],
         open_scanner: Open | None = None,
     ) -> None:
-        """`submit` gets each scan, and the scanner as its source."""
+        """`submit` is called with each scan and the scanner as its source."""
         self.config = config
         self._source = Source(SCANNER + printable(config.name), config.socket)
         self._publish = publish
@@ -64,7 +64,7 @@ class Scanner:
         self._open = open_scanner or _opener(config)
         self._device: Reads | None = None
         self._why: str | None = None
-        """Why the last read failed; None before the first one."""
+        """Reason of the last failure; None before the first one."""
         self._ended = threading.Event()
         self._thread = threading.Thread(
             target=self._work, name=f"scanner {config.name}", daemon=True
@@ -107,7 +107,7 @@ class Scanner:
             self._device = None
 
     def _gone(self, why: str) -> None:
-        """Report that it cannot be read; once for each reason."""
+        """Report once per reason that the scanner cannot be read."""
         self._builder.drop()
         was_open = self._device is not None
         try:
@@ -135,7 +135,7 @@ class Scanner:
 
 
 class InputScanner:
-    """A scanner that is a keyboard; `device` is one of evdev."""
+    """A scanner that acts as a keyboard; `device` is an evdev device."""
 
     def __init__(self, device: Any, builder: ScanBuilder) -> None:
         self._device = device
@@ -174,7 +174,7 @@ def _types_text(entry: Path) -> bool:
 
 
 class SerialScanner:
-    """A scanner on a serial port; `port` is one of pyserial."""
+    """A scanner on a serial port; `port` is a pyserial port."""
 
     def __init__(self, port: Any, builder: ScanBuilder) -> None:
         self._port = port

@@ -58,7 +58,7 @@ class Word(StrEnum):
 
 @dataclass
 class Waiting:
-    """A scan of one source that waits for the other scan of its pair, card and label."""
+    """A scan that waits for the other scan of its pair, card and label, from the same source."""
 
     source: Source
     label: str = ""
@@ -66,19 +66,17 @@ class Waiting:
     card: Socket | None = None
     """A socket whose card waits for its label."""
     is_in_doubt: bool = False
-    """A card, or a second card or label, was refused; the next scan may belong to it, and must not
-    be assigned to another unit or socket.
-    """
+    """A card, or a second card or label, was refused: the next scan may belong to it, and must not
+    be assigned to another unit or socket."""
     refused_label: tuple[str, float] | None = None
-    """The last label refused for that, and when. It is accepted when it is scanned again after its
-    refusal could be read. Another label is not: people who share the source may each have scanned
-    the card.
-    """
+    """The last label refused for that reason, and its time. A later scan of the same label is
+    accepted; another label is not, since people who share the source may each have scanned the
+    card."""
     forget_at_s: float | None = None
 
     @property
     def text(self) -> str:
-        """The waiting scan; empty without one."""
+        """The waiting scan; "" without one."""
         return self.label or ("" if self.card is None else f"{Word.SOCKET.value} {self.card.name}")
 
     def forget(self) -> None:
@@ -109,13 +107,13 @@ class ScanCommand:
 
 @dataclass(frozen=True)
 class NotUnderstood:
-    """Neither a label nor a command; `why` is the reason."""
+    """A scan that is neither a label nor a command; `why` is the reason."""
 
     why: str
 
 
 def understand(scan: str) -> Label | ScanCommand | NotUnderstood:
-    """Parse a scan. Labels are compared with the recipe later."""
+    """Parse a scan. Whether a label belongs to the recipe is checked later."""
     scanned = scan.strip()
     if not scanned:
         return NotUnderstood(text("Nothing was scanned."))
@@ -141,7 +139,7 @@ Sockets = Mapping[str, Socket]
 
 
 class Refused(Exception):  # noqa: N818  not an error of the program
-    """A scan is refused, without effect: a stable code, a sentence, and a remedy."""
+    """A scan is refused without effect: stable code, reason and remedy."""
 
     def __init__(self, code: str, reason: str, remedy: str) -> None:
         super().__init__(reason)
@@ -151,8 +149,8 @@ class Refused(Exception):  # noqa: N818  not an error of the program
 
 
 def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Binding] | None:
-    """Find the socket of a label that was scanned alone. Returns None when the operator has to scan
-    the card of its socket. Raises Refused.
+    """Socket for a label that was scanned alone. None: the operator has to scan the card of its
+    socket. Raises Refused.
     """
     if len(sockets) == 1:
         (only,) = sockets.values()
@@ -164,7 +162,7 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
     ]
     reporting = [each for each in idle if each.is_there and each.own == serial]
     if len(reporting) == 1:
-        return reporting[0], Binding.SAID
+        return reporting[0], Binding.CONFIRMED
     starting = next((each for each in sockets.values() if each.is_starting), None)
     if starting is not None:
         raise Refused(
@@ -180,11 +178,11 @@ def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Bindin
         return None
     empty = (e for e in sockets.values() if e.occupancy is Occupancy.EMPTY and e.can_work)
     named = next((e for e in empty if e in idle and not e.label), None)
-    return None if named is None else (named, Binding.NAMED)
+    return None if named is None else (named, Binding.PROMPTED)
 
 
 def was_in(sockets: Sockets, serial: str) -> Socket | None:
-    """The socket in which the unit had its last run, unless it passed; None without one."""
+    """Socket of the unit's last run, unless it passed; None without one."""
     for each in sockets.values():
         last = each.verdict
         if each.interrupted == serial or (last is not None and last.serial == serial):
@@ -201,10 +199,10 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
         raise one_at_a_time(only.label, only.wanted, _way_out(only, source))
     last = only.verdict
     if last is None or last.serial == serial:
-        return Binding.ONLY
+        return Binding.ONLY_SOCKET
     if only.occupancy is not Occupancy.SILENT:
-        return Binding.NAMED  # the next one, when this one is out
-    if last.outcome is not RunState.PASS and not last.has_talked and only.sees_units:
+        return Binding.PROMPTED  # the next one, when this one is out
+    if last.outcome is not RunState.PASS and not last.has_sent and only.sees_units:
         # It may be in its bootloader, and announce itself at any time.
         raise Refused(
             "TAKE_OUT",
@@ -215,11 +213,11 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
             ),
             text("Take it out, scan FREE {socket}, then the label again.", socket=only.name),
         )
-    return Binding.ONLY
+    return Binding.ONLY_SOCKET
 
 
 def check_free(socket: Socket) -> None:
-    """Raises Refused while a run of the socket is active or unsaved."""
+    """Raises Refused while a run of the socket is active or not saved."""
     if socket.phase is not SocketPhase.REST:
         serial = printable(socket.serial)
         reason = text("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
@@ -227,18 +225,18 @@ def check_free(socket: Socket) -> None:
 
 
 def check_service(socket: Socket) -> None:
-    """Raises Refused for a socket that cannot work; not for one that is starting."""
+    """Raises Refused for a socket that is out of service, but not for one that is starting."""
     if socket.out_of_service:
         reason = text(
             "Socket {socket} is out of service: {why}",
             socket=socket.name,
             why=socket.out_of_service,
         )
-        raise Refused("SOCKET_BROKEN", reason, text("Use another socket, or mend this one."))
+        raise Refused("SOCKET_BROKEN", reason, text("Use another socket, or repair this one."))
 
 
 def check_known(sockets: Sockets, serial: str) -> None:
-    """Raises Refused for the label of a unit that runs, or has just passed."""
+    """Raises Refused for the label of a unit that is running or has just passed."""
     for each in sockets.values():
         if each.phase is not SocketPhase.REST and each.serial == serial:
             reason = text("It runs in socket {socket}.", socket=each.name)
@@ -250,7 +248,7 @@ def check_known(sockets: Sockets, serial: str) -> None:
 
 
 def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
-    """Raises Refused for a label that was scanned already, or while another one waits. `waiting`:
+    """Raises Refused for a label that was already scanned, or while another one waits. `waiting`:
     the waiting scan of the same source.
     """
     for each in sockets.values():
@@ -261,7 +259,7 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
                 socket=each.name,
             )
             raise Refused("DOUBLE_SCAN", text("It was scanned already."), remedy)
-        if each.label and each.binding is Binding.NAMED:
+        if each.label and each.binding is Binding.PROMPTED:
             raise one_at_a_time(each.label, each.wanted, _way_out(each, waiting.source))
     label = waiting.label
     if label:
@@ -272,17 +270,17 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
 
 
 def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
-    """Raises Refused for a label when another unit is known to be in the socket."""
+    """Raises Refused for a label if another unit is known to be in the socket."""
     last = socket.holds
     if last is not None and last.serial != serial:
         raise still_there(socket, last)
     if socket.is_of_another(serial):
-        raise Refused(codes.WRONG_UNIT.name, _said_by(socket), codes.WRONG_UNIT.action)
+        raise Refused(codes.WRONG_UNIT.name, _report_of(socket), codes.WRONG_UNIT.action)
     for each in sockets.values():
         if each is not socket and each.is_there and each.own == serial:
             raise Refused(
                 codes.WRONG_UNIT.name,
-                _said_by(each),
+                _report_of(each),
                 text(
                     "Compare the labels of the units in the sockets {one} and {other}.",
                     one=each.name,
@@ -291,7 +289,7 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
             )
 
 
-def _said_by(socket: Socket) -> str:
+def _report_of(socket: Socket) -> str:
     own = printable(socket.own or "")
     return text("The unit in socket {socket} reports {own}.", socket=socket.name, own=own)
 
@@ -299,7 +297,7 @@ def _said_by(socket: Socket) -> str:
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Source) -> None:
     """Raises Refused for a label that was already assigned to another socket by its card."""
     for each in sockets.values():
-        if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
+        if each is not socket and each.label == serial and each.binding is not Binding.PROMPTED:
             reason = text("It was scanned for socket {socket}.", socket=each.name)
             way = _way_out(each, source)
             remedy = text("{wanted} Or scan {way}.", wanted=each.wanted, way=way)
@@ -307,12 +305,12 @@ def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Sour
 
 
 def _way_out(socket: Socket, source: Source) -> str:
-    """The scan that drops a label which waits for its unit."""
+    """Scan that drops a label which waits for its unit."""
     return Word.CANCEL.value if socket.source == source else f"{Word.FREE.value} {socket.name}"
 
 
 def card_waits(socket: Socket) -> Refused:
-    """The refusal of a scan for a socket whose card was scanned at another source."""
+    """Refusal of a scan for a socket whose card was scanned at another source."""
     return Refused(
         "CARD_WAITS",
         text("The card of socket {socket} was scanned elsewhere.", socket=socket.name),
@@ -321,13 +319,13 @@ def card_waits(socket: Socket) -> Refused:
 
 
 def one_at_a_time(label: str, wanted: str, way: str = Word.CANCEL.value) -> Refused:
-    """The refusal of a label while another one waits."""
+    """Refusal of a label while another one waits."""
     reason = text("{label} was scanned before and waits for its unit.", label=printable(label))
     return Refused("LABEL_WAITS", reason, text("{wanted} Or scan {way}.", wanted=wanted, way=way))
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:
-    """The refusal of a scan while the unit of the last run is in the socket."""
+    """Refusal of a scan while the unit of the last run is still in the socket."""
     return Refused(
         "TAKE_OUT",
         text(

@@ -1,5 +1,5 @@
-"""Signed content of a certificate: the canonical content of its run, the audit row with the digests
-of that content, and the station's signature of the row.
+"""Signed content of a certificate: the content of its run, the audit row with its digests, and the
+station's signature.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LINE: Final = 96
 _CONTENT: Final = re.compile(r"(?!\d+/\d+$)[A-Za-z0-9+/=]+")
 """Matches lines of the content, but not page numbers such as "1/2" that browsers print."""
 _MAX_SIZE: Final = 4 * 1024 * 1024
-"""Bytes of the unpacked content."""
+"""Maximum size of the unpacked content in bytes."""
 LEFT_OUT: Final = ("recipe", "claim")
 """Parts that certificates omit: the recipe is confidential, and the claim follows from the run."""
 
@@ -44,9 +44,9 @@ class Sealed:
     """The signed content of a certificate."""
 
     flasher: str
-    """Version of flasher that made it."""
+    """Version of the flasher that made the certificate."""
     made_at: str
-    """When the page was made (ISO 8601)."""
+    """Time at which the page was made (ISO 8601)."""
     is_kept: bool
     is_beside: bool
     examined_at: str
@@ -56,12 +56,12 @@ class Sealed:
     recipe: dict[str, str]
     """Name, revision and SHA-256 of the recipe."""
     row: dict[str, Any]
-    """The audit row."""
+    """The audit row of the run."""
     station: str
     signature: str
     key: str
     earlier: tuple[dict[str, Any], ...]
-    """Earlier runs of the unit, which the signature does not cover."""
+    """Earlier runs of the unit, not covered by the signature."""
     earlier_left_out: int
     """Number of earlier runs that are not in `earlier`."""
 
@@ -74,7 +74,7 @@ class Sealed:
 
     @property
     def digests(self) -> Mapping[str, str]:
-        """Digests of the content in the audit row, by table."""
+        """Digests of the content by table, from the audit row."""
         digests = chain.data_of(self.row["data"]).get("digests")
         return digests if isinstance(digests, dict) else {}
 
@@ -83,7 +83,7 @@ class Sealed:
         return chain.digest(dict(self.digests))
 
     def wrong(self) -> list[str]:
-        """Lists the differences from the content that the station signed, in words."""
+        """Differences from the content that the station signed, in words."""
         row = self.row
         if chain.row_hash(row) != row["hash"]:
             return [text("the audit row in it was changed")]
@@ -98,7 +98,7 @@ class Sealed:
             if part != "recipe" and found.get(part) != stated
         ]
         if not self.digests or row["run_id"] != self.content["run"]["id"]:
-            wrong.append("which run it is about")
+            wrong.append("its run number")
         return (
             [text("it was changed after it was signed: {what}", what=", ".join(wrong))]
             if wrong
@@ -126,11 +126,11 @@ class CheckedCertificate:
     fingerprint: str
     """Fingerprint of the station's key."""
     made_at: str
-    """Empty for a QR code, which does not have it."""
+    """"" for a QR code, which does not contain it."""
     problems: tuple[str, ...]
-    """Empty when it is signed by that station, unchanged, and in these records."""
+    """Empty if the certificate is signed by that station, unchanged, and in these records."""
     remarks: tuple[str, ...]
-    """For people: notable, but no problem."""
+    """Notable facts that are not problems."""
 
 
 _TYPE: Final = TypeAdapter(Sealed)
@@ -138,7 +138,7 @@ _RUN: Final = TypeAdapter(RunRecord)
 
 
 def plain(run: RunRecord) -> dict[str, Any]:
-    """Convert a run to types of JSON, from which pydantic can read it again."""
+    """Convert a run to JSON types from which pydantic can read it again."""
     return {
         name: value.value
         if isinstance(value, Enum)
@@ -158,8 +158,8 @@ def as_text(sealed: Sealed) -> str:
 
 
 def sealed_in(document: str) -> Sealed:
-    """Decode the signed content in a text. Raises UsageError when there is none, UnprovenError when
-    it is damaged.
+    """Decode the signed content in a text. Raises UsageError without one, UnprovenError for a
+    damaged one.
     """
     start = document.find(_BEGIN)
     stop = document.find(_END, start)

@@ -1,4 +1,4 @@
-"""Counts good and bad units, first-pass yield and causes of failures of this hour and shift."""
+"""Counts passed and failed units, first-pass yield and failure causes of the hour and shift."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CAUSES_MAX: Final = 3
 
 
 class Count(NamedTuple):
-    """Number of units whose last run in a period was a PASS (good), or was not (bad)."""
+    """Number of units by their last run in a period: a PASS (good), or none (bad)."""
 
     good: int
     bad: int
@@ -23,19 +23,19 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True)
 class ShiftFigures:
-    """The figures in the footer of the operator page."""
+    """Figures in the footer of the operator page."""
 
     hour: Count
     shift: Count
     first_pass_share: float | None
-    """Share of the shift's units that passed in their first run, 0 to 1; None without units."""
+    """First-pass yield of the shift, from 0 to 1; None without units."""
     causes: tuple[tuple[str, int], ...]
-    """Codes of the shift's runs without a PASS with their counts, the most frequent first."""
+    """Number of the shift's runs without a PASS, by code, most frequent first."""
 
 
 @dataclass(frozen=True)
 class EndedRun:
-    """A run that ended; `at` has a time zone."""
+    """A run that has ended; `at` has a time zone."""
 
     at: datetime
     serial: str
@@ -54,8 +54,8 @@ def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
 
 
 class ShiftCounts:
-    """Counts the runs of the current shift, and forgets those of earlier ones. `shifts`: start
-    times in the time zone of the moments that its methods get.
+    """Counts the runs of the current shift. `shifts`: start times in the time zone of the times
+    that its methods get.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class ShiftCounts:
         self._runs.append(run)
 
     def began(self, now: datetime) -> datetime:
-        """Start of the current shift; `now` without shifts."""
+        """Start of the current shift; `now` if there are no shifts."""
         return shift_began(self._shifts, now) or now
 
     def output(self, now: datetime) -> ShiftFigures:
-        """The figures at `now`, which has a time zone."""
+        """Figures at `now`, which has a time zone."""
         began = self.began(now)
         hour = now.replace(minute=0, second=0, microsecond=0)
         self._runs = runs = [run for run in self._runs if run.at >= min(began, hour)]

@@ -1,8 +1,8 @@
-"""State of one socket: its process, the unit in it, its label and its last run.
+"""State of one socket: its process, its unit, the unit's label and the last run.
 
-Only traffic shows a unit. A silent one may be asleep and counts as removed only if it would report
-its serial number on waking up. A unit that announces a power-up, or reports another serial number,
-may have been exchanged.
+A unit is detected by its frames. A silent one may sleep; it counts as removed only if it would
+report its serial number on waking up. A unit that announces a power-up, or reports another serial
+number, may be another one.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Shown = tuple[SocketState, str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """Origin of scans. Sources with the same name are one."""
+    """Origin of scans: a scanner, page or terminal. Sources with the same name are equal."""
 
     name: str = ""
-    """Name in events and messages, such as "scanner left"."""
+    """Name in events and messages, for example "scanner left"."""
     socket: str = field(default="", compare=False)
-    """The socket that it is mounted at."""
+    """Socket at which the scanner is mounted."""
 
 
 SCANNER: Final = "scanner "
@@ -38,7 +38,7 @@ TERMINAL: Final = Source("terminal")
 PIPE: Final = Source("standard input")
 FILE: Final = Source("file of scans")
 UNNAMED: Final = Source()
-"""A program that has only one source."""
+"""The source of a program that has only one."""
 _SHOWN: Final = {
     TERMINAL.name: text("terminal"),
     PIPE.name: text("standard input"),
@@ -48,7 +48,7 @@ _SHOWN: Final = {
 
 
 def source_words(name: str) -> str:
-    """The name of a source, for people."""
+    """Name of a source, for people."""
     if name.startswith(SCANNER):
         return text("scanner {name}", name=printable(name.removeprefix(SCANNER)))
     if name.startswith(PAGE):
@@ -60,42 +60,42 @@ class SocketPhase(Enum):
     """Progress of a socket's run."""
 
     REST = "no run"
-    CLAIM = "the records are asked for a run"
-    RUN = "its process works on the unit"
-    SAVE = "the run is over, its end is not on disk"
+    CLAIM = "a run is being claimed in the records"
+    RUN = "the process of the socket runs the unit"
+    SAVE = "the run has ended, but is not on disk"
 
 
 class Occupancy(Enum):
-    """Presence of a unit in the socket."""
+    """Whether a unit is in the socket."""
 
-    UNKNOWN = "nothing is known since its process began"
-    THERE = "it is heard"
-    SILENT = "nothing is heard: no unit, or one that sleeps"
-    EMPTY = "no unit is in it"
+    UNKNOWN = "not known yet: the process has just started"
+    THERE = "frames of a unit are received"
+    SILENT = "no frames are received: no unit, or a sleeping one"
+    EMPTY = "no unit"
 
 
 class Binding(Enum):
-    """The way in which a label was assigned to a socket."""
+    """How a label was assigned to a socket."""
 
-    NAMED = "the station named the socket: the unit has to arrive there, from now on"
-    SAID = "a person scanned the socket's card with it, or the unit itself says so"
-    ONLY = "the station has one socket"
+    PROMPTED = "the station named the socket, in which the unit has yet to arrive"
+    CONFIRMED = "the socket's card was scanned with it, or the unit reported its number"
+    ONLY_SOCKET = "the station has one socket"
 
 
 @dataclass(frozen=True)
 class LastRun:
-    """The last run in a socket, while its unit may be there."""
+    """The last run in a socket, while its unit may still be there."""
 
     serial: str
     outcome: RunState | None = None
-    """None until it is on disk."""
+    """None until the outcome is on disk."""
     action: str = ""
-    has_talked: bool = False
-    """Its unit has sent something after the run."""
+    has_sent: bool = False
+    """The unit has sent a frame since the run."""
     has_answered: bool = False
-    """It has answered, with or without a serial number."""
-    has_said: bool = False
-    """Its unit has reported its serial number after the run."""
+    """The unit has answered since the run, with or without a serial number."""
+    has_reported_serial: bool = False
+    """The unit has reported its serial number since the run."""
 
 
 def _state_after(outcome: RunState) -> SocketState:
@@ -110,22 +110,22 @@ class Socket:
     is_virtual: bool = False
     phase: SocketPhase = SocketPhase.REST
     out_of_service: str | None = ""
-    """The reason why it cannot work; empty while it starts, None when it can."""
+    """Reason why the socket cannot work; "" while it starts, None if it works."""
     sees_units: bool = True
     occupancy: Occupancy = Occupancy.UNKNOWN
     own: str | None = None
-    """The serial number that the unit reports; empty: it has none; None: not reported yet."""
+    """Serial number that the unit reports; "": it has none; None: not reported yet."""
     is_own_known: bool = False
-    """`own` is a serial number of the recipe: it identifies the unit."""
-    borne: str = ""
-    """The label on a virtual unit."""
+    """`own` is a serial number of the recipe, so it identifies the unit."""
+    virtual_label: str = ""
+    """Label of the virtual unit."""
     label: str = ""
-    """The label of the next run."""
-    binding: Binding = Binding.SAID
+    """Label of the next run."""
+    binding: Binding = Binding.CONFIRMED
     source: Source = UNNAMED
-    """Where the label was scanned."""
+    """Source at which the label was scanned."""
     begin_at_s: float | None = None
-    """Time at which the run begins even if no unit is detected or identified."""
+    """Time at which the run starts even if no unit is detected or identified."""
     bound_at_s: float = 0.0
     """Time at which the label was assigned."""
     presence_number: int = 0
@@ -133,33 +133,33 @@ class Socket:
     arrived_at_s: float = 0.0
     """Time at which its unit was detected."""
     is_in_bootloader: bool = False
-    """It sends only announcements of its bootloader, so it cannot report its serial number."""
+    """It sends only bootloader announcements, so it cannot report its serial number."""
     serial: str = ""
-    """The unit of the active run."""
+    """Serial number of the active run."""
     last: LastRun | None = None
     is_last_there: bool = False
-    """The unit of the last run may be present; no traffic suggests another one."""
+    """The unit of the last run may still be there: no frame suggests another one."""
     is_chosen: bool = False
-    """Its card was scanned, and the label of its unit comes next."""
+    """Its card was scanned, and the label must follow."""
     interrupted: str = ""
-    """The unit of a run that a dead station left in this socket."""
+    """Serial number of a run in this socket that was interrupted by the end of the station."""
     note: str = ""
     """Error of the last label, or of saving."""
     note_until_s: float | None = None
-    """Until then the note about a dropped scan is shown."""
+    """Time until which the note about a dropped scan is shown."""
     out_since_s: float = 0.0
-    """Start of the outage."""
+    """Start of the present outage."""
     shown: Shown | None = None
-    """The view that was reported last."""
+    """State, serial number and text that were reported last."""
 
     @property
     def can_work(self) -> bool:
-        """True when its process runs and its adapter is open."""
+        """True if its process runs and its adapter is open."""
         return self.out_of_service is None
 
     @property
     def is_there(self) -> bool:
-        """True while a unit is detected in it."""
+        """True while a unit is detected in the socket."""
         return self.occupancy is Occupancy.THERE
 
     @property
@@ -169,12 +169,12 @@ class Socket:
 
     @property
     def is_busy(self) -> bool:
-        """True while a run is active, is not saved yet, or has its label."""
+        """True while a run is active, not saved yet, or has its label."""
         return self.phase is not SocketPhase.REST or bool(self.label)
 
     @property
     def state(self) -> SocketState:
-        """The state that was reported last."""
+        """State that was reported last."""
         return SocketState.STARTING if self.shown is None else self.shown[0]
 
     @property
@@ -192,7 +192,7 @@ class Socket:
 
     @property
     def awaits_label(self) -> bool:
-        """True when it holds a unit without a label."""
+        """True if the socket holds a unit without a label."""
         is_free = self.can_work and self.phase is SocketPhase.REST and not self.label
         return is_free and self.is_there and self.verdict is None
 
@@ -207,18 +207,18 @@ class Socket:
     # -- the unit in it ---------------------------------------------------------------------------
 
     def is_exchange(self, what: PresenceChanged) -> bool:
-        """True when the detected unit may be another one than a moment ago."""
+        """True if the detected unit may be another one than a moment ago."""
         is_other = None not in (self.own, what.serial) and self.own != what.serial
         return self.is_there and what.is_there and (what.is_power_up or what.was_missed or is_other)
 
     @property
     def has_passed(self) -> bool:
-        """True when the last unit here has passed, wherever it is by now."""
+        """True if the last run passed, wherever its unit is now."""
         return self.last is not None and self.last.outcome is RunState.PASS
 
     def note_unit(self, what: PresenceChanged, *, is_serial: bool) -> bool:
         """Note a unit that was detected or reported its serial number; `is_serial`: a number of the
-        recipe. True when it is another unit than before.
+        recipe. True if it is another unit than before.
         """
         before, self.occupancy = self.occupancy, Occupancy.THERE
         self.is_in_bootloader = what.is_in_bootloader
@@ -231,7 +231,7 @@ class Socket:
         is_new = self._is_new(before) or bool(what.label)
         if is_new:
             self._forget_note()
-            self.borne = what.label
+            self.virtual_label = what.label
         return is_new
 
     def _is_new(self, before: Occupancy) -> bool:
@@ -239,25 +239,25 @@ class Socket:
         if last is None:
             return before is not Occupancy.THERE
         if self.own == last.serial:
-            self.last = replace(last, has_talked=True, has_answered=True, has_said=True)
+            self.last = replace(last, has_sent=True, has_answered=True, has_reported_serial=True)
             self.is_last_there = True
             return False
-        says_other = self.own is not None and (last.has_said or self.is_own_known)
+        says_other = self.own is not None and (last.has_reported_serial or self.is_own_known)
         if says_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
             # Another unit; or one that was silent for a while, and does not say who it is.
             was_last, self.is_last_there = self.is_last_there, False
             return was_last or before is not Occupancy.THERE
         has_answered = last.has_answered or self.own is not None
-        self.last = replace(last, has_talked=True, has_answered=has_answered)
+        self.last = replace(last, has_sent=True, has_answered=has_answered)
         return False
 
     def _forget_note(self) -> None:
-        """Clear the note about the unit before."""
+        """Clear the note about the previous unit."""
         if self.phase is SocketPhase.REST and self.note_until_s is None:
             self.note = ""
 
     def fall_silent(self, *, is_certain: bool) -> bool:
-        """Note that no unit is detected any more, or certainly none is there. True when one was."""
+        """Note that no unit is detected any more; `is_certain`: none is there. True if one was."""
         before = self.occupancy
         last = self.last
         # One that has passed has answered at the end of its run: it does not sleep, it was pulled,
@@ -266,55 +266,60 @@ class Socket:
         is_pulled = (
             last is not None
             and self.has_passed
-            and (not last.has_answered or (last.has_said and self.is_last_there))
+            and (not last.has_answered or (last.has_reported_serial and self.is_last_there))
         )
         is_out = is_certain or self.is_own_known or is_pulled or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
         if is_out:
             self.is_last_there = False
-        self.own, self.is_own_known, self.borne, self.is_in_bootloader = None, False, "", False
+        self.own, self.is_own_known, self.virtual_label, self.is_in_bootloader = (
+            None,
+            False,
+            "",
+            False,
+        )
         self._forget_note()
         if is_certain:
             self.last = None
         return before is Occupancy.THERE
 
-    def let_go(self) -> str:
-        """Remove the label from this socket; returns it."""
+    def release_label(self) -> str:
+        """Remove the label from the socket and return it."""
         label, self.label, self.begin_at_s = self.label, "", None
         if label and self.occupancy is Occupancy.EMPTY:
             self.occupancy = Occupancy.SILENT  # its unit may have been put in, and sleep
         return label
 
     def is_of_another(self, label: str) -> bool:
-        """True when the unit reports another serial number than the label."""
+        """True if the unit reports another serial number than the label."""
         return self.is_there and self.is_own_known and self.own != label
 
     @property
     def has_card(self) -> bool:
-        """True when its label was scanned with its card, or its unit is virtual."""
-        return self.binding is Binding.SAID or self.is_virtual
+        """True if the label was scanned with the socket's card, or the unit is virtual."""
+        return self.binding is Binding.CONFIRMED or self.is_virtual
 
     @property
     def is_unidentified(self) -> bool:
-        """True when its label was scanned without its card, and the unit does not identify itself:
-        it does not answer, or is in its bootloader.
+        """True if the label was scanned without the socket's card, and the unit has not identified
+        itself: it does not answer, or is in its bootloader.
         """
-        could_say = self.sees_units and self.binding is Binding.NAMED and not self.borne
+        could_say = self.sees_units and self.binding is Binding.PROMPTED and not self.virtual_label
         return (
-            self.binding is not Binding.SAID
+            self.binding is not Binding.CONFIRMED
             and self.is_there
             and (self.is_in_bootloader or (could_say and self.own is None))
         )
 
     def is_due(self, now: float) -> bool:
-        """True when the unit of its label is present, as far as known."""
+        """True if the run can start: the unit of the label is present, as far as known."""
         is_free = self.can_work and self.phase is SocketPhase.REST and not self.is_chosen
         if not (self.label and is_free) or self.is_unidentified:
             return False
         # While it is not known whether a unit is there, nothing begins.
         is_known = self.occupancy is not Occupancy.UNKNOWN
         is_time = self.begin_at_s is not None and now >= self.begin_at_s and is_known
-        if self.binding is Binding.NAMED:
+        if self.binding is Binding.PROMPTED:
             # It was put in, and has identified itself or had the time to.
             has_arrived = self.is_there and self.begin_at_s is not None
             is_time = has_arrived and (self.own is not None or is_time)
@@ -326,9 +331,9 @@ class Socket:
 
     @property
     def wanted(self) -> str:
-        """The next step that its label needs."""
+        """The operator's next action for the label."""
         shown = printable(self.label)
-        if self.binding is not Binding.NAMED:
+        if self.binding is not Binding.PROMPTED:
             return text("Connect {label}.", label=shown)
         if self.verdict is not None:
             before = printable(self.verdict.serial)
@@ -336,7 +341,7 @@ class Socket:
         return text("Put {label} into socket {socket}.", label=shown, socket=self.name)
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
-        """The view of the socket; `stopped`: why the line is stopped, `is_only`: the only one."""
+        """The displayed state. `stopped`: reason of a stopped line; `is_only`: the only socket."""
         if self.is_running:
             return SocketState.RUNNING, self.serial, ""
         if self.phase is SocketPhase.SAVE:
@@ -366,24 +371,25 @@ class Socket:
         return self._view_free(card)
 
     def _view_free(self, card: str) -> Shown:
-        """The view without a label; `card` is the scan that must go with it."""
-        borne = text(" It bears {label}.", label=printable(self.borne)) if self.borne else ""
+        """The view without a label; `card` is the scan that must accompany the label."""
+        own = printable(self.virtual_label)
+        label = text(" Its label is {label}.", label=own) if own else ""
         if self.interrupted:
             sentence = text(
-                "{serial} was interrupted here: scan its label{card}.{borne}",
+                "{serial} was interrupted here: scan its label{card}.{virtual}",
                 serial=printable(self.interrupted),
                 card=card,
-                borne=borne,
+                virtual=label,
             )
             return SocketState.SCAN, self.interrupted, sentence
         if self.note:
-            return SocketState.SCAN, "", text("{said}{borne}", said=self.note, borne=borne)
+            return SocketState.SCAN, "", text("{note}{virtual}", note=self.note, virtual=label)
         if self.is_there:
             asked = self._asked_for(card)
-            return SocketState.SCAN, "", text("{said}{borne}", said=asked, borne=borne)
+            return SocketState.SCAN, "", text("{note}{virtual}", note=asked, virtual=label)
         if self.occupancy is Occupancy.EMPTY:
             return SocketState.EMPTY, "", ""
-        return SocketState.SILENT, "", text("Nothing is heard: no unit, or one that sleeps.")
+        return SocketState.SILENT, "", text("No frames are received: no unit, or a sleeping one.")
 
     def _asked_for(self, card: str) -> str:
         if self.is_own_known:
@@ -393,7 +399,7 @@ class Socket:
         if last is None or last.outcome is None:
             return text("Scan the label of the unit{card}.", card=card)
         return text(
-            "It was off or not heard after {state} of {serial}: if this is another unit,"
+            "It was off or silent after {state} of {serial}: if this is another unit,"
             " scan its label{card}.",
             state=_state_after(last.outcome).value,
             serial=printable(last.serial),

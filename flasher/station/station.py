@@ -1,13 +1,12 @@
-"""A running station: the processes of its sockets, its records, and the `Line` that decides.
+"""Runs a station: the processes of its sockets, its records, and the `Line` that decides.
 
     with Store.open(...) as store:
         station = Station(store, recipe, setups, operator="jo", on_event=print)
         station.run(until=lambda: False)      # station.submit("W2605002") from any thread
 
-One thread does everything: it is the only one that writes records. A run is begun when its claim is
-on disk; a socket's process does nothing that cannot be taken back before the intent is on disk; and
-`RunEnded`, the one event that says PASS, leaves after the outcome is on disk. Which label is for
-which unit is decided by `flasher.station.line`.
+One thread does all work and writes all records. A run starts after its claim is on disk; a socket's
+process does nothing irreversible before the intent is on disk; `RunEnded`, the only event with a
+PASS, is published after the outcome is on disk. `flasher.station.line` assigns labels to units.
 """
 
 from __future__ import annotations
@@ -82,29 +81,28 @@ from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
 
 TURN_S: Final = 0.1
-"""A turn of the loop waits at most this long."""
+"""Maximum time that a turn of the loop waits."""
 SCANS_ENDED: Final = "SCANS_ENDED"
-"""The refusal code of labels that still wait after the last scan."""
+"""Refusal code of labels that still wait after the last scan."""
 EventHandler = Callable[[StationEvent], None]
 
 
 @dataclass(frozen=True)
 class StationOptions:
-    """Options of a station; the defaults suit a line with people."""
+    """Options of a station; the defaults are for a line with people."""
 
     arrival_limit_s: float = ARRIVAL_LIMIT_S
     """See `Line`."""
     end_limit_s: float = 30.0
-    """Time for runs to end when the station closes."""
+    """Time limit for runs to end when the station closes."""
     scans_labels: bool = False
     """Scan the labels of virtual units automatically."""
     mixes_virtual: bool = False
-    """Real and virtual units may share the records; one serial number is never both."""
+    """Real and virtual units may share the records, but not a serial number."""
 
 
 class Station:
-    """A station with one recipe. Events report what happens on the line; methods do not raise for
-    it.
+    """A station with one recipe. Incidents on the line are reported by events, not exceptions.
 
     `submit`, `publish`, `note`, `stop` and `abort_all` may be called from any thread, the others
     from one.
@@ -147,14 +145,14 @@ class Station:
         self._labels = labels
         self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
-        """Runs that are claimed and not saved yet, by socket."""
+        """Claimed runs that are not saved yet, by socket."""
         self._scans: deque[tuple[str, Source]] = deque()
         self._published: deque[StationEvent] = deque()
         self._notes: deque[tuple[AuditEvent, Mapping[str, str]]] = deque()
         self._checked: deque[bool] = deque()
-        """Results of PIN checks that the line has not received yet."""
+        """Results of PIN checks that the line has not processed yet."""
         self.checker = checker or pins.checker()
-        """Executor that checks PINs in a thread."""
+        """Executor for PIN checks."""
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
         self._is_stopping = False
@@ -164,7 +162,7 @@ class Station:
     # -- public calls ---------------------------------------------------------------------------
 
     def start(self) -> None:
-        """End the runs that a dead station left, then begin.
+        """Mark runs that a dead station left as INTERRUPTED, then start the sockets.
 
         Raises RecordError; UsageError for records of the other kind of units.
         """
@@ -202,40 +200,40 @@ class Station:
         self.turn(0.0)
 
     def submit(self, text: str, source: Source = UNNAMED) -> None:
-        """Submit a scan. A card waits for a label of the same source, and a label for a card."""
+        """Submit a scan. A card and its label come from the same source."""
         self._scans.append((text, source))
         self._wake()
 
     def publish(self, event: StationEvent) -> None:
-        """Publish an event from outside the line in the station's next turn."""
+        """Publish an event from outside the line in the next turn."""
         self._published.append(event)
         self._wake()
 
     def note(self, what: AuditEvent, data: Mapping[str, str]) -> None:
-        """Add an action of a person outside the line to the audit trail, in the next turn."""
+        """Append an action of a person outside the line to the audit trail, in the next turn."""
         self._notes.append((what, data))
         self._wake()
 
     def drop_waiting(self) -> None:
-        """Drop the cards and labels that wait. Called in the station's thread."""
+        """Drop waiting cards and labels. Called in the station's thread."""
         remedy = text("Scan it again when the station runs.")
         self.line.drop_all(Refused(SCANS_ENDED, text("The scans have ended."), remedy))
         self._carry_out()
 
     def stop(self) -> None:
-        """Begin no further unit; `run` returns after the active runs."""
+        """Start no further run; `run` returns after the active runs."""
         self._is_stopping = True
         self._wake()
 
     def abort_all(self) -> None:
-        """Stop, and stop the active runs at their next safe place."""
+        """Start no further run, and abort the active runs at their next safe place."""
         self._is_aborting = True
         self.stop()
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Start, and work until `stop` was called or `until` returns True; then close.
+        """Start and work until `stop` was called or `until` returns True; then close.
 
-        Raises RecordError, UsageError when the station cannot begin.
+        Raises RecordError or UsageError if the station cannot start.
         """
         self.start()
         try:
@@ -248,14 +246,14 @@ class Station:
             self.close()
 
     def turn(self, limit_s: float) -> None:
-        """One turn of the loop: wait up to `limit_s`, then do all work that is due."""
+        """One turn of the loop: wait up to `limit_s`, then do all due work."""
         if limit_s > 0:
             self.supervisor.wait([self._wake_receiver], limit_s)
         while self._wake_receiver.poll():
             self._wake_receiver.recv_bytes()
         self.line.is_closing = self._is_stopping
         for socket, message in self.supervisor.poll():
-            self._hear(socket, message)
+            self._process_message(socket, message)
         while self._published:
             self.emit(self._published.popleft())
         self._write_notes()
@@ -264,11 +262,11 @@ class Station:
             self._abort_running()
         self.line.tick(self._now)
         self._carry_out()
-        self._tell_labels()
+        self._publish_labels()
         self._on_turn()
 
     def _take_scans(self) -> None:
-        """Feed scans and results of PIN checks to the line; scans wait during a check."""
+        """Pass scans and results of PIN checks to the line; scans wait during a check."""
         while self._checked or (self._scans and not self.line.is_checking_pin):
             if self._checked:
                 self.line.pin_checked(self._now, is_right=self._checked.popleft())
@@ -278,7 +276,7 @@ class Station:
             self._carry_out()
 
     def close(self) -> None:
-        """End all processes. Active runs are stopped, and saved if they report their end in time;
+        """End all processes. Active runs are aborted, and saved if they report their end in time;
         the next start finds the others.
         """
         if not self._is_open:
@@ -292,7 +290,7 @@ class Station:
         self.supervisor.close()
         if self._labels is not None:
             self._labels.close()
-            self._tell_labels()
+            self._publish_labels()
         self._write_notes()
         self.emit(StationStopped(self.store.station))
 
@@ -316,7 +314,7 @@ class Station:
         return self.clock.monotonic_s()
 
     def emit(self, event: StationEvent) -> None:
-        """Publish an event with its time."""
+        """Publish an event with the current time."""
         try:
             at = self.clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
             self._on_event(replace(event, at=at))
@@ -328,7 +326,7 @@ class Station:
         self._carry_out()
 
     def _carry_out(self) -> None:
-        """Carry out the effects of the line and feed back their results, until there are none."""
+        """Execute the effects of the line and feed back their results, until none is left."""
         while effects := self.line.take():
             for effect in effects:
                 match effect:
@@ -353,7 +351,7 @@ class Station:
                     case _:
                         self.emit(effect)
 
-    def _hear(self, socket: str, message: FromWorker | WorkerLost) -> None:
+    def _process_message(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
             case AdapterReady() | AdapterDown() | PresenceChanged():
                 self._feed(socket, message)
@@ -379,7 +377,7 @@ class Station:
                 self.supervisor.send(socket.name, Abort())
 
     def _pin_checked(self, checked: Future[bool]) -> None:
-        """Called in the thread that checks PINs."""
+        """Called in the thread of the PIN check."""
         self._checked.append(checked.exception() is None and checked.result())
         self._wake()
 
@@ -395,8 +393,8 @@ class Station:
                 socket.interrupted = run.serial
 
     def _end_unknown(self) -> bool:
-        """End runs whose claims were saved although an error was reported. Returns False when the
-        end cannot be saved.
+        """End runs whose claim was saved although an error was reported. False if that cannot be
+        saved.
         """
         known = {run.claim.run_id for run in self._runs.values()}
         try:
@@ -420,7 +418,7 @@ class Station:
     # -- beginning --------------------------------------------------------------------------------
 
     def _claim(self, order: Order) -> line.SocketInput:
-        """Claim the run in the records."""
+        """Claim a run in the records."""
         socket = order.socket
         try:
             life = self._life(order.serial)
@@ -438,7 +436,7 @@ class Station:
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
-        """The history of a unit of this recipe's part. Raises RecordError."""
+        """Earlier runs of a unit of this recipe's part. Raises RecordError."""
         lives, part = self.store.read.units(serial), self.recipe.recipe.part
         return next((life for life in lives if life.part == part), None)
 
@@ -449,18 +447,18 @@ class Station:
         if not self.supervisor.send(socket, self._runs[socket].claim):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
-    def _going(self, socket: str) -> ActiveRun | None:
-        """The run of a socket, until its process has reported the end."""
+    def _active_run(self, socket: str) -> ActiveRun | None:
+        """Run of a socket whose process has not reported the end."""
         run = self._runs.get(socket)
         return run if run is not None and run.reported is None else None
 
     # -- while a run goes on ----------------------------------------------------------------------
 
     def _answer(self, socket: str, asked: Ask) -> None:
-        """Save what the process asked for, then reply."""
-        run, number = self._going(socket), asked.number
+        """Save a record that a process asks for, then reply."""
+        run, number = self._active_run(socket), asked.number
         if run is None:
-            reply = WriteReply(number, error="The run is not one of this station.")
+            reply = WriteReply(number, error="The run does not belong to this station.")
             self.supervisor.send(socket, reply)
             return
         write_id, claim = None, run.claim
@@ -498,8 +496,8 @@ class Station:
     # -- its end ----------------------------------------------------------------------------------
 
     def _end(self, socket: str, result: RunResult) -> None:
-        """Save the outcome of a run that ended, then publish it."""
-        run = self._going(socket)
+        """Save the outcome of a run that has ended, then publish it."""
+        run = self._active_run(socket)
         if run is None:
             return
         run.reported, run.ended_s = result, self._now
@@ -508,8 +506,8 @@ class Station:
         self._carry_out()
 
     def _end_lost(self, socket: str, reason: str, *, hung: bool) -> None:
-        """End the run of a process that was lost."""
-        run = self._going(socket)
+        """End the run of a lost process."""
+        run = self._active_run(socket)
         if run is None:
             return
         code = codes.PROCESS_HUNG if hung else codes.PROCESS_DIED
@@ -517,7 +515,7 @@ class Station:
         self._end(socket, RunResult(code.outcome, code.name, text, duration_s))
 
     def _save(self, socket: str) -> bool:
-        """Save the outcome of a run and publish it; False when it is not saved."""
+        """Save the outcome of a run and publish it; False if it could not be saved."""
         run = self._runs[socket]
         claim = run.claim
         try:
@@ -567,10 +565,10 @@ class Station:
             self._labels.submit(self._label(socket, run))
 
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
-        """Print a label again; returns the refusal, if any."""
+        """Print a label again; returns the refusal, or None."""
         if self._labels is None:
             reason = text("This station has no printer.")
-            return Refused("NO_PRINTER", reason, text("Set it up in the station's file."))
+            return Refused("NO_PRINTER", reason, text("Set it up in the station file."))
         try:
             life = self._life(serial)
             last = None if life is None else life.last
@@ -590,7 +588,7 @@ class Station:
             groups = {}
         return LabelJob(socket, run.serial, values_of(run, groups), is_reprint)
 
-    def _tell_labels(self) -> None:
+    def _publish_labels(self) -> None:
         for job, reason in () if self._labels is None else self._labels.take():
             if reason:
                 self._label_failed(job.socket, job.serial, reason)
@@ -598,7 +596,7 @@ class Station:
                 self.emit(LabelPrinted(job.socket, job.serial, job.is_reprint))
 
     def _label_failed(self, socket: str, serial: str, reason: str) -> None:
-        remedy = text("Mend it, then scan REPRINT {serial}.", serial=printable(serial))
+        remedy = text("Repair the printer, then scan REPRINT {serial}.", serial=printable(serial))
         self.emit(LabelFailed(socket, serial, reason, remedy))
 
     def _not_saved(
@@ -610,21 +608,23 @@ class Station:
 
 
 _NOT_PASSED: Final = Refused(
-    "NOT_PASSED", text("The unit has not passed."), text("It gets a label when it has.")
+    "NOT_PASSED", text("The unit has not passed."), text("Only a passed unit gets a label.")
 )
 
 
 def _not_labelled(run: RunRecord) -> Refused | None:
-    """The reason why a unit with this last run gets no label."""
+    """Reason why a unit with this last run gets no label."""
     if run.state is not RunState.PASS:
         return _NOT_PASSED
     if run.is_virtual or run.kind is RunKind.GOLDEN:
-        return Refused("NO_PRODUCT", text("It is no product."), text("It gets no label."))
+        return Refused(
+            "NO_PRODUCT", text("It is not a product."), text("Only products get a label.")
+        )
     return None
 
 
 def _error_line(error: RecordError) -> str:
-    """An error of the records in one line: what and where, without its remedy."""
+    """Message and location of an error in one line, without its remedy."""
     where = f" ({error.where})" if error.where else ""
     return f"{error.what.rstrip('.')}{where}."
 
@@ -633,8 +633,7 @@ def _check_unit_kinds(
     known: frozenset[bool], own: frozenset[bool], options: StationOptions
 ) -> bool:
     """Check that sockets may use records with these kinds of units: True for virtual, False for
-    real; `own` are the kinds of the sockets. Returns True when the records will hold both kinds
-    from now on.
+    real; `own` are the sockets' kinds. Returns True if the records will then hold both kinds.
 
     Raises UsageError: a PASS of a virtual unit must not be mistaken for one of a product.
     """
@@ -649,6 +648,5 @@ def _check_unit_kinds(
         what = "These records hold virtual units, and this station has adapters."
     raise UsageError(
         what,
-        remedy="Keep records of virtual units in a database of their own; --mix-virtual has them"
-        " in one.",
+        remedy="Use a separate database for virtual units, or --mix-virtual.",
     )

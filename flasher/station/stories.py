@@ -1,4 +1,4 @@
-"""Explains the traces of runs in the records."""
+"""Explains recorded bus traces of runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flasher.trace.story import Story
 
 
 def explained(files: FileStore, file: AttachmentFile) -> Story | str:
-    """Explain a trace of the records. Returns a text with the reason when that fails."""
+    """Explain a recorded trace. Returns a text with the reason if that fails."""
     try:
         with files.temporary_copy(file) as path:
             return replace(explain_path(path), source=printable(file.name))

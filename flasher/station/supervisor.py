@@ -1,4 +1,4 @@
-"""Starts, watches and restarts the processes of the sockets, independently of each other."""
+"""Starts, watches and restarts the processes of the sockets, each on its own."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final, Protocol
 
-from flasher.station.children import deaf_from_birth
+from flasher.station.children import signals_blocked
 from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, WorkerSetup
 from flasher.station.worker import worker_main
 
 HANG_S: Final = 10.0
-"""Without a message for this time a process hangs: heartbeats come every half second, and calls of
-an adapter take at most some seconds."""
+"""Silence after which a process counts as hung: it sends a heartbeat every half second, and a call
+of an adapter takes at most some seconds."""
 START_S: Final = 60.0
-"""The same for a process that starts, which loads the driver of its adapter."""
+"""The same for a starting process, which loads the driver of its adapter."""
 RESTART_MIN_S: Final = 1.0
 RESTART_MAX_S: Final = 30.0
 _QUIT_S: Final = 5.0
 _MESSAGES_AT_ONCE: Final = 1000
-"""Messages read from one process before the next one's turn."""
+"""Maximum number of messages read from one process before the next one."""
 
 
 class WorkerPort(Protocol):
@@ -30,23 +30,23 @@ class WorkerPort(Protocol):
 
     @property
     def waitable(self) -> Any:
-        """Argument for `multiprocessing.connection.wait`; None: cannot be waited for."""
+        """Argument for `multiprocessing.connection.wait`; None if it cannot be waited for."""
 
     def send(self, message: ToWorker) -> bool:
-        """Send a message. Returns False when the process has ended."""
+        """Send a message. False if the process has ended."""
 
     def receive(self) -> FromWorker | None:
-        """The next message, or None. Raises EOFError or OSError when the process has ended."""
+        """The next message, or None. Raises EOFError or OSError if the process has ended."""
 
     def kill(self) -> None:
         """Kill the process, and wait for its end."""
 
     def join(self, limit_s: float) -> bool:
-        """Wait until the process ends. Returns False after the time limit."""
+        """Wait until the process ends. False after the time limit."""
 
 
 class ProcessPort:
-    """A process, started with "spawn", so that it shares no state with the station."""
+    """A process started with "spawn", so that it shares no state with the station."""
 
     def __init__(self, setup: WorkerSetup) -> None:
         context = multiprocessing.get_context("spawn")
@@ -54,7 +54,7 @@ class ProcessPort:
         self._process = context.Process(
             target=worker_main, args=(theirs, setup), name=f"socket {setup.socket}", daemon=True
         )
-        with deaf_from_birth():
+        with signals_blocked():
             self._process.start()
         # The end of the process is only detected after this side has closed the other end.
         theirs.close()
@@ -107,14 +107,14 @@ class _Slot:
         self.heard_at = 0.0
         self.is_new = True
         self.start_at: float | None = 0.0
-        """Time of its next start; None: not scheduled."""
+        """Time of its next start; None if it is not due to start."""
         self.pause_s = RESTART_MIN_S
         self.reason = ""
-        """The reason that it reported for not working."""
+        """Reason that it reported for not working."""
 
 
 class WorkerSupervisor:
-    """All processes. `now` is a monotonic clock in seconds."""
+    """The processes of all sockets. `now` is a monotonic clock in seconds."""
 
     def __init__(
         self,
@@ -128,11 +128,11 @@ class WorkerSupervisor:
 
     @property
     def ports(self) -> Mapping[str, WorkerPort]:
-        """The running processes by socket."""
+        """Running processes by socket."""
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
 
     def send(self, socket: str, message: ToWorker) -> bool:
-        """Send a message to a socket's process. Returns False when none is running."""
+        """Send a message to a socket's process. False if none is running."""
         port = self._slots[socket].port
         return port is not None and port.send(message)
 
@@ -145,8 +145,8 @@ class WorkerSupervisor:
                 wait(waitables, timeout=limit_s)
 
     def poll(self) -> list[tuple[str, FromWorker | WorkerLost]]:
-        """Read the messages of all processes, and start those that are due. Returns the messages
-        with their sockets; for a lost process `WorkerLost`.
+        """Read the messages of all processes, and start due ones. Returns messages, or
+        `WorkerLost`, with their sockets.
         """
         news: list[tuple[str, FromWorker | WorkerLost]] = []
         for name, slot in self._slots.items():
@@ -170,7 +170,7 @@ class WorkerSupervisor:
         return news
 
     def close(self) -> None:
-        """Ask all processes to end; kill those that do not in time."""
+        """Ask all processes to end; kill those that do not end in time."""
         ports = list(self.ports.values())
         for port in ports:
             port.send(Quit())
@@ -184,7 +184,7 @@ class WorkerSupervisor:
     # -- one process ------------------------------------------------------------------------------
 
     def _receive(self, slot: _Slot) -> tuple[list[FromWorker], bool]:
-        """Returns the waiting messages of a process, and whether it has ended."""
+        """The waiting messages of a process, and whether it has ended."""
         messages: list[FromWorker] = []
         port = slot.port
         if port is None:
@@ -215,5 +215,5 @@ class WorkerSupervisor:
         return WorkerLost(reason, hung, pause_s)
 
     def worked(self, socket: str) -> None:
-        """Reset the pause before restarts, after the process of this socket completed a run."""
+        """Reset the pause before restarts: the process of this socket completed a run."""
         self._slots[socket].pause_s = RESTART_MIN_S

@@ -1,4 +1,4 @@
-"""Checks of a unit's answers against recipe and manifest: versions, limits, writes."""
+"""Checks a unit's answers against recipe and manifest: versions, limits, written values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 NOT_IDENTIFIED: Final = "not identified before flashing"
 BEFORE: Final = "before "
-"""Prefix of measurements of values that must not change, as read before the first write."""
+"""Prefix of measurements of values that must not change, read before the first write."""
 OF_CHECK: Final = {
     IdentityCheck.HARDWARE: codes.WRONG_HARDWARE,
     IdentityCheck.DOWNGRADE: codes.OLD_VERSION,
@@ -31,7 +31,7 @@ OF_CHECK: Final = {
 
 
 def check_texts(allowed: Sequence[str], reported: str | None, code: Code) -> None:
-    """Check a reported text against the patterns of a recipe. Raises StepFailedError."""
+    """Compare a reported text with the patterns of a recipe. Raises StepFailedError."""
     if not allowed or reported is None:
         return
     # These patterns have only *.
@@ -41,7 +41,7 @@ def check_texts(allowed: Sequence[str], reported: str | None, code: Code) -> Non
 
 
 def check_measured(measured: Sequence[Measurement]) -> None:
-    """Check measurements against their limits. Raises StepFailedError."""
+    """Compare measurements with their limits. Raises StepFailedError."""
     for each in measured:
         if each.is_within:
             continue
@@ -54,12 +54,12 @@ def check_measured(measured: Sequence[Measurement]) -> None:
 
 
 def wanted_text(plan: WritePlan) -> str:
-    """The written value, as the records show it."""
+    """The value to write, as it is recorded."""
     return ", ".join(change.new for change in field_changes(plan, None))
 
 
 def identity_measurements(target: UnitTarget, identified: Identified) -> list[Measurement]:
-    """The reported identity of a device, as measurements without limits."""
+    """The reported identity of a device as measurements without limits."""
     name, version = target.name, identified.seen.version
     if version is None:
         return [Measurement(f"{name} identity", text=NOT_IDENTIFIED)]
@@ -76,12 +76,12 @@ def state_text(target: UnitTarget, identified: Identified) -> str:
     if identified.is_in_bootloader:
         return f"in its bootloader {target.watcher.version}, {NOT_IDENTIFIED}".replace(" ,", ",")
     if identified.seen.version is None:
-        return "cannot be asked" if target.version_request is None else "silent"
+        return "no version query" if target.version_request is None else "silent"
     return identified.seen.firmware_version or "answers"
 
 
 class UnitReads:
-    """The reads of one run, and their checks."""
+    """Reads and checks the items of one run."""
 
     def __init__(
         self, claim: Claim, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
@@ -95,8 +95,8 @@ class UnitReads:
     def limits(
         self, step: StepName, askable: Collection[str] | None = None
     ) -> Iterator[Measurement]:
-        """Take the measurements of a step. `askable`: the targets that run an application; others
-        are not measured. Raises NoAnswerError.
+        """Take the measurements of a step, of targets that run an application (`askable`). Raises
+        NoAnswerError.
         """
         for limit in self._recipe.recipe.limit:
             if limit.step is step and (askable is None or limit.target in askable):
@@ -116,8 +116,8 @@ class UnitReads:
     # -- values that must not change --------------------------------------------------------------
 
     def before(self, askable: Collection[str]) -> Iterator[Measurement]:
-        """Read the values that must not change, and remember them. Values that an interrupted run
-        of this unit read first take precedence. Targets that are not `askable` run no application.
+        """Read the values that must not change, and store them. Values that an interrupted run of
+        this unit read take precedence. Targets that are not `askable` run no application.
         """
         known = self._claim.known_before
         for target, readable in self._unchanged():
@@ -137,7 +137,7 @@ class UnitReads:
                 yield Measurement(f"{BEFORE}{name}", text=text)
 
     def unchanged(self, measured: list[Measurement]) -> None:
-        """Check that values which must not change are as before. Raises StepFailedError."""
+        """Read the values that must not change again. Raises StepFailedError for a changed one."""
         for target, readable in self._unchanged():
             for name, text in self._texts(target, readable).items():
                 first = self._before.get(name)

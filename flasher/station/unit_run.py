@@ -1,8 +1,8 @@
-"""The run of one unit, from first request to last: blocking, on an open connection.
+"""Runs one unit in a socket: blocking, on an open connection.
 
 It does not use the database: a `Journal` stores what must be on disk before the run continues, and
-a write that cannot be recorded is not sent. `unit_steps` has the steps; this module begins,
-retries, times, records and judges them.
+a write that cannot be recorded is not sent. `unit_steps` has the steps; this module starts,
+repeats, times and records them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from flasher.station.unit_steps import Act, UnitSteps
 from flasher.station.unit_target import StepFailedError, UnitTarget
 
 _PROGRESS_S: Final = 0.25
-"""Minimum interval between reports of progress, so that they never fill the pipe to the station."""
+"""Minimum interval between reports of progress, so that they never fill the pipe."""
 _STATES: Final = {
     RunState.FAIL: StepState.FAIL,
     RunState.ERROR: StepState.ERROR,
@@ -50,7 +50,7 @@ _BY_ERROR: Final = (
 
 
 class _NotedPower:
-    """The power of a socket. Notes each cycle, so that the restart is not taken for an exchange."""
+    """Power of a socket. Notes each cycle, so that the restart is not taken for an exchange."""
 
     def __init__(self, power: PowerControl, units: Iterable[Continuity]) -> None:
         self._power = power
@@ -64,11 +64,11 @@ class _NotedPower:
 
 
 class UnitRun:
-    """A run. `cancelled` is called repeatedly, and stays True once it was.
+    """One run. `cancelled` is called repeatedly, and stays True once it was.
 
-    `watchers`: for each target the traffic before the run. `was_exchanged`: another unit may have
-    been put in since the label was assigned to the socket; `was_missed`: part of that time was
-    unobserved; `was_silent`: the bus was observed, and nothing was received.
+    `watchers`: the traffic of each target before the run. `was_exchanged`: another unit may have
+    been put in since the label was assigned; `was_missed`: part of that time was unobserved;
+    `was_silent`: no frame was received in it.
     """
 
     def __init__(  # noqa: PLR0913  all parts of a run
@@ -126,7 +126,7 @@ class UnitRun:
             self._hear_waiting()
 
     def run(self) -> RunResult:
-        """Run all steps and return the result. An exception is a bug."""
+        """Run all steps and return the result. Any exception is a bug."""
         began_at = self._clock.now()
         code, text, verified = codes.OK, "", {}
         try:
@@ -159,7 +159,7 @@ class UnitRun:
                 )
                 for each in self._recipe.targets
             ]
-            self._hear_waiting = targets[0].hear_waiting
+            self._hear_waiting = targets[0].process_queued_frames
             return UnitSteps(
                 self._claim,
                 self._recipe,
@@ -208,7 +208,7 @@ class UnitRun:
         failed, text = None, ""
         try:
             if step is not StepName.CONNECT:
-                steps.targets[0].hear_waiting()
+                steps.targets[0].process_queued_frames()
             steps.targets[0].check_cancelled()
             text = act(measured)
         except StepFailedError as error:
@@ -217,7 +217,7 @@ class UnitRun:
             code, text = codes.TOO_SLOW, "It was not done in time."
             if self._cancelled():
                 code, text = codes.OPERATOR_ABORT, f"Stopped in {step.value}."
-            failed = StepFailedError(code, f"{text} {steps.left_behind}".strip())
+            failed = StepFailedError(code, f"{text} {steps.device_state}".strip())
         except JournalError:
             raise
         except FlasherError as error:
@@ -246,17 +246,17 @@ class UnitRun:
         return failed
 
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
-        """The ending for a unit that may have been exchanged; it precedes all others."""
+        """The error for a unit that may have been exchanged; it precedes all others."""
         lost = next((each.lost for each in self._continuity.values() if each.lost), "")
         unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
         if not (lost or unobserved):
             return None
         code = codes.UNIT_CHANGED if lost else codes.NOT_OBSERVED
-        return StepFailedError(code, f"{lost or unobserved} {steps.left_behind}".strip())
+        return StepFailedError(code, f"{lost or unobserved} {steps.device_state}".strip())
 
     def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
-        """The error for a missing answer: the unit was removed if an application that had answered
-        before no longer does, which a lost adapter leaves open.
+        """The error for a missing answer: the unit was removed if an application that answered
+        before does not any more. A lost adapter leaves that open.
         """
         try:
             for target in steps.targets:
@@ -284,7 +284,7 @@ class UnitRun:
             raise StepFailedError(codes.BUS, error.what) from error
 
     def _is_over(self) -> bool:
-        """True when a person stopped the run, the step's time is over, or the unit may have been
+        """True if a person aborted the run, the step's time is over, or the unit may have been
         exchanged; called between frames.
         """
         ends_at = self._step_ends_at
@@ -292,7 +292,7 @@ class UnitRun:
         return self._is_lost() or self._cancelled() or is_late
 
     def _is_lost(self) -> bool:
-        """True when the unit may have been exchanged; called between frames."""
+        """True if the unit may have been exchanged; called between frames."""
         now = self._clock.now()
         for each in self._continuity.values():
             each.listened(now)

@@ -1,7 +1,7 @@
 """Steps of a unit's run: identify, check, flash, write, restart, verify.
 
-A step adds its measurements to a list, returns a short text for the record, and raises
-StepFailedError with a code.
+A step adds measurements to a list, returns a short text for the record, and raises StepFailedError
+with a code.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ class UnitSteps:
     ) -> None:
         self.targets = targets
         self.verified: dict[str, Verified] = {}
-        """Verification level of each target in this run."""
-        self.left_behind = ""
-        """The state in which a device is left now, as a sentence, if it needs a rescue."""
+        """Verification level that each target reached in this run."""
+        self.device_state = ""
+        """State of a device that needs a rescue, as a sentence; or ""."""
         self._claim = claim
         self._is_verify_only = claim.kind is RunKind.VERIFY_ONLY
         self._recipe = recipe
@@ -117,14 +117,14 @@ class UnitSteps:
 
     @property
     def has_lost_its_session(self) -> bool:
-        """True when a device got an update command and has run no application since: it cannot
+        """True if a device got an update command and has run no application since: it cannot
         identify itself, so no step may be tried again.
         """
         return any(each.continuity.is_told_to_update and not each.goes_on for each in self.targets)
 
     def wait(self, limit_s: float) -> None:
-        """Wait between two tries, while running applications are asked for their versions. Raises
-        StepFailedError when one falls silent.
+        """Wait between two tries, and request the versions of running applications. Raises
+        StepFailedError if one stops answering.
         """
         clock = self.targets[0].clock
         ends_at = clock.now() + limit_s
@@ -137,7 +137,7 @@ class UnitSteps:
 
     def _connect(self, measured: list[Measurement]) -> str:
         connection = self.targets[0].device.connection
-        self.targets[0].hear_waiting()  # queued frames date from before the run
+        self.targets[0].process_queued_frames()  # queued frames date from before the run
         error = connection.link.health().error(connection.name)
         if error is not None:
             raise error
@@ -158,7 +158,7 @@ class UnitSteps:
                 )
             is_known = target.continuity.has_answered and not target.goes_on
             if is_known and identified.seen.version is None:
-                raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
+                raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
             may_await_power = self._power is not None or target.goes_on
             is_rescue = self._claim.kind is RunKind.RECHECK and may_await_power
             if target.is_silent(identified) and not is_rescue:
@@ -181,7 +181,7 @@ class UnitSteps:
 
     def _check_label(self) -> None:
         """Compare reported serial numbers with the label. A new unit has none, or one of its maker;
-        a serial number of this recipe identifies the unit. Raises StepFailedError.
+        only a serial number of this recipe identifies it. Raises StepFailedError.
         """
         for identified in self._identified.values():
             own = identified.serial_number
@@ -233,12 +233,12 @@ class UnitSteps:
     # -- flashing ---------------------------------------------------------------------------------
 
     def _flash(self, target: UnitTarget, measured: list[Measurement]) -> str:
-        """Flash a target, unless an interrupted run has. Records it before and after; tries a power
-        cycle when the device falls silent.
+        """Flash a target, unless an interrupted run has, and record it before and after. Tries a
+        power cycle if the device stops answering.
         """
         name, identified = target.name, self._identified[target.name]
         if (
-            # The records of an interrupted run and the device have to agree.
+            # The records of the interrupted run must agree with the device.
             self._claim.kind is RunKind.RECHECK
             and target.version_request is not None
             and name in self._claim.flashed_before
@@ -258,7 +258,7 @@ class UnitSteps:
                 raise
             if self.has_lost_its_session:
                 with suppress(BusError, InterruptedByUserError):
-                    target.find_out_who_is_there()
+                    target.identify_after_failure()
                 raise
             if not may_rescue:
                 raise
@@ -276,8 +276,8 @@ class UnitSteps:
         return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}"
 
     def _check_flashed(self) -> None:
-        """Compare the serial numbers of flashed targets before the next one is flashed: a target
-        that was in its bootloader could not report it before. Raises StepFailedError.
+        """Compare the serial numbers of flashed targets before the next one is flashed: one that
+        was in its bootloader could not report it before. Raises StepFailedError.
         """
         for target in self.targets:
             if target.name in self._flashed and target.version_request is not None:
@@ -320,7 +320,7 @@ class UnitSteps:
             options = replace(options, timings=watched)
         result = replace(target.job, options=options).run(target.device, on_event=on_event)
         left = result.outcome.device_left
-        self.left_behind = f"State of the device: {wording(left)}." if left.needs_rescue else ""
+        self.device_state = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()
         if result.ok:
             if target.watcher.completions == completions_when_lost and not target.goes_on:
@@ -331,7 +331,7 @@ class UnitSteps:
         words = "" if error is None else error.what
         raise StepFailedError(
             code or codes.OF_ENDING.get(result.outcome.ending, codes.TRANSFER_FAILED),
-            f"{words} {self.left_behind}".strip(),
+            f"{words} {self.device_state}".strip(),
             needs_rescue=left in (DeviceLeft.NO_APPLICATION, DeviceLeft.PERHAPS_ERASED),
         )
 
@@ -340,7 +340,7 @@ class UnitSteps:
             self._power.begin_cycle()
             return
         name = target.name.upper()
-        sentence = text("Switch the {target} off, wait 3 s, and on again.", target=name)
+        sentence = text("Switch the {target} off, wait 3 s, and switch it on again.", target=name)
         self._prompt(sentence, wait_s)
 
     @staticmethod
@@ -350,7 +350,7 @@ class UnitSteps:
             return StepFailedError(
                 codes.NOT_OBSERVED,
                 f"The adapter was away before the {target.name} started its new application:"
-                " another unit could have come.",
+                " another unit could have been connected.",
             )
         return StepFailedError(
             codes.UNIT_CHANGED,
@@ -374,11 +374,11 @@ class UnitSteps:
         return f"{len(self._plans)} written"
 
     def _await(self, target: UnitTarget) -> Content:
-        """Wait for the version answer of the application. Raises StepFailedError."""
+        """Wait for a version answer of the application. Raises StepFailedError."""
         was_running = target.continuity.is_running and not target.goes_on
         answer = target.await_application()
         if answer is None and was_running:
-            raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
+            raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
         if answer is None:
             raise StepFailedError(codes.NOT_RUNNING, f"The {target.name} does not answer.")
         own = self._identified[target.name]
@@ -403,7 +403,7 @@ class UnitSteps:
     # -- restart and verification -----------------------------------------------------------------
 
     def _restarts(self, target: UnitTarget) -> bool:
-        """True for a target that can be restarted, and asked for its version afterwards."""
+        """True for a target that can be restarted and then asked for its version."""
         can_reset = self._power is not None or target.loaded.target.has_version_query
         return can_reset and target.version_request is not None
 
@@ -442,7 +442,7 @@ class UnitSteps:
         return "; ".join(levels)
 
     def _continuity(self) -> Iterator[Measurement]:
-        """Whether each target was observed without a gap, as measurements for the records."""
+        """Measurements that record whether each target was observed without a gap."""
         for target in self.targets:
             is_watched = target.continuity.is_running and not target.goes_on
             words = "observed" if is_watched else "not observed"
@@ -452,7 +452,7 @@ class UnitSteps:
             yield Measurement(POWER_CYCLES, float(cycles))
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
-        """Verify the image of a target. Returns the level reached; raises StepFailedError."""
+        """Verify the image of a target; returns the level reached. Raises StepFailedError."""
         loaded, name = target.loaded, target.name
         needs_memory = loaded.required is Verified.MEMORY
         if target.version_request is None:
@@ -488,11 +488,11 @@ class UnitSteps:
         return Verified.MEMORY
 
     def _completed(self, target: UnitTarget) -> Verified:
-        """The level of a target that cannot be read back: its bootloader must have confirmed the
-        image in this run. Raises StepFailedError.
+        """Level of a target that cannot be read back: its bootloader must have confirmed the image
+        in this run. Raises StepFailedError.
         """
         if target.name not in self._flashed:
-            raise StepFailedError(codes.CANNOT_VERIFY, f"The {target.name} cannot be asked.")
+            raise StepFailedError(codes.CANNOT_VERIFY, f"The {target.name} has no version query.")
         if not self._recipe.recipe.allow_completed_not_read_back:
             raise StepFailedError(codes.CANNOT_VERIFY, "The recipe requires it to be read back.")
         return Verified.COMPLETED

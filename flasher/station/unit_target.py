@@ -1,7 +1,4 @@
-"""One target of the unit in a socket: its `Device`, and the station's own requests.
-
-`unit_steps` judges the answers.
-"""
+"""One target of the unit in a socket: its `Device` and the station's own requests."""
 
 from __future__ import annotations
 
@@ -33,13 +30,13 @@ from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
 _SHARE_OF_TRIES: Final = 0.8
-"""Share of the time of all tries of a packet, within which a present device sends something."""
+"""Share of the time for all tries of a packet in which a present device sends a frame."""
 _WAITING_MAX: Final = 10_000
-"""Frames that are processed at once, so that a babbling bus does not block a run."""
+"""Maximum number of frames processed at once, so that a babbling bus cannot block a run."""
 
 
 class StepFailedError(Exception):
-    """A try of a step failed; the run decides whether there is another one."""
+    """A try of a step failed; the run decides whether to try again."""
 
     def __init__(self, code: Code, text: str, *, needs_rescue: bool = False) -> None:
         super().__init__(text)
@@ -50,16 +47,16 @@ class StepFailedError(Exception):
 
 @dataclass(frozen=True)
 class Identified:
-    """Identity that a device reported before the first write."""
+    """Identity that a device reports before the first write."""
 
     seen: DeviceAnswers
     is_in_bootloader: bool
     two_devices: str
-    """Evidence of a second unit, as a sentence; empty without any."""
+    """Evidence of a second unit, as a sentence; "" without any."""
 
     @property
     def serial_number(self) -> str:
-        """The reported serial number; empty without one."""
+        """The reported serial number; "" without one."""
         return str(getattr(self.seen.version, "serial_number", ""))
 
 
@@ -83,7 +80,7 @@ class UnitTarget:
         self.continuity = continuity
         self.watcher = continuity.watcher
         self.goes_on = goes_on
-        """The recipe allows it to restart by itself (`AfterRestart.CONTINUE`)."""
+        """The recipe allows the target to restart by itself (`AfterRestart.CONTINUE`)."""
         self._taps = taps
         # No other program uses this adapter, and each flash listens for other tools itself.
         self.device = connection.device(
@@ -109,14 +106,14 @@ class UnitTarget:
             identity=loaded.profile.identity(release=loaded.release, reports_unchecked=True),
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
-        """Its version request; None without a known one."""
+        """Its version request; None if unknown."""
         self._cancelled = cancelled
 
     # -- requests ---------------------------------------------------------------------------------
 
     def identify(self) -> Identified:
-        """Request its version; silence is not an error here. A device passes through its bootloader
-        after power-up (R19): it has no application only if it keeps announcing.
+        """Request the version; no answer is not an error here. After power-up a device passes
+        through its bootloader (R19): it has no application only if it keeps announcing itself.
         """
         identified = self._identify_once()
         if not identified.is_in_bootloader or self.version_request is None:
@@ -139,13 +136,13 @@ class UnitTarget:
         return Identified(asked.answers, announced, asked.two_devices)
 
     def is_silent(self, identified: Identified) -> bool:
-        """True when it did not answer a version request."""
+        """True if it did not answer a version request."""
         asked = self.version_request is not None
         return asked and identified.seen.version is None and not identified.is_in_bootloader
 
     def await_application(self) -> Content | None:
-        """Request its version until the application answers. Returns None when the application does
-        not start in time, or no longer answers.
+        """Request the version until the application answers. None if it does not start in time or
+        no longer answers.
         """
         may_start = self.goes_on or not self.continuity.is_running
         start_s = self.loaded.profile.timings.application_start_timeout_s
@@ -161,9 +158,9 @@ class UnitTarget:
                 self.continuity.settle()
                 return answer
 
-    def find_out_who_is_there(self) -> None:
-        """Request and listen after a failed transfer, so that `continuity` can compare the unit.
-        Waits for a silent device, which announces itself when its supply returns.
+    def identify_after_failure(self) -> None:
+        """Request and receive after a failed transfer, so that `continuity` can compare the unit.
+        Waits for a silent device, which announces itself when its power returns.
         """
         timings = self.loaded.profile.timings
         tried_s = timings.packet_tries * timings.ack_timeout_s
@@ -178,17 +175,18 @@ class UnitTarget:
                 self.device.version()
 
     def confirm(self) -> None:
-        """Request its version again, unless it has restarted since its last answer; `continuity`
-        compares the answer. Raises StepFailedError when the application no longer answers.
+        """Request the version again, unless the target has restarted since its last answer;
+        `continuity` compares the answer. Raises StepFailedError if the application no longer
+        answers.
         """
-        self.hear_waiting()
+        self.process_queued_frames()
         self.check_cancelled()
         if not self.continuity.is_running or self.await_application() is not None:
             return
         if not self.goes_on:
-            raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} fell silent.")
+            raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} stopped answering.")
 
-    def hear_waiting(self) -> None:
+    def process_queued_frames(self) -> None:
         """Process the frames that are queued in the driver."""
         link = self.device.connection.link
         for _ in range(_WAITING_MAX):
@@ -199,9 +197,7 @@ class UnitTarget:
                 tap(frame, sent=False, now=self.clock.now())
 
     def read(self, what: Readable) -> Mapping[str, tuple[object, str]]:
-        """Read an item. Returns for each field its value, and the value as text. Raises
-        NoAnswerError.
-        """
+        """Read an item; returns value and text of each field. Raises NoAnswerError."""
         content = self.device.ask(Request(what.item))
         return {
             name: (getattr(content, name), codec.show(getattr(content, name)))
@@ -212,7 +208,7 @@ class UnitTarget:
     # -- restart ----------------------------------------------------------------------------------
 
     def restart(self, power: PowerControl | None) -> bool:
-        """Switch it off and on, or without `power` reset it by message. Returns True when its
+        """Switch the unit off and on, or reset the target by a message without `power`. True if its
         bootloader announced itself afterwards. Raises NoAnswerError.
         """
         watcher, before = self.watcher, self.watcher.announcements
@@ -242,7 +238,7 @@ class UnitTarget:
     # -- engines ----------------------------------------------------------------------------------
 
     def check_cancelled(self) -> None:
-        """Raises InterruptedByUserError when the run must end."""
+        """Raises InterruptedByUserError if the run must end."""
         if self._cancelled():
             raise InterruptedByUserError("The run has to end.")
 

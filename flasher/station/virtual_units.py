@@ -1,10 +1,8 @@
-"""Virtual units for training, demonstration and tests. They are put into a socket, are good, slow,
-bad or dead, and are taken out again. They keep their labels, contents and numbers. Some are
-exchanged for another one during their run, and put in again later; some have the label of another
-unit.
+"""Virtual units for training, demonstration and tests, put into a socket and taken out again.
 
-Each socket has a simulated bus of its own, as fast as a real one. Everything about a unit is drawn
-from seed and serial number.
+They are good, slow, bad or dead, and keep their labels, contents and numbers. Some are exchanged
+for another one during their run and put in again later; some have the label of another unit. Each
+socket has a simulated bus as fast as a real one. Seed and serial number determine a unit.
 """
 
 from __future__ import annotations
@@ -41,13 +39,13 @@ from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import SERIAL_NUMBER
 
 NO_NUMBER: Final = "NONE"
-"""Serial number of a new unit: empty."""
+"""Serial number of a new unit, which has none."""
 OTHER_HARDWARE: Final = "V0r0r1_20200101"
 POWER_OFF_S: Final = 1.0
 EXCHANGE_GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
-"""How long a socket is empty while its unit is exchanged."""
+"""Times for which a socket is empty while its unit is exchanged."""
 SLOW_PROGRAM_S: Final = 0.01
-"""Slow units take ten times as long for each packet."""
+"""Programming time of a packet in slow units, ten times the usual one."""
 SLOW_ERASE_S: Final = 0.02
 _DIGITS: Final = re.compile(r"[0-9]+")
 _SERIALS_TRIED: Final = 2000
@@ -82,7 +80,7 @@ def health_of(units: MockUnits, serial: str) -> Health:
 def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[str]:
     """Serial numbers that fit a recipe: its example with other digits in its last number.
 
-    Raises UsageError where none is found.
+    Raises UsageError if none is found.
     """
     places = list(_DIGITS.finditer(rule.example))
     for number in range(first, first + step * _SERIALS_TRIED, step):
@@ -98,13 +96,13 @@ def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[st
             break
     raise UsageError(
         "There are no serial numbers for further virtual units.",
-        remedy="End the serial number of the recipe with a number, or begin anew.",
+        remedy="End the serial number of the recipe with a number, or use new records.",
     )
 
 
 def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Collection[str]]) -> int:
-    """The number after that of the last virtual unit in the records. `known` returns those of the
-    given serial numbers that are in the records.
+    """The number after the last virtual unit in the records. `known` returns those of the given
+    serial numbers that are recorded.
     """
     numbers: dict[str, int] = {}
     for number in range(1, _NUMBERS_TRIED):
@@ -117,7 +115,7 @@ def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Colle
 
 @dataclass(frozen=True)
 class VirtualUnit:
-    """A unit that keeps its paper label, its contents and its numbers wherever it is put."""
+    """A virtual unit, which keeps its paper label, contents and numbers wherever it is put."""
 
     label: str
     """Text of the paper label."""
@@ -127,8 +125,8 @@ class VirtualUnit:
 
 
 class _Seat:
-    """The place of one target's device on the bus of a socket; an engine. Calls `look` with the
-    time of each event.
+    """Place of one target's device on the bus of a socket; an engine. Calls `look` with the time of
+    each event.
     """
 
     def __init__(self, look: Callable[[float], None]) -> None:
@@ -196,28 +194,28 @@ class VirtualSocket:
         self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
         self._exchanged: set[str] = set()
         self._returns: deque[VirtualUnit] = deque()
-        """Units that were exchanged for another one in their run, and will be put in again."""
+        """Units that were exchanged during their run and will be put in again."""
         self._exchange_at_operation: int | None = None
         """The operation of the flash during which the unit is pulled out."""
         self._in_hand: VirtualUnit | None = None
-        """The unit that is put in its place, at `_put_at`."""
+        """Unit that replaces it, at `_put_at`."""
         self._put_at = 0.0
         self._is_other = False
-        """The unit replaced another one during a run, which is not reported yet."""
+        """A unit was replaced during a run, which is not reported yet."""
 
     @property
     def serial(self) -> str:
-        """The label of the unit in the socket; empty without a unit."""
+        """Label of the unit in the socket; "" without a unit."""
         return "" if self.unit is None else self.unit.label
 
     @property
     def devices(self) -> Mapping[str, FaultInjector]:
-        """The devices of the unit in the socket, by target."""
+        """Devices of the unit in the socket, by target."""
         seats = self._seats.items()
         return {name: seat.device for name, seat in seats if seat.device is not None}
 
     def step(self) -> PresenceChanged | None:
-        """Put a unit in or take it out when it is due. Returns the change, or None."""
+        """Put a unit in or take it out if due. Returns the change, or None."""
         now = self.clock.now()
         if self._next_at is None or now < self._next_at:
             return None
@@ -233,7 +231,7 @@ class VirtualSocket:
         if unit is None:
             return None
         self.put(unit)
-        return self._put_in("a virtual unit came")
+        return self._put_in("a virtual unit arrived")
 
     def _put_in(self, how: str) -> PresenceChanged:
         return PresenceChanged(is_there=True, how=how, label=self.serial, is_power_up=True)
@@ -247,7 +245,7 @@ class VirtualSocket:
         return self.make(next(self._serials))
 
     def make(self, label: str) -> VirtualUnit:
-        """Make the unit with this label, as it arrives at the end of the line."""
+        """Make a unit with this label, as it arrives at the end of the line."""
         health, number = health_of(self._virtual.units, label), self._own_number(label)
         devices, now = {}, self.clock.now()
         for target in self._recipe.targets if health is not Health.DEAD else ():
@@ -263,7 +261,7 @@ class VirtualSocket:
         return unit.health
 
     def put(self, unit: VirtualUnit) -> None:
-        """Put a unit in. The socket powers it, so it starts through its bootloader."""
+        """Put a unit in. The socket powers it, so it starts with its bootloader."""
         self.unit, now = unit, self.clock.now()
         for name, device in unit.devices.items():
             device.power_on(now)
@@ -271,7 +269,7 @@ class VirtualSocket:
         self._exchange_at_operation = self._planned_exchange(unit)
 
     def take_out(self) -> VirtualUnit | None:
-        """Take the unit out, which switches it off. Returns it; None without one."""
+        """Take the unit out, which switches it off, and return it; None without a unit."""
         unit, self.unit, now = self.unit, None, self.clock.now()
         self._exchange_at_operation = None
         for seat in self._seats.values():
@@ -281,7 +279,7 @@ class VirtualSocket:
         return unit
 
     def _planned_exchange(self, unit: VirtualUnit) -> int | None:
-        """Draw the operation of its flash during which the unit is exchanged; None: none."""
+        """Draw the flash operation during which the unit is exchanged; None: no exchange."""
         chance, units = _chance(self._virtual.units, "exchanged", unit.label), self._virtual.units
         was_exchanged = unit.label in self._exchanged
         if not unit.devices or was_exchanged or chance.random() >= units.exchanged:
@@ -292,7 +290,7 @@ class VirtualSocket:
         return unit.devices[name].operations_done + int(packets * chance.uniform(0.2, 0.9))
 
     def _look(self, now: float) -> None:
-        """Exchange the unit when it is due."""
+        """Exchange the unit if due."""
         if self._in_hand is not None:
             if now >= self._put_at:
                 self.put(self._in_hand)
@@ -320,8 +318,8 @@ class VirtualSocket:
             seat.due_at = at_s
 
     def _own_number(self, label: str) -> str:
-        """The serial number that the unit reports: none if the recipe writes it, else that of its
-        label, cut to the field's length; of another unit if it is mislabelled.
+        """Serial number that the unit reports: none if the recipe writes it, else that of its
+        label, shortened to the field; of another unit if it is mislabelled.
         """
         chance, units = _chance(self._virtual.units, "label", label), self._virtual.units
         number = label
@@ -338,7 +336,7 @@ class VirtualSocket:
         return number
 
     def run_ended(self) -> None:
-        """Take the unit out a while after the end of its run."""
+        """Take the unit out some time after the end of its run."""
         self._next_at = self.clock.now() + self._virtual.leave_after_s
         self._exchange_at_operation = None
         if self._in_hand is not None:  # the bus did not run up to the moment of the exchange

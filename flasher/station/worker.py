@@ -1,12 +1,12 @@
-"""The process of one socket: it opens the adapter, watches for units, and runs them.
+"""The process of one socket: opens the adapter, detects units, and runs them.
 
-It is a process of its own, so that a driver that crashes or hangs affects one socket only.
-`multiprocessing` starts the processes with "spawn" on every system: a station can wait for all of
-their pipes together, on Windows too, and output that a driver prints does no harm.
+A driver that crashes or hangs thus affects one socket only. `multiprocessing` starts the processes
+with "spawn" on every system: a station can wait for all pipes together, on Windows too, and output
+that a driver prints does no harm.
 
-It writes no records. It asks the station to save everything that has to be on disk (`Ask`), and
-waits for the reply. A broken pipe means that the station is dead: the current message is finished,
-and no further one is sent.
+The process writes no records. It asks the station to save everything that must be on disk (`Ask`),
+and waits for the reply. If the pipe breaks because the station died, the current message is
+finished and no further one is sent.
 """
 
 from __future__ import annotations
@@ -69,24 +69,24 @@ _LOOK_S: Final = 0.1
 
 
 class Channel(Protocol):
-    """The pipe to the station; `multiprocessing.connection.Connection` is one."""
+    """Pipe to the station, for example a `multiprocessing.connection.Connection`."""
 
     def send(self, obj: Any, /) -> None:
-        """Raises OSError when the station has ended."""
+        """Raises OSError if the station has ended."""
 
     def recv(self) -> Any:
-        """Raises EOFError when the station has ended."""
+        """Raises EOFError if the station has ended."""
 
     def poll(self, timeout: float = 0.0) -> bool:
-        """True when a message waits, or the station has ended."""
+        """True if a message waits or the station has ended."""
 
 
 class StationGoneError(Exception):
-    """The station has ended: nothing can be recorded."""
+    """The station has ended, so nothing can be recorded."""
 
 
 class StationPipe:
-    """The pipe to the station: sends heartbeats, and queues messages until they are taken."""
+    """The pipe to the station, with heartbeats and queued messages."""
 
     def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
         self._channel = channel
@@ -97,10 +97,10 @@ class StationPipe:
         self._claim: Claim | None = None
         self._replies: dict[int, WriteReply] = {}
         self.meanwhile: Callable[[], None] = lambda: None
-        """Called repeatedly while it waits for the station."""
+        """Called repeatedly while waiting for the station."""
         self.is_aborted = False
         self.is_over = False
-        """True when the station has ended, or has asked the process to end."""
+        """True if the station has ended or has asked the process to end."""
         self.is_gone = False
 
     def send(self, message: FromWorker) -> None:
@@ -112,12 +112,12 @@ class StationPipe:
             raise StationGoneError from error
 
     def send_progress(self, event: RunEvent) -> None:
-        """Send progress; a dead station is detected by `look`."""
+        """Send progress; `look` detects a dead station."""
         with suppress(StationGoneError):
             self.send(event)
 
     def look(self, wait_s: float = 0.0) -> None:
-        """Receive waiting messages, and send a heartbeat when one is due."""
+        """Receive waiting messages, and send a heartbeat if due."""
         now = self._now()
         self._looked_at = now
         if now - self._beat_at >= BEAT_S and not self.is_gone:
@@ -132,13 +132,13 @@ class StationPipe:
             self.is_gone = self.is_over = True
 
     def wait(self, limit_s: float) -> None:
-        """Wait up to `limit_s`; returns early when the process has to end."""
+        """Wait up to `limit_s`, or until the process has to end."""
         until = self._now() + limit_s
         while self._now() < until and not self.is_over:
             self.look(IDLE_S)
 
     def is_stopped(self) -> bool:
-        """True when a person aborted the run or the station has ended; called between frames."""
+        """True if a person aborted the run or the station has ended; called between frames."""
         if self._now() - self._looked_at >= _LOOK_S:
             self.look()
         return self.is_aborted or self.is_over
@@ -156,7 +156,7 @@ class StationPipe:
         write = JournalWrite(target, what, value)
         write_id = self._ask(write).write_id
         if write_id is None:
-            raise JournalError("The station did not say what it saved.")
+            raise JournalError("The station did not confirm the saved record.")
         return replace(write, write_id=write_id)
 
     def verified(self, write: JournalWrite, read_back: str | None) -> None:
@@ -168,7 +168,7 @@ class StationPipe:
     def _ask(
         self, what: JournalWrite | StepEnded, measurements: Sequence[Measurement] = ()
     ) -> WriteReply:
-        """Wait for the station to save it. Raises StationGoneError, JournalError."""
+        """Wait until the station has saved it. Raises StationGoneError, JournalError."""
         self._asked += 1
         self.send(Ask(self._asked, what, tuple(measurements)))
         give_up_at = self._now() + REPLY_LIMIT_S
@@ -215,13 +215,13 @@ class Worker:
         self._presence = Presence(recipe.targets)
         self._listened_at = connection.clock.now()
         self._is_down = False
-        """The adapter failed."""
+        """The adapter has failed."""
         self._is_blocked = False
         """Its transmit queue is full."""
         self._reopen_at = 0.0
 
     def work(self) -> None:
-        """Work until the station ends the process, or has ended itself."""
+        """Work until the station ends the process or has ended itself."""
         sees = self._virtual is not None or self._presence.sees_units
         self._pipe.send(AdapterReady(self._connection.name, sees))
         if self._virtual is not None:
@@ -270,7 +270,7 @@ class Worker:
         self._listened_at = self._connection.clock.now()
 
     def _listened(self) -> None:
-        """Record that the bus was observed up to now, unless this computer stalled."""
+        """Note that the bus was observed up to now, unless this computer stalled."""
         now, blind_s = self._connection.clock.now(), BLIND_S * self._connection.clock.speed
         if now - self._listened_at > blind_s:
             self._presence.miss(now - self._listened_at, now)
@@ -349,7 +349,7 @@ class Worker:
 
 
 def pack(path: Path) -> str:
-    """Compress a trace file, delete the plain one, and return its hash. Raises OSError."""
+    """Compress a trace file, delete the plain one, and return its SHA-256. Raises OSError."""
     made = packed(path)
     make_private(made)
     with path.open("rb") as plain, made.open("wb") as raw:
@@ -366,14 +366,14 @@ def _error_result(code: codes.Code, text: str) -> RunResult:
 
 
 Opened = AbstractContextManager[tuple[Connection, VirtualSocket | None]]
-"""The connection of a socket, and its virtual units if it has them."""
+"""Connection of a socket, and its virtual units if any."""
 
 
 @contextmanager
 def open_socket(
     setup: WorkerSetup, recipe: LoadedRecipe
 ) -> Iterator[tuple[Connection, VirtualSocket | None]]:
-    """Open the connection of a setup. Raises UsageError, BusError."""
+    """Open the connection of a socket. Raises UsageError, BusError."""
     if setup.bus is None:
         if setup.virtual is None:
             raise UsageError(f"Socket {setup.socket} has neither an adapter nor virtual units.")
@@ -387,7 +387,7 @@ def open_socket(
 
 
 def load_same(setup: WorkerSetup) -> LoadedRecipe:
-    """Load the recipe of the setup. Raises UsageError when it differs from the station's."""
+    """Load the recipe. Raises UsageError if it differs from the station's."""
     recipe = load_recipe(setup.recipe)
     if {str(path): sha256 for path, sha256 in recipe.files.items()} != dict(setup.files):
         raise UsageError("The recipe, or a file that it names, was changed.")
@@ -397,7 +397,8 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 def work_on(
     pipe: StationPipe, setup: WorkerSetup, recipe: LoadedRecipe, opened: Callable[[], Opened]
 ) -> None:
-    """Work in a socket until the station ends the process; retry an adapter that cannot be opened.
+    """Work in a socket until the station ends the process; an adapter that cannot be opened is
+    tried again.
 
     Raises StationGoneError.
     """

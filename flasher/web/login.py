@@ -213,7 +213,7 @@ class Login:
         password = fields.get("password", "").encode()
         if not (self._password and hmac.compare_digest(password, self._password.encode())):
             raise self._wrong(address, "", "wrong password")
-        self._attempts.was_right(address, "")
+        self._attempts.forget(address, "")
         return None
 
     async def _person(self, badges: Badges, address: str, code: str, pin: str) -> Person:
@@ -221,7 +221,7 @@ class Login:
         person = badges.find(code)
         if person is not None and not (person.pin or badges.needs_pin):
             self._count(address, code)
-            self._attempts.was_right(address, code)
+            self._attempts.forget(address, code)
             return person
         if not pin:  # a scanner ends what it types by Enter
             self._count(address, None)
@@ -237,7 +237,7 @@ class Login:
             raise self._wrong(address, code, "unknown badge")
         if not (is_right and person.pin):
             raise self._wrong(address, code, "wrong PIN", person.name)
-        self._attempts.was_right(address, code)
+        self._attempts.forget(address, code)
         return person
 
     def _count(self, address: str, badge: str | None) -> None:

@@ -20,7 +20,7 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.i18n import text
-from flasher.station.board import Board, Row, Spoken
+from flasher.station.board import Board, Replies, Row
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
 from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.shift_counts import EndedRun, ShiftCounts, ShiftFigures
@@ -80,13 +80,13 @@ class ScreenHeader:
     output: ShiftFigures
     health: tuple[HealthCheck, ...]
     stopped: LineStopped | None
-    spoken: Spoken
+    replies: Replies
     is_secret: bool
     """Typed characters must not be shown."""
 
     def to_json(self, translate: Translator, source: Source) -> dict[str, Any]:
         """The header in a language, for the page of the session `source`."""
-        stopped, lot, spoken = self.stopped, self.lot, self.spoken.to(source.name)
+        stopped, lot, reply = self.stopped, self.lot, self.replies.to(source.name)
         name = lot.name or translate(text("no lot"))
         left = max(lot.size - lot.good, 0)
         return {
@@ -98,8 +98,8 @@ class ScreenHeader:
             if lot.size
             else name,
             "virtual": translate(self.virtual),
-            "spoken": translate(spoken.text),
-            "is_refusal": spoken.is_refusal,
+            "spoken": translate(reply.text),
+            "is_refusal": reply.is_refusal,
             "is_secret": self.is_secret,
             "stopped": None
             if stopped is None
@@ -137,7 +137,7 @@ def _left(left_s: float, translate: Translator) -> str:
 
 def _tile(row: Row, translate: Translator) -> dict[str, Any]:
     """One socket in a language, for the page's script."""
-    serial = row.serial or row.borne
+    serial = row.serial or row.virtual_label
     return {
         "socket": row.socket,
         "state": row.state.value.lower(),
@@ -200,10 +200,10 @@ class Screen:
             self._tally.output(datetime.now().astimezone()),
             self._watch.look(board),
             board.stopped,
-            board.spoken,
+            board.replies,
             bool(board.pin_of),
         )
-        self.feed.put(_HEAD, head, word=(head.stopped, head.spoken, head.is_secret))
+        self.feed.put(_HEAD, head, word=(head.stopped, head.replies, head.is_secret))
 
 
 class OperatorPage:

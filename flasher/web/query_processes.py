@@ -22,7 +22,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response, S
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import FlasherError
-from flasher.station.children import deaf_from_birth
+from flasher.station.children import signals_blocked
 from flasher.web.pages import Pages
 from flasher.web.sign_ins import SignIn
 
@@ -104,7 +104,7 @@ class QueryProcesses:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(PROCESSES, context, _begin, (self._make,))
-        with deaf_from_birth():
+        with signals_blocked():
             return self._pool.submit(function, *arguments)
 
     def close(self) -> None:

@@ -367,7 +367,7 @@ def test_with_badges_nothing_begins_before_one_is_scanned(
 def test_without_badges_it_is_said_once(flasher: Flasher, recipe: Path) -> None:
     words = ("--mock-sockets", "1", "--units", "1", "--mock-bad", "0", "--lines", *FAST)
     run = flasher("station", "run", "--recipe", recipe, *words)
-    assert run.out.count("No badge table: people are taken at their word.") == 1
+    assert run.out.count("No badge table: operator names are not checked.") == 1
 
 
 def test_a_badge_in_a_file_of_scans_is_no_label(

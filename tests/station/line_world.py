@@ -141,7 +141,7 @@ class World:
 
     def feed(self, name: str, what: line.SocketInput) -> None:
         self.note(f"{name} {what}")
-        self.way = "named" if self.line.sockets[name].binding is Binding.NAMED else "card"
+        self.way = "named" if self.line.sockets[name].binding is Binding.PROMPTED else "card"
         self.line.feed(name, what, self.now)
         self.write_planned()
 

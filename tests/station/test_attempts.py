@@ -52,7 +52,7 @@ def test_refused_tries_do_not_make_the_pause_longer() -> None:
 def test_a_right_try_ends_the_growth_and_not_the_rate() -> None:
     attempts = Attempts()
     used_up(attempts, 0.0)
-    attempts.was_right(X, "B")
+    attempts.forget(X, "B")
     assert attempts.begin(X, "B", 1.0) == 59.0
     used_up(attempts, 60.0)
     assert attempts.begin(X, "B", 60.0) == PAUSE_S
@@ -115,7 +115,7 @@ def test_in_no_minute_more_than_five_of_a_badge_and_address(
         if wait_s == 0.0:
             checked[address].append(now)
             if is_right:
-                attempts.was_right(address, "B")
+                attempts.forget(address, "B")
     for moments in checked.values():
         for begun in moments:
             assert sum(begun <= each < begun + 59.999 for each in moments) <= TRIES_MAX

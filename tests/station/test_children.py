@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from flasher.station.children import deaf_from_birth
+from flasher.station.children import signals_blocked
 
 HEARS = """
 import signal, sys
@@ -22,7 +22,7 @@ def test_a_process_hears_no_ctrl_c_from_its_first_line_on_and_its_parent_hears_i
     heard: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _frame: heard.append(number))
     try:
-        with deaf_from_birth():
+        with signals_blocked():
             signal.raise_signal(signal.SIGINT)
             assert subprocess.run([sys.executable, "-c", HEARS], check=False).returncode == 0
             assert not heard

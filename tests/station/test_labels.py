@@ -188,7 +188,7 @@ def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> No
     failed = line.last(LabelFailed)
     assert (failed.socket, failed.serial) == ("A", SERIAL)
     assert failed.reason == "The printer is out of paper."
-    assert failed.remedy == f"Mend it, then scan REPRINT {SERIAL}."
+    assert failed.remedy == f"Repair the printer, then scan REPRINT {SERIAL}."
     assert bench.store.read.run(line.last(RunEnded).run_id).run.state is RunState.PASS
     board = Board()
     for event in line.events:

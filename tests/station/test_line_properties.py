@@ -105,7 +105,7 @@ def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
         unknown = next(
             (e for e in free if e.occupancy is not Occupancy.THERE and not e.label), None
         )
-        return found or (None if unknown is None else (unknown, Binding.NAMED))
+        return found or (None if unknown is None else (unknown, Binding.PROMPTED))
 
     patch.setattr(line, "place", place)
 

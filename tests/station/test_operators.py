@@ -123,7 +123,7 @@ def test_without_a_table_the_station_says_so_once(bench: Bench) -> None:
         board.apply(event)
     assert not line.last(StationStarted).has_badges
     assert not board.has_badges
-    assert board.last_reply == "No badge table: people are taken at their word."
+    assert board.last_reply == "No badge table: operator names are not checked."
     line.scan("OPERATOR Ann")
     assert line.station.line.operator == "Ann"
     line.scan("123456")

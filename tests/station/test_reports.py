@@ -222,5 +222,5 @@ def test_earlier_runs_are_on_the_page(plant: Bench) -> None:
 
 def test_nothing_is_certified_for_a_unit_without_runs(plant: Bench, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
-    with pytest.raises(UsageError, match="nothing to certify"):
+    with pytest.raises(UsageError, match="no run to certify"):
         render_certificate(UnitLife("W1", "P", UnitState.NEW, ()), plant.clock.utc(), Proof())

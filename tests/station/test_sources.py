@@ -363,14 +363,14 @@ def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
     floor.put_all(*pair())
     floor.scan("SOCKET A")
     floor.change_places(0.5)
-    said = "The unit was exchanged, or had no power. See which unit it is, then scan again."
+    said = "The unit was exchanged, or had no power. Check which unit it is, then scan again."
     assert floor.text("A").startswith(said)
     floor.go_on(15.0)
     assert floor.text("A") == "Scan the label of the unit and SOCKET A."
     floor.scan("SOCKET A")
     floor.units.pop("A")
     floor.go_on(2.5)
-    assert floor.text("A").startswith("Its unit sends nothing any more.")
+    assert floor.text("A").startswith("Its unit stopped sending.")
     floor.go_on(15.0)
     assert floor.state("A") is SocketState.SILENT
 
@@ -397,7 +397,7 @@ def test_green_goes_with_its_unit_however_fast_the_next_one_is(recipe: LoadedRec
     assert floor.state("A") is SocketState.PASS
     floor.change_places(0.3)
     assert floor.state("A") is SocketState.SCAN
-    assert floor.text("A").startswith("It was off or not heard after PASS of W1")
+    assert floor.text("A").startswith("It was off or silent after PASS of W1")
 
 
 def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> None:
@@ -440,7 +440,7 @@ def test_green_outlives_an_outage_only_with_a_unit_that_says_who_it_is(
         assert floor.state("A") is SocketState.PASS
     else:
         assert floor.state("A") is SocketState.SCAN
-        assert floor.text("A").startswith("It was off or not heard after PASS of W1")
+        assert floor.text("A").startswith("It was off or silent after PASS of W1")
 
 
 @each("put_after_s", [0.1, 1.0, 1.9])

@@ -336,7 +336,7 @@ def test_green_goes_when_it_may_be_another_unit(line: LineBench) -> None:
     assert line.state("A") is SocketState.PASS, "it may sleep"
     line.arrive("A", "")
     assert line.state("A") is SocketState.SCAN
-    assert line.text("A").startswith(f"It was off or not heard after PASS of {SERIAL}")
+    assert line.text("A").startswith(f"It was off or silent after PASS of {SERIAL}")
 
 
 def test_a_socket_out_of_service_is_that(line: LineBench) -> None:
@@ -820,9 +820,9 @@ def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> N
 
 def test_labels_of_virtual_units_may_scan_themselves(bench: Bench) -> None:
     line = LineBench(bench, scans_labels=True)
-    line.say("A", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    line.say("A", PresenceChanged(is_there=True, how="a virtual unit arrived", label=SERIAL))
     assert line.state("A") is SocketState.RUNNING
-    line.say("B", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    line.say("B", PresenceChanged(is_there=True, how="a virtual unit arrived", label=SERIAL))
     assert line.last(ScanRefused).code == "UNIT_RUNNING"
 
 
@@ -830,11 +830,11 @@ def test_labels_that_came_while_the_line_was_stopped_scan_themselves_after_it(
     bench: Bench,
 ) -> None:
     line = LineBench(bench, scans_labels=True)
-    line.say("A", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    line.say("A", PresenceChanged(is_there=True, how="a virtual unit arrived", label=SERIAL))
     line.work("A")
     other = hold(bench)
     line.end("A")
-    line.say("B", PresenceChanged(is_there=True, how="a virtual unit came", label=OTHER))
+    line.say("B", PresenceChanged(is_there=True, how="a virtual unit arrived", label=OTHER))
     assert line.last(ScanRefused).code == "LINE_STOPPED"
     other.close()
     line.scan("RESUME")
@@ -931,4 +931,4 @@ def test_a_pass_of_a_first_run_that_flashed_nothing_is_none(line: LineBench) -> 
     line.end("A")
     ended = line.last(RunEnded)
     assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
-    assert "every target flashed" in ended.text or "refuses" in ended.text
+    assert "every target flashed" in ended.text or "forbids" in ended.text

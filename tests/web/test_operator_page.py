@@ -228,7 +228,7 @@ def test_a_page_shows_what_came_of_its_own_scans_and_of_scanners(
     one, two, again = line.sources
     assert one == again != two
     reason = text("The unit was exchanged, or had no power.")
-    remedy = text("See which unit it is, then scan again.")
+    remedy = text("Check which unit it is, then scan again.")
     line.say(ScanRefused("SOCKET A", "UNIT_CHANGED", reason, remedy, "A", one.name, at=AT))
     line.say(ScanAccepted("SOCKET B", "socket", "B", two.name, at=AT))
     expect(page.locator("#spoken")).to_have_text(f"SOCKET A: {reason} {remedy}")

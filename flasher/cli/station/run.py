@@ -297,7 +297,7 @@ class _Session:
 
     def _first_stop(self) -> None:
         text = "No further unit starts; running ones are finished. Ctrl-C again stops them."
-        self.view.board.speak(text)
+        self.view.board.reply(text)
         self.output.progress(text)
         self.view.refresh()
 

@@ -98,15 +98,18 @@ class ScanFile:
         return not self._left
 
     def turn(
-        self, sockets: Iterable[Socket], borne: Mapping[str, str], exchanged: Collection[str] = ()
+        self,
+        sockets: Iterable[Socket],
+        virtual_labels: Mapping[str, str],
+        exchanged: Collection[str] = (),
     ) -> None:
-        """Submit the next scan when its unit waits. `borne`: labels of virtual units by socket;
-        `exchanged`: labels of units taken out in their run, which are scanned again when the unit
-        returns. Raises UsageError when no socket can detect units.
+        """Submit the next scan if its unit waits. `virtual_labels`: labels of virtual units by
+        socket; `exchanged`: labels of units taken out in their run, which are scanned again when
+        the unit returns. Raises UsageError if no socket can detect units.
         """
         sockets = tuple(sockets)
         for socket in sockets:
-            label = borne.get(socket.name, "")
+            label = virtual_labels.get(socket.name, "")
             if socket.awaits_label and label in exchanged and self._again[label] < _AGAIN_MAX:
                 self._again[label] += 1
                 self._submit(f"{Word.SOCKET.value} {socket.name}")
@@ -123,7 +126,7 @@ class ScanFile:
             )
         scan = understand(self._left[0])
         if self._is_label(self._left[0]):
-            self._label(sockets, borne)
+            self._label(sockets, virtual_labels)
         elif isinstance(scan, ScanCommand) and scan.word is Word.SOCKET and len(self._left) > 1:
             named = next(e for e in sockets if e.name.lower() == scan.argument.lower())
             if named.awaits_label:
@@ -132,15 +135,19 @@ class ScanFile:
         else:
             self._submit(self._left.popleft())
 
-    def _label(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
+    def _label(self, sockets: Iterable[Socket], virtual_labels: Mapping[str, str]) -> None:
         """Submit a label for a waiting unit."""
         ahead = list(takewhile(self._is_label, self._left))  # up to the next command
         for socket in sockets:
             if not (socket.awaits_label and socket.sees_units):
                 continue
-            own = borne.get(socket.name, "")
+            own = virtual_labels.get(socket.name, "")
             # A virtual unit whose label comes later in the file waits for it.
-            label = own if own in ahead else next((e for e in ahead if e not in borne.values()), "")
+            label = (
+                own
+                if own in ahead
+                else next((e for e in ahead if e not in virtual_labels.values()), "")
+            )
             if label:
                 self._left.remove(label)
                 self._submit(f"{Word.SOCKET.value} {socket.name}")

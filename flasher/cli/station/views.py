@@ -22,7 +22,7 @@ from flasher.cli.documents import to_json
 from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
 from flasher.station import events
-from flasher.station.board import NO_BADGES, Board, Row, beside_words
+from flasher.station.board import NO_BADGES, Board, Row, device_event_text
 from flasher.station.events import LineStopped, SocketState, StationEvent
 from flasher.station.records.model import Figures
 
@@ -197,7 +197,7 @@ def _cells(row: Row) -> list[str | Text]:
     return [
         row.socket,
         Text(f" {row.state.value:<{_STATE_WIDTH - 1}}", style=_STYLES[row.state]),
-        Text(row.serial or row.borne, style="" if row.serial else "italic"),
+        Text(row.serial or row.virtual_label, style="" if row.serial else "italic"),
         Text(doing, style="bold" if row.code else ""),
         f"{percent:>5} {left:>7}",
     ]
@@ -282,7 +282,7 @@ def _words(event: StationEvent) -> Iterator[str]:
         case events.OperatorPrompted(socket, text):
             yield f">>> {f'socket {socket}: ' if socket else ''}{text}"
         case events.LabelFailed() | events.ScannerChanged():
-            yield beside_words(event)
+            yield device_event_text(event)
         case events.LineStopped(code, reason, remedy):
             yield f"LINE STOPPED {code}: {reason} {remedy} Then scan RESUME."
         case events.LineResumed():
