@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+from flasher.conformance.matrix import ClauseRow
 from flasher.conformance.reports import group_title
 from flasher.conformance.results import (
     CaseResult,
@@ -114,6 +115,17 @@ def comparison_page(found: SideBySide) -> str:
         colours=_COLOURS,
         in_part=CaseVerdict.PASS_IN_PART,
         differing=[case for case in found.cases if case.differs],
+    )
+
+
+def matrix_page(report: RunReport, rows: Sequence[ClauseRow]) -> str:
+    """Render the requirements matrix of a run."""
+    return render_page(
+        "matrix.html",
+        report=report,
+        rows=rows,
+        colours=_COLOURS,
+        in_part=CaseVerdict.PASS_IN_PART,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shlex
@@ -19,12 +20,14 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.bench_options import BenchOptions
 from flasher.conformance.cases import rs
 from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
+from flasher.conformance.clauses import CLAUSES
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
 from flasher.conformance.simulated import SimulatedPort
 from flasher.errors import BusError, ExitCode
 from pytest_flasher import BENCH_OPTIONS
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.report.pages import Page, assert_self_contained
 
 from .bench import PROFILE, fails_once, passes_once, run_case
 
@@ -211,10 +214,57 @@ def test_all_files_are_written_with_what_they_are_for(flasher: Flasher, tmp_path
     assert "boot version" in flasher("explain", trace, "--all").out
 
 
+def test_the_matrix_has_each_clause_with_its_cases_and_what_was_not_judged(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    table, page = tmp_path / "clauses.csv", tmp_path / "clauses.html"
+    for path in (table, page):
+        assert flasher(*WRONG, "--case", "UP-03", "--matrix", path).code == 12
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(dict.fromkeys(row["clause"] for row in rows)) == list(CLAUSES)
+    verdicts = {(row["clause"], row["case"]): row["verdict"] for row in rows}
+    assert verdicts["Welling 5.1, figure 2 (begin)", "RS-01"] == "fail"
+    assert verdicts["R17", "UP-03"] == "pass"
+    assert verdicts["Welling 5.2, table 9 (C502)", "EN-01"] == "not selected"
+    reasons = {row["case"]: row["reason"] for row in rows}
+    assert "expected" in reasons["RS-01"]
+    assert reasons["UP-03"] == ""
+    html = page.read_text("utf-8")
+    assert_self_contained(Page(html))
+    assert f" of {len(CLAUSES)} clauses were judged in this run." in html
+
+
+def test_a_case_that_failed_is_run_again_with_its_seed(flasher: Flasher, tmp_path: Path) -> None:
+    report = tmp_path / "a.json"
+    first = flasher(*WRONG, "--case", "UP-03", "--seed", "7", "--json-report", report)
+    assert first.code == 12
+    again = flasher("--json", *WRONG[:6], "--rerun-failed", report)
+    assert again.code == 12
+    document = again.document["report"]
+    assert [result["id"] for result in document["results"]] == ["RS-01"]
+    assert document["seed"] == "7"
+
+
+def test_cases_that_failed_are_selected_by_the_report_alone(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    report = tmp_path / "a.json"
+    assert flasher(*MOCK, "--case", "RS-01", "--json-report", report).code == 0
+    none = flasher(*MOCK, "--rerun-failed", report)
+    assert none.code == 2
+    assert "there is nothing to run again" in none.err
+    for words in (("--case", "RS-01"), ("--quick",), ("--seed", "1")):
+        both = flasher(*MOCK, "--rerun-failed", report, *words)
+        assert both.code == 2
+        assert "selects the cases and the seed itself" in both.err
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
         ((), 2, "-t/--target is required"),
+        (("-t", "bms", "--mock", "--matrix", "clauses.pdf"), 2, "ends in .csv or .html"),
         (("-t", "bms"), 2, "good image is required"),
         (("-t", "bms", "--mock", "--case", "RS-1"), 2, "Did you mean RS-0"),
         (("-t", "bms", "--mock", "--group", "QQ"), 2, "There is no group"),

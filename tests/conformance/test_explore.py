@@ -197,6 +197,16 @@ def test_nothing_found_is_exit_code_0(flasher: Flasher) -> None:
     assert "never in the phase transfer" in ran.out
 
 
+def test_it_walks_for_a_time_and_tells_what_was_covered(flasher: Flasher) -> None:
+    ran = flasher("conformance", "explore", "-t", "bms", "--mock", "--for", "0.01")
+    assert ran.code == 0
+    assert " 1 walks, " in ran.out
+    assert "pairs of phase and step were covered" in ran.out
+    assert ran.out.splitlines()[-1] == "nothing was found"
+    sooner = flasher("conformance", "explore", "-t", "bms", "--mock", "--for", "99", "--steps", "3")
+    assert " 3 steps, " in sooner.out
+
+
 def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,7 +220,11 @@ def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
     monkeypatch.setattr(f"{where}.can_ask", lambda: True)
     monkeypatch.setattr(f"{where}.agrees", lambda question, **_: asked.append(question))
     assert flasher("conformance", "explore", *bench, "--steps", "12").code == 2
-    assert asked == ["12 steps erase and write the device about 2 times. Begin?"]
+    assert flasher("conformance", "explore", *bench, "--for", "60").code == 2
+    assert asked == [
+        "12 steps erase and write the device about 2 times. Begin?",
+        "the device is erased and written again and again for 60 s. Begin?",
+    ]
 
 
 @pytest.mark.parametrize("argument", ["", "=other"])

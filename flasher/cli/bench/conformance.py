@@ -63,7 +63,13 @@ from flasher.conformance.catalogue import (
     known_cases,
     missing_requirements,
 )
-from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
+from flasher.conformance.diff import (
+    THRESHOLD_PERCENT,
+    Difference,
+    compare,
+    read_report,
+    verdicts_of,
+)
 from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunReport
 from flasher.conformance.side_by_side import SideBySide, side_by_side
 from flasher.errors import ErrorCode, ExitCode, UsageError
@@ -91,12 +97,26 @@ back; a second one ends at once.
 _TRACE_DIR: Final = "--trace-dir"
 _FILES: Final = {
     name: f"--{name.replace('_', '-')}"
-    for name in ("junit", "json_report", "html", "badge", "summary")
+    for name in ("junit", "json_report", "html", "badge", "summary", "matrix")
 }
 """Report files: their field names in the options, and their options."""
+_FAILED: Final = frozenset(
+    {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.NOT_RUN}
+)
+"""Verdicts of the cases that --rerun-failed selects."""
 _RUN_OPTIONS: Final = frozenset(
     {
-        *("--list", "--case", "--group", "--exclude", "--quick", "--seed", "--repeat", "--timeout"),
+        *(
+            "--list",
+            "--case",
+            "--group",
+            "--exclude",
+            "--rerun-failed",
+            "--quick",
+            "--seed",
+            "--repeat",
+            "--timeout",
+        ),
         *_FILES.values(),
         _TRACE_DIR,
         *OUTPUT_OPTIONS,
@@ -187,6 +207,10 @@ class Choices:
         "--exclude", "excluded", multiple=True, type=str.upper, metavar="ID|G",
         help="run all but this case or group; may be repeated",
     )]  # fmt: skip
+    rerun_failed: Annotated[Path | None, _what(
+        "--rerun-failed", type=values.FilePath("json", gives=Path), metavar="REPORT",
+        help="run the cases that did not pass in this report of --json-report, with its seed",
+    )]  # fmt: skip
     quick: Annotated[bool, _what(
         "--quick", is_flag=True, brief=True,
         help="some of every group, in under a minute on a real bus",
@@ -224,6 +248,9 @@ class Choices:
     summary: Annotated[Path | None, _report(
         "--summary", help="the run on one page (HTML) to be printed, for a release",
     )]  # fmt: skip
+    matrix: Annotated[Path | None, _report(
+        "--matrix", help="each clause with its cases and their verdicts (.csv or .html)",
+    )]  # fmt: skip
     trace_dir: Annotated[Path | None, option(
         _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
         help="folder for a trace file (candump) of each case that does not pass",
@@ -259,6 +286,8 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
 
     bench = described(bench, bus)
     _check_files(chosen)
+    if chosen.rerun_failed is not None:
+        chosen = _only_failed(chosen, chosen.rerun_failed)
     wear = chosen.selection.wears(chosen.upgrades)
     if wear and not bench.is_simulated:
         named = ", ".join(f"{case_id} {count} times" for case_id, count in wear.items())
@@ -287,10 +316,36 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     return code
 
 
+def _only_failed(chosen: Choices, path: Path) -> Choices:
+    """Select the cases that did not pass in a report. Raises UsageError when there is none, or when
+    the report cannot be read.
+    """
+    source = click.get_current_context().get_parameter_source("seed")
+    if chosen.selection != Selection() or source is not click.core.ParameterSource.DEFAULT:
+        raise UsageError(
+            "--rerun-failed selects the cases and the seed itself.",
+            remedy="Leave out --case, --group, --exclude, --quick and --seed.",
+        )
+    report = read_report(path)
+    failed = [case_id for case_id, each in verdicts_of(report).items() if each in _FAILED]
+    if not failed:
+        raise UsageError(
+            f"No case of {printable(str(path))} failed: there is nothing to run again.",
+            where="--rerun-failed",
+        )
+    return replace(chosen, cases=tuple(failed), seed=report.seed)
+
+
 def _check_files(chosen: Choices) -> None:
     """Raises UsageError if a report file cannot be written."""
     for name, option_name in _FILES.items():
         check_writable(getattr(chosen, name), option_name, typed_values(but=name))
+    if chosen.matrix is not None and chosen.matrix.suffix.lower() not in (".csv", ".html"):
+        raise UsageError(
+            f"{printable(str(chosen.matrix))} names no format.",
+            where="--matrix",
+            remedy="Name a file that ends in .csv or .html.",
+        )
     if chosen.trace_dir is not None:
         try:
             chosen.trace_dir.mkdir(parents=True, exist_ok=True)
@@ -341,7 +396,7 @@ def _tell(
         if path is None:
             continue
         try:
-            write_whole(path, _content(name, report), option_name)
+            write_whole(path, _content(name, report, path), option_name)
             output.progress(f"{name.replace('_', ' ')}: {printable(str(path))}")
         except UsageError as error:
             failed.append(error)
@@ -352,9 +407,9 @@ def _tell(
     output.document(ConformanceDocument(report), exit_code=code)
 
 
-def _content(name: str, report: RunReport) -> bytes:
+def _content(name: str, report: RunReport, path: Path) -> bytes:
     """Content of the report file of this name."""
-    from flasher.conformance import html_report, reports, summary_page  # noqa: PLC0415
+    from flasher.conformance import html_report, matrix, reports, summary_page  # noqa: PLC0415
 
     match name:
         case "junit":
@@ -365,6 +420,10 @@ def _content(name: str, report: RunReport) -> bytes:
             text = html_report.html_page(report)
         case "badge":
             text = summary_page.badge(report)
+        case "matrix":
+            rows = matrix.requirements_matrix(report)
+            is_csv = path.suffix.lower() == ".csv"
+            text = matrix.matrix_csv(rows) if is_csv else html_report.matrix_page(report, rows)
         case _:
             text = summary_page.summary_page(report)
     return text.encode("utf-8")

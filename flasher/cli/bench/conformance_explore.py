@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import time
 from dataclasses import replace
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +33,7 @@ from flasher.protocol.text import printable
 _EXAMPLES: Final = """\
 examples:
   flasher conformance explore -t bms --subject ./boot --steps 5000
+  flasher conformance explore -t bms --subject ./boot --for 30
   flasher conformance explore -t bms --mock --variant accepts-early-end --seed 7
   flasher conformance explore -t bms --mock --replay 'reset update=384 packet packet-crc'
 
@@ -40,10 +43,11 @@ reduced to the shortest walk that shows it; --replay repeats that walk. Exit cod
 finding. A device on a bus is erased about twice a walk (12 steps on average).
 """
 _TRACE_FILE: Final = "--trace-file"
+_STEPS: Final = 2000
 _WALKS_PER_STEP: Final = 1 / 12
 _ERASES_A_WALK: Final = 2
 _REPLACED: Final = frozenset(
-    {"--steps", "--seed", "--replay", _TRACE_FILE, "--yes", *OUTPUT_OPTIONS}
+    {"--steps", "--for", "--seed", "--replay", _TRACE_FILE, "--yes", *OUTPUT_OPTIONS}
 )
 
 
@@ -60,8 +64,12 @@ _what = partial(option, panel="what is run, and how")
 )
 @bench_options
 @_what(
-    "--steps", type=values.count, default="2000", metavar="N", brief=True,
-    help="end after so many steps",
+    "--steps", type=values.count, metavar="N", brief=True,
+    help=f"end after so many steps (default: {_STEPS}, without --for)",
+)  # fmt: skip
+@_what(
+    "--for", "for_s", type=values.seconds, metavar="SECONDS", brief=True,
+    help="end after the walk in which this time is over",
 )  # fmt: skip
 @_what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk")
 @_what("--replay", metavar="STEPS", help="take these steps instead, as printed with a finding")
@@ -76,7 +84,8 @@ def explore(
     bus: Bus,
     bench: BenchOptions,
     *,
-    steps: int,
+    steps: int | None,
+    for_s: float | None,
     seed: str,
     replay: str | None,
     yes: bool,
@@ -89,22 +98,41 @@ def explore(
 
     bench = described(bench, bus)
     check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
+    most = steps or (_STEPS if for_s is None else inf)
     if not (bench.is_simulated or replay):
-        erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
-        wear = f"{steps} steps erase and write the device about {erases} times"
+        if most < inf:
+            erases = max(1, round(most * _WALKS_PER_STEP * _ERASES_A_WALK))
+            wear = f"{most} steps erase and write the device about {erases} times"
+        else:
+            wear = f"the device is erased and written again and again for {for_s:g} s"
         confirm_wear(wear, is_agreed=yes)
     with (
         opened(bench, output) as (subject, profile, stopped),
-        Bar(output, leave=False, unit=" steps") as bar,
+        Bar(output, leave=False, unit=" steps" if most < inf else " s") as bar,
     ):
+        began_s = time.perf_counter()
+
+        def is_over() -> bool:
+            return for_s is not None and time.perf_counter() - began_s >= for_s
+
+        def show(done: int) -> None:
+            if most < inf:
+                bar.move_to(min(done, most), most)
+            elif for_s is not None:
+                bar.move_to(min(round(time.perf_counter() - began_s), for_s), for_s)
+
         explorer = Explorer(
             subject,
             profile,
             seed=seed,
             stopped=stopped,
-            progress=lambda done: bar.move_to(min(done, steps), steps),
+            progress=show,
         )
-        explored = explorer.explore(steps) if replay is None else explorer.replay(replay.split())
+        explored = (
+            explorer.explore(most, is_over=is_over)
+            if replay is None
+            else explorer.replay(replay.split())
+        )
         was_stopped = stopped()
     code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
     if was_stopped and explored.finding is None:

@@ -55,24 +55,30 @@ class Explorer:
         self._steps = 0
         self._walks = 0
 
-    def explore(self, steps: int) -> ExploreResult:
-        """Walk for `steps` steps or until a violation is found. Raises BusError."""
+    def explore(
+        self, steps: float, *, is_over: Callable[[], bool] = lambda: False
+    ) -> ExploreResult:
+        """Walk for `steps` steps, until `is_over` after a walk, or until a violation is found.
+        Raises BusError.
+        """
         try:
             trouble = self._restore()
             if trouble:
                 return self._result(_bring_up_finding(trouble))
             while self._steps < steps and not self._stopped():
                 chance = random.Random(f"{self._seed}/{self._walks}")  # noqa: S311  by the seed
-                length = min(chance.randint(3, WALK_STEPS), steps - self._steps)
+                length = int(min(chance.randint(3, WALK_STEPS), steps - self._steps))
                 taken: list[WalkStep] = []
                 found = self._walk([None] * length, taken, chance)
                 self._progress(self._steps)
                 if found is not None:
                     finding = self._shrink(found, taken)
                     return self._result(finding, self._stop_reason() if self._stopped() else "")
+                if is_over():
+                    break
         except RunStopped:
             return self._result(stopped=self._stop_reason())
-        return self._result(stopped="it was stopped" if self._steps < steps else "")
+        return self._result(stopped="it was stopped" if self._stopped() else "")
 
     def replay(self, texts: Sequence[str]) -> ExploreResult:
         """Take the steps of a finding. Raises UsageError and BusError."""
