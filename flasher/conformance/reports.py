@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from flasher.conformance.catalogue import GROUPS
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
+    LINE_JOINT,
     CaseResult,
     CaseText,
     CaseVerdict,
@@ -212,7 +213,7 @@ def failure_details(text: CaseText, result: CaseResult) -> str:
     failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
     lines = [f"clause: {label}: {content}" for label, content in text.clauses.items()]
     lines.append(f"stimulus: {text.stimulus}")
-    lines += map(str, failed[:_FINDINGS])
+    lines += (str(check).replace(LINE_JOINT, "\n  ") for check in failed[:_FINDINGS])
     if len(failed) > _FINDINGS:
         lines.append(f"{len(failed) - _FINDINGS} more failed checks")
     lines.append(f"seed: {result.seed}")

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 FINAL_IMAGE_OK: Final = "verified"
 SCHEMA_VERSION: Final = 2
 """Version of the JSON report; incremented when a field changes its meaning or is removed."""
+LINE_JOINT: Final = " | "
+"""Joins the lines that a bootloader printed before it crashed, such as a sanitizer's report."""
 CHECKS_KEPT: Final = 50
 """Largest number of failed checks of a case in JSON; all are counted."""
 

@@ -218,6 +218,44 @@ def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
     assert "did not return from flasher_dut_receive" in found
 
 
+@pytest.mark.slow
+def test_a_second_call_that_does_not_return_is_ended_sooner(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.conformance.dut.process.WATCHDOG_S", 0.4)
+    monkeypatch.setattr("flasher.conformance.dut.process._AFTER_HANG_S", 0.1)
+    report = _run(_FLAWS + "Hangs", "TX-06")
+    assert "within 0.4 s of real time" in report.not_upgradable
+    assert "within 0.1 s of real time" in _failures(report)
+
+
+class PrintsForEver(PythonBootloader):
+    def _end(self) -> None:
+        while True:
+            os.write(1, b"x" * 4096)
+
+
+def test_a_bootloader_that_prints_without_end_is_ended_before_the_disk_is_full(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.conformance.dut.process._FILE_MAX_SIZE", 100_000)
+    report = _run(_FLAWS + "PrintsForEver", "EN-01")
+    assert "ended by SIGXFSZ in flasher_dut_receive" in _failures(report)
+
+
+def test_a_crash_is_printed_whole_and_once(flasher: Flasher, tmp_path: Path) -> None:
+    junit = tmp_path / "junit.xml"
+    ran = flasher(
+        *("conformance", "-t", "bms", "--subject", _FLAWS + "IsSanitized", "--junit", junit),
+        *("--case", "EN-01", "--case", "EN-02"),
+    )
+    assert ran.code == 12
+    lines = ran.out.splitlines()
+    assert lines.count("    SUMMARY: message.c:70)") == 1
+    assert lines[lines.index("    SUMMARY: message.c:70)") - 1].endswith("stack-buffer-overflow")
+    assert junit.read_text("utf-8").count("\n  SUMMARY: message.c:70") == 2
+
+
 class IsSanitized(PythonBootloader):
     """Ends like a program stopped by AddressSanitizer."""
 

@@ -4,6 +4,7 @@ cases.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -14,6 +15,7 @@ from flasher.cli.terminal import columns
 from flasher.conformance.diff import Difference, VerdictChange
 from flasher.conformance.reports import group_title
 from flasher.conformance.results import (
+    LINE_JOINT,
     CaseResult,
     CaseText,
     CaseVerdict,
@@ -38,6 +40,8 @@ _TOLD: Final = (
 """Verdicts with one line per case; unsupported cases share one per reason."""
 _MS: Final = 1000
 _SHADES: Final = " .:-=+*#%@"
+_ADDRESS: Final = re.compile(r"\b0x[0-9a-fA-F]+|==\d+==")
+"""What differs between two reports of the same crash."""
 _DRAWN_LEAST: Final = 20
 _DRAWN_MS: Final = 0.1
 """Times that differ by less count as equal."""
@@ -66,12 +70,13 @@ def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
         for text, result in cases:
             why = f": {result.reason}" if result.verdict is CaseVerdict.PASS_IN_PART else ""
             yield printable(f"{result.verdict.text:<12}  {text.id}  {text.title}{why}")
+    crashes: set[str] = set()
     for status in _TOLD:
         lines = [
             line
             for text, result in cases
             if result.verdict is status
-            for line in _case_lines(text, result, verbose=verbose)
+            for line in _case_lines(text, result, crashes, verbose=verbose)
         ]
         if lines:
             yield ""
@@ -92,8 +97,12 @@ def report_lines(report: RunReport, *, verbose: bool = False) -> Iterator[str]:
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
 
 
-def _case_lines(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterator[str]:
-    """One line: case, expected, actual, and the command to repeat it."""
+def _case_lines(
+    text: CaseText, result: CaseResult, crashes: set[str], *, verbose: bool
+) -> Iterator[str]:
+    """One line: case, expected, actual, and the command to repeat it. After a crash that is not
+    among `crashes` yet, also all that the bootloader printed.
+    """
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     reason = result.reason
     if result.verdict is CaseVerdict.DEVIATION:
@@ -101,6 +110,11 @@ def _case_lines(text: CaseText, result: CaseResult, *, verbose: bool) -> Iterato
     head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
     replay = f" | replay: {result.replay}" if result.replay else ""
     yield printable(f"{head}: {_short(reason)}") + replay
+    crash, *printed = result.reason.split(LINE_JOINT)
+    place = _ADDRESS.sub("", crash)
+    if printed and place not in crashes:
+        crashes.add(place)
+        yield from (printable(f"    {line}") for line in (crash, *printed))
     failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
         for label, content in text.clauses.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import select
 import signal
 import tempfile
@@ -14,12 +15,19 @@ from typing import Final, Never
 
 from flasher.conformance.dut import Facts, SubjectError, pipes
 from flasher.conformance.dut.pipes import Pipe, PipeMessage
+from flasher.conformance.results import LINE_JOINT
 from flasher.errors import FlasherError, UsageError, printable
 
 WATCHDOG_S: Final = 5.0
 """A call that takes longer in real time counts as not returning."""
+_AFTER_HANG_S: Final = 0.5
+"""The same once a call of this bootloader has not returned: most cases meet the same loop."""
 _WAIT_S: Final = 0.01
-_OUTPUT_SIZE: Final = 4096
+_OUTPUT_SIZE: Final = 65_536
+_LINES: Final = 80
+_LINE_SIZE: Final = 240
+_FILE_MAX_SIZE: Final = 64 * 1024 * 1024
+"""A process that prints without end is ended, by SIGXFSZ, before it fills the disk."""
 _DUMP_MARK: Final = "Shadow bytes around"
 """Start of the memory dump after AddressSanitizer's readable report."""
 _STDIN, _STDOUT, _STDERR = range(3)
@@ -60,6 +68,7 @@ class BootloaderProcess:
         self._process: int | None = None
         self._pipe = Pipe(-1, -1)
         self._poll = select.poll()
+        self._watchdog_s = WATCHDOG_S
 
     @property
     def is_running(self) -> bool:
@@ -156,7 +165,8 @@ class BootloaderProcess:
         self._stderr.seek(0)
         lines = self._stderr.read(_OUTPUT_SIZE).decode(errors="replace").splitlines()
         report = takewhile(lambda line: not line.startswith(_DUMP_MARK), lines)
-        return " | ".join(printable(line) for line in report if line.strip(" ="))
+        shown = [printable(line)[:_LINE_SIZE] for line in report if line.strip(" =")]
+        return LINE_JOINT.join(shown[:_LINES])
 
     def _become_bootloader(self, read_fd: int, write_fd: int) -> Never:
         """Replace this child process by the bootloader."""
@@ -164,6 +174,8 @@ class BootloaderProcess:
             # The suite handles Ctrl-C and signals to the process group, and ends this process.
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, signal.SIG_IGN)
+            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (_FILE_MAX_SIZE, _FILE_MAX_SIZE))
             os.dup2(self._stderr.fileno(), _STDERR)
             if self._is_program:
                 os.dup2(read_fd, _STDIN)
@@ -185,10 +197,11 @@ class BootloaderProcess:
 
     def _next(self, doing: str) -> tuple[PipeMessage, bytes]:
         while (found := self._pipe.take()) is None:
-            if not self._poll.poll(WATCHDOG_S * 1000):
+            if not self._poll.poll(self._watchdog_s * 1000):
                 self.kill()
+                limit_s, self._watchdog_s = self._watchdog_s, min(WATCHDOG_S, _AFTER_HANG_S)
                 raise BootloaderError(
-                    f"the bootloader did not return from {doing} within {WATCHDOG_S:g} s of real "
+                    f"the bootloader did not return from {doing} within {limit_s:g} s of real "
                     "time and was killed"
                 )
             if not self._pipe.fill():
