@@ -151,28 +151,32 @@ class SimulatedBus:
 
     def advance(self, limit: float) -> None:
         """Advance to the next event on the bus, at latest to `limit`."""
-        self._report_faults()
-        now, self._delivered_at = self._delivered_at, None
-        self._serve_devices(self.clock.now() if now is None else now)
+        clock, faults = self.clock, self.faults
+        now = clock.now()
+        if faults.due_at <= now:
+            self._report_faults(now)
+        delivered_at, self._delivered_at = self._delivered_at, None
+        self._serve_devices(now if delivered_at is None else delivered_at)
         if self._sending is None:
             self._arbitrate()
-        moment = min(limit, self.faults.due_at)
+        moment = min(limit, faults.due_at)
         if self._sending is not None and self._sending_ends_at < moment:
             moment = self._sending_ends_at
         for device in self._devices:
             wanted = device.deadline
             if wanted is not None and wanted < moment and not device.outbox:
                 moment = wanted
-        self.clock.wait_until(moment)
+        clock.wait_until(moment)
         if self._sending is not None and self._sending_ends_at <= moment:
             self._deliver(*self._sending)
-        self._report_faults()
+        now = clock.now()
+        if faults.due_at <= now:
+            self._report_faults(now)
 
-    def _report_faults(self) -> None:
-        if self.faults.due_at <= (now := self.clock.now()):
-            for report in self.faults.tick(now):
-                for host in self._hosts:
-                    host.inbox.append(report)
+    def _report_faults(self, now: float) -> None:
+        for report in self.faults.tick(now):
+            for host in self._hosts:
+                host.inbox.append(report)
 
     def _silence_hosts(self) -> None:
         """Drop the frames that hosts queued or were sending."""
@@ -215,19 +219,25 @@ class SimulatedBus:
             winners = [node for node in waiting if node.outbox[0][1].can_id == lowest]
             if len(winners) > 1:
                 winners = self._contend(winners) if self._collides else winners[:1]
+        queued_at, frame = winners[0].outbox[0]
+        collides = False
+        if len(winners) > 1:
+            queued_at = min(node.outbox[0][0] for node in winners)
+            collides = any(node.outbox[0][1] != frame for node in winners)
         # A paced clock wakes slightly late, the wire does not: a frame that waited for the previous
         # one follows it without a gap.
-        begins_at = max(self._sending_ends_at, min(node.outbox[0][0] for node in winners))
-        frame = winners[0].outbox[0][1]
-        if any(node.outbox[0][1] != frame for node in winners):
+        begins_at = max(self._sending_ends_at, queued_at)
+        if collides:
             self._sending, bits = (winners, None), self._collide(winners)
         else:
             self._sending, bits = (winners, frame), frame_bits(frame)
             for node in winners:
                 node.outbox.popleft()
-                node.tx_errors = max(0, node.tx_errors - 1)
-        self._sending_ends_at = begins_at + bits / self._bitrate_bps
-        self.busy_s += bits / self._bitrate_bps
+                if node.tx_errors:
+                    node.tx_errors -= 1
+        taken_s = bits / self._bitrate_bps
+        self._sending_ends_at = begins_at + taken_s
+        self.busy_s += taken_s
 
     def _contend(self, rivals: Sequence[_Node]) -> Sequence[_Node]:
         """Select among senders of one id those of the frame with the first dominant bit, and any
@@ -265,10 +275,9 @@ class SimulatedBus:
         ends_at = self._sending_ends_at
         frames = self._disturbance(frame, ends_at) if self._disturbance else (frame,)
         for carried in frames:
-            now = ends_at
             for device in self._devices:
                 if device not in senders:
-                    device.engine.receive(carried, now)
+                    device.engine.receive(carried, ends_at)
             for host in self._hosts:
                 if host not in senders and self.faults.takes_part:
                     host.inbox.append(carried)

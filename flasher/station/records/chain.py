@@ -307,7 +307,7 @@ def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dic
         return {key: row for key, (row,) in found.items()}
 
     def named_by(rows: Iterable[Mapping[str, Any]], table: Table) -> dict[Any, dict[str, Any]]:
-        """The rows of a table that others name, by their ids."""
+        """Rows of a table that other rows refer to, by id."""
         return by_id(table, dict.fromkeys(row[f"{table.name}_id"] for row in rows))
 
     def parts_of(table: Table) -> dict[int, list[dict[str, Any]]]:
