@@ -94,10 +94,10 @@ class Machine(ABC):
         # Asked after every frame of a simulated bus: calls of `min` took a third of its time.
         due_at = self._transmitter.due_at
         if not self._is_cancelled:
-            if self._due_at < due_at:
+            if self._due_at < due_at:  # noqa: PLR1730
                 due_at = self._due_at
             for reassembler in self._reassemblers.values():
-                if reassembler.due_at < due_at:
+                if reassembler.due_at < due_at:  # noqa: PLR1730
                     due_at = reassembler.due_at
             if self._off_bus_until is not None and self._off_bus_until < due_at:
                 due_at = self._off_bus_until
