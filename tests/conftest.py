@@ -8,9 +8,13 @@ import sys
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
-import pytest
+# Before all others are imported: what they make stays (`pytest_collection_finish`).
+gc.disable()
 
-import flasher.python_can  # noqa: F401  before a test imports python-can
+import hypothesis  # noqa: E402
+import pytest  # noqa: E402
+
+import flasher.python_can  # noqa: E402, F401  before a test imports python-can
 
 if TYPE_CHECKING:
     from tests.station.postgres import Server
@@ -26,6 +30,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """`pytest` alone runs the first lane; `pytest -m slow` the second; what is named runs whole."""
     if config.args_source is not pytest.Config.ArgsSource.ARGS and not config.option.markexpr:
         config.option.markexpr = "not slow and not kernel"
+    # How long an example may take depends on the computer, and on what else it does.
+    hypothesis.settings.register_profile("any computer", deadline=None)
+    hypothesis.settings.load_profile("any computer")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -83,13 +90,14 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)  # there is memory for some garbage
+    gc.enable()
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """For `-n auto`: one worker more than there are cores, since tests wait for other processes and
-    for buses at real pace a third of their time.
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """For `-n auto`: a worker for each core, and one more for the second lane, whose tests wait for
+    other processes and for buses at real pace a third of their time.
     """
-    return (os.cpu_count() or 1) + 1
+    return (os.cpu_count() or 1) + int(config.option.markexpr == "slow")
 
 
 @pytest.fixture(scope="session")
