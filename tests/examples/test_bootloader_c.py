@@ -45,6 +45,22 @@ def test_some_of_every_group_under_sanitizers(flasher: Flasher, tmp_path: Path) 
     assert ran.code == 0
 
 
+def test_what_the_suite_reached_can_be_measured(flasher: Flasher, tmp_path: Path) -> None:
+    _need("make", "gcc", "gcov")
+    make("coverage", tmp_path)
+    subject = tmp_path / "coverage" / "boot"
+    line = ("conformance", "-t", "bms", "--subject", subject, "--profile", PROFILE)
+    assert flasher(*line, "--case", "RS-01", "--case", "TX-01", "--case", "EN-01").code == 0
+    told = subprocess.run(
+        ["gcov", "--object-directory", subject.parent, "boot-boot"],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    share = re.search(r"boot\.c'\nLines executed:([\d.]+)%", told.stdout)
+    assert share is not None
+    assert 70 < float(share[1]) < 100
+    assert re.search(r"^ +\d+\*?: +\d+:", (tmp_path / "boot.c.gcov").read_text(), re.MULTILINE)
+
+
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:
     """A target whose bootloader reports the name PBU."""
     _need("make", "gcc")
