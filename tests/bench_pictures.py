@@ -92,7 +92,7 @@ def before_an_upgrade(page: Page, album: Album) -> None:
     album.take("nobody")
     _again(page)
     _use(page, BikeFault.HARDWARE)
-    page.click("#told-all")
+    page.click("#answers-all")
     album.take("bike")
     page.click("#do-watch")
     expect(page.locator("#watched tbody tr").first).to_be_visible()

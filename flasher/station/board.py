@@ -271,7 +271,7 @@ class Board:
                 reply = text("{text}: {meaning}", text=sentence, meaning=meaning)
             if event.meaning == "label" and not event.socket:
                 self.waiting[event.text] = event.source
-                reply = text("{said}. {prompt}", said=reply, prompt=self.prompt)
+                reply = text("{reply}. {prompt}", reply=reply, prompt=self.prompt)
             elif event.meaning == Word.CANCEL.value.lower():
                 kept = {n: source for n, source in self.waiting.items() if source != event.source}
                 self.waiting = kept
@@ -283,7 +283,7 @@ class Board:
         if source and not source.startswith(PAGE):
             self.scanners.add(source)
             if len(self.scanners) > 1:
-                answer = text("{source}: {said}", source=source_words(source), said=answer)
+                answer = text("{source}: {reply}", source=source_words(source), reply=answer)
         self.replies = self.replies.with_answer(answer, source, is_refusal=is_refusal)
 
     def _socket(self, event: StationEvent) -> None:

@@ -1,6 +1,6 @@
-"""Archive pages: history of this computer, bundles, backups and the stories of traces.
+"""Archive pages: flash history, bundles, backups and explained traces of this computer.
 
-Separate processes answer them (`flasher.web.query_processes`), so that no upgrade waits.
+Processes of their own render them (`flasher.web.query_processes`), so that no upgrade waits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flasher.web.pages import Pages
 from flasher.web.query_processes import HTML, Answer, Question
 
 SHOWN_MAX: Final = 50
-"""Limit for flashes, and for files of one kind."""
+"""Maximum number of flashes, and of files of one kind, on a page."""
 _ZIP: Final = "application/zip"
 
 
@@ -38,12 +38,12 @@ class ArchivedFile(NamedTuple):
     at: datetime
     size_bytes: int
     what: str = ""
-    """Why a bundle was written."""
+    """Reason why the bundle was written."""
 
 
 @dataclass(frozen=True)
 class Archive:
-    """Answers queries of the pages. `bundles`, `backups` and `traces` are folders; the last one has
+    """Renders the archive pages. `bundles`, `backups` and `traces` are folders; the last one holds
     files dropped on the page.
     """
 
@@ -56,14 +56,14 @@ class Archive:
         return Pages()
 
     def answer(self, question: Question) -> Answer:
-        """The page or file; an error page if there is none."""
+        """Render a page or return a file; an error page if there is none."""
         try:
             return PAGES[question.path](self, question)
         except FlasherError as error:
             return self._page(question, "trouble.html", http=400, error=error)
         except OSError as error:
             trouble = UsageError(
-                f"That cannot be read: {error.strerror or error}.", code=ErrorCode.FILE_NOT_READ
+                f"A file cannot be read: {error.strerror or error}.", code=ErrorCode.FILE_NOT_READ
             )
             return self._page(question, "trouble.html", http=400, error=trouble)
 
@@ -80,7 +80,7 @@ class Archive:
         return Answer(text.encode("utf-8", "backslashreplace"), HTML, http)
 
     def overview(self, question: Question) -> Answer:
-        """The history, bundles and backups, the latest first."""
+        """History, bundles and backups, latest first."""
         history = FlashHistory()
         flashes, damaged = history.flashes()
         serial = question.fields.get("serial", "")
@@ -102,7 +102,7 @@ class Archive:
         )
 
     def story(self, question: Question) -> Answer:
-        """The story of a bundle, or of a dropped trace."""
+        """The explanation of a bundle or a dropped trace."""
         if "bundle" in question.fields:
             path = self._bundle(question.fields["bundle"])
         else:
@@ -119,7 +119,7 @@ class Archive:
         )
 
     def bundle(self, question: Question) -> Answer:
-        """A bundle as one file."""
+        """Download of a bundle as one file."""
         path = self._bundle(question.fields.get("name", ""))
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -136,7 +136,7 @@ class Archive:
         return _known({each.name: each for each in bundles(self.bundles)}, name)
 
     def _backups(self) -> list[Path]:
-        """Backups, the latest last."""
+        """Backups, latest last."""
         found = [each for each in _files(self.backups) if each.suffix == ".zip"]
         return sorted(found, key=lambda each: each.stat().st_mtime_ns)
 
@@ -170,10 +170,8 @@ def _bundle(path: Path) -> ArchivedFile:
 
 
 def _known(found: Mapping[str, Path], name: str) -> Path:
-    """Raises UsageError for an unlisted name: nothing else is read."""
+    """Raises UsageError for an unlisted name, so that no other file is read."""
     path = found.get(name)
     if path is None:
-        raise UsageError(
-            f"{printable(name)} is not there any more.", remedy="Load the page before it again."
-        )
+        raise UsageError(f"{printable(name)} no longer exists.", remedy="Reload the previous page.")
     return path

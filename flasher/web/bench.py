@@ -1,7 +1,7 @@
-"""The bench: one user upgrades one bike step by step, one activity at a time.
+"""Controller of the bench page: one user upgrades one bike step by step.
 
-Pages send orders; the whole state goes into a feed that every page follows, so that a page may be
-closed and opened again. `BenchBackend` works with the devices.
+Pages submit orders; a feed sends the whole state to every page, so that a page may be closed and
+opened again. `BenchBackend` uses the devices.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ from flasher.web.bench_state import (
 from flasher.web.feed import Feed
 
 TURN_S: Final = 0.2
-"""How often an idle bench reports that it runs."""
+"""Interval at which an idle bench reports that it runs."""
 SILENCE_LIMIT_S: Final = 5.0
-"""Opening an adapter may take seconds without any report."""
+"""Time without a report before pages show the bench as silent; opening an adapter takes seconds."""
 NOTES_KEPT: Final = 12
 WATCH_TURN_S: Final = 0.5
-"""Refresh period of the bus view: slow enough to read."""
+"""Refresh interval of the bus view, slow enough to read."""
 SUBJECT: Final = "bench"
-_AGAIN: Final = text("Begin again with the adapter.")
+_AGAIN: Final = text("Start again with the adapter.")
 _RESCUE: Final = text("Then rescue this device.")
 T = TypeVar("T")
 Order = Callable[["BenchController"], object]
-"""A step for the bench's own thread."""
+"""A function that the bench's own thread calls."""
 _LOG: Final = logging.getLogger("flasher.web")
 
 
@@ -75,11 +75,11 @@ class UpgradeEnding:
     error: FlasherError | None
     bundle: Path | None
     warning: str = ""
-    """Why it is missing in the history; empty if it is there."""
+    """Reason why the history lacks the upgrade; "" if it has it."""
 
 
 class BenchBackend(Protocol):
-    """Interface to the devices. Methods raise FlasherError."""
+    """Access to the devices. Methods raise FlasherError."""
 
     dialect: Dialect
 
@@ -92,7 +92,7 @@ class BenchBackend(Protocol):
     def dropped(self) -> Sequence[str]: ...
     def use_folder(self, path: str) -> None: ...
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
-        """Open an adapter. With `asks` False nothing will be sent."""
+        """Open an adapter. With `asks` False, nothing may be sent."""
 
     def model_area(self) -> Area | None:
         """Memory area of a device model; None for real devices."""
@@ -105,7 +105,7 @@ class BenchBackend(Protocol):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> Saved:
-        """Save the battery's answers, and the memory of an area, to a new file."""
+        """Save the battery's answers and the memory of an area to a new file."""
 
     def upgrade(
         self,
@@ -115,11 +115,14 @@ class BenchBackend(Protocol):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> UpgradeEnding:
-        """Run an upgrade to its end, and store its records."""
+        """Run an upgrade to its end and store its records."""
 
 
 class BenchController:
-    """`now` is a monotonic clock, `date` the time of day."""
+    """Executes the orders of pages, one at a time, in its own thread.
+
+    `now` is a monotonic clock in seconds, `date` the local time.
+    """
 
     def __init__(
         self,
@@ -134,7 +137,7 @@ class BenchController:
         self._date = date
         self._lock = threading.Lock()
         self._is_taken = False
-        """An order is pending or being carried out."""
+        """An order is queued or being executed."""
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
         self._has_new_files = threading.Event()
@@ -144,7 +147,7 @@ class BenchController:
     # -- any thread --------------------------------------------------------------------------------
 
     def order(self, order: Order) -> bool:
-        """Submit an order; False while another one is running."""
+        """Submit an order; False if another one is queued or being executed."""
         with self._lock:
             if self._is_taken:
                 return False
@@ -154,17 +157,15 @@ class BenchController:
         return True
 
     def files_came(self) -> None:
-        """Files were dropped: look at them when idle."""
+        """Check dropped files as soon as the bench is idle."""
         self._has_new_files.set()
 
     def stop(self) -> None:
-        """End the current activity at the next message boundary."""
+        """End the current activity after the present message."""
         self._stop.set()
 
     def close(self, *, ends_upgrade: bool = True) -> None:
-        """The program ends: start nothing more, and stop the current activity, except an upgrade
-        that is to finish.
-        """
+        """Start nothing more, and end the current activity; an upgrade only with `ends_upgrade`."""
         self._is_closing = True
         if ends_upgrade or self.state.doing is not Activity.UPGRADING:
             self._ends_at_once = True
@@ -172,7 +173,7 @@ class BenchController:
     # -- its own thread ----------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Carry out orders until closed."""
+        """Execute orders until closed."""
         while not self._is_closing:
             self.feed.beat()
             try:
@@ -184,7 +185,7 @@ class BenchController:
             self.write_planned(order)
 
     def write_planned(self, order: Order) -> None:
-        """Carry out a write, and show its progress."""
+        """Write to a device and show the progress."""
         self._set(trouble=None)
         try:
             order(self)
@@ -195,7 +196,7 @@ class BenchController:
             trouble = FlasherError(
                 f"Internal error: {type(error).__name__}: {printable(str(error))}.",
                 cause="a bug in flasher",
-                remedy="Please report it with what the terminal shows and what you were doing.",
+                remedy="Please report it with the output of the terminal and the steps before it.",
             )
             self._set(trouble=trouble)
         finally:
@@ -209,7 +210,7 @@ class BenchController:
         self.feed.beat()
 
     def _cancelled(self) -> bool:
-        """Polled by everything that takes long."""
+        """True if the current activity must end; called often."""
         self.feed.beat()
         left_s = self.state.power_cycle_left_s
         if left_s(self._now()) != left_s(self.state.now_s):
@@ -222,7 +223,7 @@ class BenchController:
     # -- the steps: orders -------------------------------------------------------------------------
 
     def start_over(self, *, is_rescue: bool = False) -> None:
-        """Reset for the next bike, or for a rescue."""
+        """Reset for the next bike or a rescue."""
         self.state = BenchState(
             adapters=self.state.adapters,
             was_looked_for=True,
@@ -236,7 +237,7 @@ class BenchController:
         self._set(adapters=tuple(self._place.adapters(self._cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
-        """Open this adapter and look for devices."""
+        """Open an adapter and look for devices."""
         adapter = _known({each.name: each for each in self.state.adapters}, name)
         self._place.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
@@ -249,7 +250,7 @@ class BenchController:
             self.look()
 
     def look(self) -> None:
-        """Query the battery, and listen to the others, which the documents give no query for."""
+        """Request the battery's identity, and receive from the others, which have no query."""
         self._set(doing=Activity.LOOKING, bike=None, done=None)
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
@@ -262,7 +263,7 @@ class BenchController:
             return device.identify(cancelled=self._cancelled)
 
     def choose_target(self, name: str) -> None:
-        """Select the device to upgrade, and check which images fit; "" is none."""
+        """Select the device to upgrade, and check which images fit; "" deselects."""
         if not name:
             self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
             return
@@ -270,7 +271,7 @@ class BenchController:
         self.judge()
 
     def choose_image(self, name: str) -> None:
-        """Select this image; "" is none."""
+        """Select an image; "" deselects."""
         if not name:
             self._set(done=None)
             self.judge()
@@ -283,7 +284,7 @@ class BenchController:
         self.judge()
 
     def judge(self) -> None:
-        """Check which images fit."""
+        """Check which images fit the selected device."""
         self._set(doing=Activity.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
@@ -302,7 +303,7 @@ class BenchController:
             self.judge()
 
     def waive(self, name: str, waiver: str) -> None:
-        """Accept the image despite this check, which must be the one that refused it."""
+        """Accept an image that this check refused."""
         done = self.state.done
         refused = {each.name: each.refusal for each in self.state.offers if each.refusal}
         if done is not None and done.error is not None:
@@ -318,7 +319,7 @@ class BenchController:
         self._set(offer=next(fitting, None))
 
     def watch(self) -> None:
-        """Show the traffic of the bus until stopped. Sends nothing."""
+        """Show the bus traffic until stopped, without sending."""
         board = MessageTable()
         since_s = self._now()
         messages = troubles = 0
@@ -348,8 +349,8 @@ class BenchController:
             )  # fmt: skip
 
     def find_areas(self) -> None:
-        """Find memory areas for a backup, only from images that fit: reading an address that does
-        not exist may crash a device.
+        """Find memory areas for a backup in the images that fit: reading an address that does not
+        exist may crash a device.
         """
         self._adapter()
         self._set(doing=Activity.JUDGING, areas=None)
@@ -365,7 +366,7 @@ class BenchController:
         self._set(areas=None)
 
     def back_up(self, source: str) -> None:
-        """Save the battery's answers, and the memory of the area with this source; "" is none."""
+        """Save the battery's answers and the memory of this area; "" for no memory."""
         areas = {area.source: area for area in self.state.areas or ()}
         area = _known(areas, source) if source else None
 
@@ -423,7 +424,7 @@ class BenchController:
 
     def _check_device(self, job: Job) -> None:
         """Raises WrongDeviceError for an image of another device than the one that answered; the
-        upgrade queries it again.
+        upgrade asks again.
         """
         bike = self.state.bike
         if bike is None or self.state.is_rescue or job.plan.target is not bike.target:
@@ -438,13 +439,13 @@ class BenchController:
 
     def upgrade(self, target: str, sha256: str) -> None:
         """Upgrade with the image of this digest, as chosen when the button was pressed. Raises
-        UsageError for an order from an outdated page.
+        UsageError if the page was outdated.
         """
         chosen, offer = self.state.target, self.state.offer
         if chosen is None or offer is None or (chosen.name, offer.sha256) != (target, sha256):
             raise UsageError(
                 "Another device or image was chosen meanwhile; nothing was sent.",
-                remedy="Look at what is chosen, and begin again.",
+                remedy="Check the selection, then start again.",
             )
         adapter = self._adapter()
         self._set(
@@ -476,7 +477,7 @@ class BenchController:
             self._set(done=replace(done, after=self._seen(adapter, done.target)))
 
     def _happened(self, event: object) -> None:
-        """Handle an event during an upgrade."""
+        """Process an event of an upgrade."""
         changes: dict[str, object] = {}
         match event:
             case events.PacketAcknowledged(number, _, _):
@@ -507,7 +508,7 @@ class BenchController:
         """Select the same device, and the same image unless the device refused it."""
         done = self.state.done
         if done is None:
-            raise UsageError("No upgrade has failed.", remedy="Begin with the adapter.")
+            raise UsageError("No upgrade has failed.", remedy="Start with the adapter.")
         self._set(is_rescue=True, done=None, offer=None, checks=(), notes=())
         self.judge()
         if done.may_rescue_with_it:
@@ -521,15 +522,15 @@ class BenchController:
 
 
 def _note_of(event: object) -> str:
-    """The note for an event; checks are shown elsewhere."""
+    """Text of an event; "" for checks, which are shown elsewhere."""
     line = progress_line(event)
     warning = warning_text(event) or (line[0] if line and line[1] < 2 else "")
     return "" if isinstance(event, events.CheckMade) else warning
 
 
 def _known(things: Mapping[str, T], name: str) -> T:
-    """Raises UsageError for an entry that no longer exists."""
+    """Look up a name. Raises UsageError for an entry that no longer exists."""
     found = things.get(name)
     if found is None:
-        raise UsageError(f"{printable(name)} is not there any more.", remedy="Look again.")
+        raise UsageError(f"{printable(name)} no longer exists.", remedy="Look again.")
     return found

@@ -1,4 +1,4 @@
-"""Bench page: the bench's state as page parts, and orders from its forms."""
+"""Bench page: renders the bench's state as page parts, and submits orders from its forms."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from flasher.web.bench_state import BenchState, Done
 from flasher.web.pages import Pages, streamed
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
-"""In bytes: more than the largest image as Intel HEX."""
+"""Maximum upload in bytes, above the largest image as Intel HEX."""
 UPLOAD: Final = "/bench/upload"
 _FILES_MAX: Final = 200
-"""Files of a folder that are checked."""
+"""Maximum number of files of a folder that are checked."""
 _MANIFEST: Final = ".toml"
 
 
@@ -54,11 +54,11 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "rescue": (partial(BenchController.start_over, is_rescue=True), ()),
     "rescue-it": (BenchController.rescue_it, ()),
 }
-"""Orders of a form by its command, with their arguments."""
+"""Orders by the command of a form, with the names of their fields."""
 
 
 class Shelf:
-    """Sources of images: a folder, and one for files dropped on the page."""
+    """Folders with images: a chosen one, and one for files dropped on the page."""
 
     def __init__(
         self, folder: Path, dropped: Path, suffixes: Sequence[str], traces: Sequence[str]
@@ -71,17 +71,17 @@ class Shelf:
         self._trace_suffixes = tuple(f".{suffix}" for suffix in traces)
 
     def use(self, folder: str) -> None:
-        """Take images from this folder. Raises UsageError if it does not exist."""
+        """Choose the folder. Raises UsageError if it does not exist."""
         path = Path(folder).expanduser()
         if not folder or not path.is_dir():
             raise UsageError(
-                f"{printable(folder)} is no folder of this computer.",
+                f"{printable(folder)} is not a folder of this computer.",
                 remedy="Name one with its whole path, as in /home/me/firmware.",
             )
         self.folder = path.resolve()
 
     def files(self) -> list[Path]:
-        """Possible images; dropped ones first."""
+        """Possible images, dropped ones first."""
         found: list[Path] = []
         for folder in (self._dropped, self.folder):
             if folder.is_dir():
@@ -97,9 +97,7 @@ class Shelf:
         return sorted(visible(each.name) for each in self._dropped.iterdir() if each.is_file())
 
     def take(self, name: str, data: bytes) -> Path | None:
-        """Store a dropped file; None unless it is an image, a manifest or a trace. Raises
-        OSError.
-        """
+        """Store a dropped image, manifest or trace; None for any other file. Raises OSError."""
         plain = name.replace("\\", "/").rpartition("/")[2]
         suffix = Path(plain).suffix.lower()
         is_trace = suffix in self._trace_suffixes
@@ -112,12 +110,12 @@ class Shelf:
 
 
 def upload_limit(usual: int) -> Callable[[str], int]:
-    """Maximum body size of a path, for the guard."""
+    """Maximum body size of a path in bytes, for the guard."""
     return lambda path: UPLOAD_MAX if path == UPLOAD else usual
 
 
 class BenchPage:
-    """The routes of the page."""
+    """Routes of the bench page."""
 
     def __init__(
         self, pages: Pages, machine: BenchController, shelf: Shelf, *, is_mock: bool
@@ -221,11 +219,11 @@ _SHORT: Final = (
     (VersionInformation, ("model", "serial_number", "hardware_version", "firmware_version")),
     (RunningInformation, ("state_of_charge_percent", "voltage_mv", "mean_current_ma")),
 )
-"""Identity of a battery, and whether it can be upgraded now."""
+"""Facts of a battery in short: identity, and whether it can be upgraded now."""
 
 
 def _rows(content: Content) -> dict[str, tuple[str, str]]:
-    """Label and value of each field, by its name."""
+    """Label and value of each field, by field name."""
     return {
         shown.name: (shown.label, _listed(shown) or f"{shown.text} {shown.unit}".rstrip())
         for shown in content_fields(content)
@@ -233,7 +231,7 @@ def _rows(content: Content) -> dict[str, tuple[str, str]]:
 
 
 def _listed(shown: Field) -> str:
-    """The names of flags, for translation one by one; empty for other fields."""
+    """Names of flags, separated for translation; "" for other fields."""
     names = shown.value if isinstance(shown.value, list) else []
     if not names or not all(isinstance(name, str) for name in names):
         return ""
@@ -242,7 +240,7 @@ def _listed(shown: Field) -> str:
 
 
 def facts(state: BenchState) -> list[tuple[str, str]]:
-    """Short description of the battery; its faults last."""
+    """Short description of the battery, with its faults last."""
     if state.bike is None:
         return []
     answers = {type(each.answer): each.answer for each in state.bike.readings if each.answer}
@@ -257,7 +255,7 @@ def facts(state: BenchState) -> list[tuple[str, str]]:
 
 
 def identity(done: Done) -> list[tuple[str, str]]:
-    """Identity of the upgraded device; empty if it cannot be queried."""
+    """Identity of the upgraded device; empty if it has no query."""
     if done.before is None or done.before.target is not done.target:
         return []
     version = done.before.version
@@ -266,7 +264,7 @@ def identity(done: Done) -> list[tuple[str, str]]:
 
 
 def battery_answers(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]]:
-    """All answers of the battery, as in `flasher info`: a title with its rows."""
+    """All answers of the battery, as `flasher info` prints them: titles with rows."""
     bike = state.bike
     if bike is None:
         return []
@@ -279,7 +277,7 @@ def battery_answers(state: BenchState) -> list[tuple[str, list[tuple[str, str]]]
 
 
 def compared(done: Done) -> list[tuple[str, str, str]]:
-    """Every answer before and after: label, old, new; "" for none."""
+    """Every answer before and after the upgrade: label, old, new; "" if missing."""
     sides: list[dict[tuple[str, str], tuple[str, str]]] = []
     for seen in (done.before, done.after):
         side = {}
@@ -298,7 +296,7 @@ def compared(done: Done) -> list[tuple[str, str, str]]:
 
 
 def left_s(state: BenchState) -> float | None:
-    """Estimated seconds until the transfer ends; None before the second packet."""
+    """Estimated seconds to the end of the transfer; None before the second packet."""
     if state.transfer_began_s is None or state.offer is None or state.packet < 2:
         return None
     took_s = state.now_s - state.transfer_began_s

@@ -1,4 +1,4 @@
-"""State of the bench."""
+"""State of the bench, as shown on its page."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ class Activity(Enum):
 
 @dataclass(frozen=True)
 class Adapter:
-    """A connection to a bike, identified by `name`."""
+    """A CAN adapter with a bike, or a virtual bike."""
 
     name: str
     note: str = ""
     was_last: bool = False
-    """The adapter used last."""
+    """True for the adapter that was used last."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """An image file checked for the target: it fits, or `refusal` gives the reason."""
+    """An image file that was checked for the target: it fits, or `refusal` has the reason."""
 
     path: Path
     version: str = ""
@@ -53,19 +53,17 @@ class Offer:
     checks: tuple[events.CheckMade, ...] = ()
     refusal: FlasherError | None = None
     waived: tuple[str, ...] = ()
-    """Names of the checks waived for it (flasher.host.waivers)."""
+    """Names of checks that were waived for the image (flasher.host.waivers)."""
 
     @property
     def name(self) -> str:
-        """Display name."""
+        """File name for display."""
         return visible(self.path.name)
 
 
 @dataclass(frozen=True)
 class Done:
-    """A finished upgrade. Transferred, completed and running are three claims; None means
-    unknown.
-    """
+    """A finished upgrade. Transferred, completed and running are separate facts; None: unknown."""
 
     at: datetime
     adapter: Adapter
@@ -74,14 +72,14 @@ class Done:
     checks: tuple[events.CheckMade, ...]
     before: DeviceInfo | None
     packet: int
-    """Packets that the device acknowledged, in the best attempt."""
+    """Number of packets that the device acknowledged in the best attempt."""
     result: Result | None
-    """None if the adapter failed, or a user ended it at once."""
+    """None if the adapter failed or a user ended the upgrade at once."""
     error: FlasherError | None
     bundle: Path | None
     after: DeviceInfo | None = None
     warning: str = ""
-    """Why it is missing in the history; empty if it is there."""
+    """Reason why the history lacks the upgrade; "" if it has it."""
 
     @property
     def is_transferred(self) -> bool | None:
@@ -93,7 +91,7 @@ class Done:
 
     @property
     def is_running(self) -> bool | None:
-        """The application answered, and nothing contradicts that it is the new one."""
+        """True if the application answered and does not contradict the new version."""
         result = self.result
         if result is None or result.running_version is None:
             return None
@@ -101,7 +99,7 @@ class Done:
 
     @property
     def may_rescue_with_it(self) -> bool:
-        """The device needs an image, and has not refused this one."""
+        """True if the device needs an image and has not refused this one."""
         error = self.error
         return error is not None and error.needs_rescue and not self.is_refused
 
@@ -112,18 +110,18 @@ class Done:
 
 @dataclass(frozen=True)
 class SeenMessage:
-    """The latest message of one kind on the bus."""
+    """Latest message of one kind on the bus."""
 
     seen: BusEvent
     changed: frozenset[str]
-    """Names of the fields that changed recently."""
+    """Names of fields that changed recently."""
     count: int
     rate_hz: float | None
 
 
 @dataclass(frozen=True)
 class BusWatch:
-    """Bus traffic since the start of watching."""
+    """Bus traffic since the view was started."""
 
     since_s: float
     messages: int
@@ -133,25 +131,25 @@ class BusWatch:
 
 @dataclass(frozen=True)
 class Saved:
-    """A written backup."""
+    """A completed backup."""
 
     path: Path
     size_bytes: int
     area: Area | None
-    """Its memory area."""
+    """Memory area that was read; None without memory."""
     running_version: str
-    """Version that the device answered; empty for none."""
+    """Firmware version that the device reported; "" without one."""
     names_running_version: bool | None
-    """True if the memory contains that version; None without memory or version."""
+    """True if the memory contains that version; None if memory or version is missing."""
     items: tuple[str, ...]
-    """Answers of the device."""
+    """Titles of the answers in the backup."""
     missing: Mapping[str, str]
-    """Missing items, each with the reason."""
+    """Reason why each missing item could not be read, by item."""
 
 
 @dataclass(frozen=True)
 class BenchState:
-    """Complete state of the page."""
+    """Complete state of the bench page."""
 
     doing: Activity = Activity.NOTHING
     is_rescue: bool = False
@@ -159,11 +157,11 @@ class BenchState:
     was_looked_for: bool = False
     adapter: Adapter | None = None
     bike: DeviceInfo | None = None
-    """Devices found and the battery's answers, before the upgrade."""
+    """Detected devices and the battery's answers before the upgrade."""
     areas: tuple[Area, ...] | None = None
-    """Memory areas offered for a backup, while one is to be chosen."""
+    """Memory areas offered for a backup; None if no choice is open."""
     saved_bytes: int = 0
-    """Memory read for a backup so far."""
+    """Number of bytes of memory read for a backup so far."""
     saved: Saved | None = None
     """The last backup."""
     watched: BusWatch | None = None
@@ -173,35 +171,35 @@ class BenchState:
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None
     waived: frozenset[tuple[str, str]] = frozenset()
-    """Image names, each with a check waived for this device."""
+    """Names of images, each with a check that was waived."""
     phase: events.Phase | None = None
     packet: int = 0
-    """Packets that the device acknowledged in this attempt."""
+    """Number of packets that the device acknowledged in this attempt."""
     furthest: int = 0
-    """The same, in the best attempt."""
+    """Number of packets that the device acknowledged in the best attempt."""
     repetitions: int = 0
     transfer_began_s: float | None = None
     now_s: float = 0.0
-    """On the clock of the bench, like `transfer_began_s`."""
+    """Time of the bench's clock, like `transfer_began_s`."""
     power_cycle_s: float | None = None
-    """How long to wait for the user to switch the device off and on."""
+    """Seconds in which the user has to switch the device off and on; None: not needed."""
     power_cycle_since_s: float = 0.0
-    """On the clock of the bench."""
+    """Time of the bench's clock at which that began."""
     adapter_left_s: int | None = None
-    """How long to wait for the lost adapter."""
+    """Seconds left in which a lost adapter may return; None: not lost."""
     checks: tuple[events.CheckMade, ...] = ()
     notes: tuple[str, ...] = ()
     is_stopping: bool = False
     done: Done | None = None
     trouble: FlasherError | None = None
-    """Error of the last step, except of an upgrade."""
+    """Error of the last step; upgrades have theirs in `done`."""
 
     @property
     def is_idle(self) -> bool:
         return self.doing is Activity.NOTHING
 
     def power_cycle_left_s(self, now_s: float) -> int:
-        """Whole seconds left to wait for the device."""
+        """Whole seconds left to switch the device off and on."""
         if self.power_cycle_s is None:
             return 0
         return max(0, round(self.power_cycle_s - (now_s - self.power_cycle_since_s)))

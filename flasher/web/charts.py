@@ -1,8 +1,8 @@
-"""Charts as page markup, drawn by pygal.
+"""Draws charts as SVG page markup with pygal.
 
-Styles, scripts and names from pygal are removed, so that no policy has to allow them: the pages'
-style sheet paints a chart, in light and dark. It shows one of two drawings, so that text has its
-full size on desktops and phones.
+Styles, scripts and names from pygal are removed, so that no browser policy has to allow them: the
+pages' style sheet colours a chart, in light and dark. It shows one of two drawings, so that text
+has its full size on desktops and phones.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flasher.report.scale import linear_ticks
 sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, pygal.PluginImportFixer)]
 
 SERIES_MAX: Final = 8
-"""Colours in the style sheet."""
+"""Number of colours in the style sheet."""
 _HEIGHT: Final = 300
 _PX_PER_LABEL: Final = 36
 _PX_PER_CHARACTER: Final = 8
@@ -45,13 +45,13 @@ Series = Mapping[str, Sequence[float | None]]
 
 
 def lines(title: str, labels: Sequence[str], series: Series, unit: str) -> Markup:
-    """Lines over shared labels, for shares of 100: from the ten below the least value."""
+    """Line chart of percentages over shared labels, from the ten below the least value up."""
     least = min(value for values in series.values() for value in values if value is not None)
     return _drawn(title, labels, series, pygal.Line, (min(90, least // 10 * 10), 100), unit)
 
 
 def stacked_bars(title: str, labels: Sequence[str], series: Series) -> Markup:
-    """One bar for each label, stacked from the series."""
+    """Stacked bar chart with a bar for each label."""
     most = max(sum(each or 0 for each in bar) for bar in zip(*series.values(), strict=True))
     return _drawn(title, labels, series, pygal.StackedBar, (0, most))
 
@@ -90,7 +90,7 @@ def _drawn(
 
 
 def _strip(element: Any) -> None:
-    """Keep shapes, texts, positions and classes only."""
+    """Keep shapes, texts, positions and classes; remove all else."""
     for child in list(element):
         names = set((child.get("class") or "").split())
         if not isinstance(child.tag, str) or child.tag in _DROPPED or names & _OVERLAYS:

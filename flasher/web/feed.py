@@ -1,9 +1,9 @@
-"""State feed for pages: each message is the whole state of one subject.
+"""Sends states to pages: each message is the whole state of one subject.
 
 A program's thread calls `put` and `beat`; pages follow in the server's event loop. A new page
 receives all states, then each change in order. A newer state replaces an unsent one of its subject
-when only its progress changed, so no shown word is skipped; a page too slow for that receives all
-states again.
+if only the progress differs, so that no displayed word is skipped; a page too slow for that
+receives all states again.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 BEAT_S: Final = 0.5
-"""Longest time between two messages to a page."""
+"""Maximum interval between two messages to a page."""
 GATHER_S: Final = 0.04
-"""Changes within this time are one message."""
+"""Changes within this time are sent as one message."""
 PENDING_MAX: Final = 2000
-"""Unsent changes before a page receives all states."""
+"""Number of unsent changes from which a page receives all states instead."""
 
 
 @dataclass
@@ -32,18 +32,18 @@ class _Change:
 
 
 class _Follower:
-    """Unsent changes of one page."""
+    """Queue of unsent changes for one page."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.changes: deque[_Change] = deque()
         self.last: dict[str, _Change] = {}
         self.is_behind = True
-        """It needs all states."""
+        """The page needs all states."""
         self.woken = asyncio.Event()
         self._loop = loop
 
     def put(self, change: _Change) -> None:
-        """Add a change. Call with the feed's lock held."""
+        """Queue a change. Call with the feed's lock held."""
         if self.is_behind:
             return
         last = self.last.get(change.subject)
@@ -63,17 +63,17 @@ class _Follower:
 
 @dataclass(frozen=True)
 class Batch:
-    """Changes sent to a page at a time."""
+    """Changes that are sent to a page together."""
 
     changes: tuple[tuple[str, Any], ...]
-    """Subjects with their whole states, in the order in which they changed."""
+    """Subjects with their states, in the order of the changes."""
     is_all: bool = False
-    """These are all subjects; others no longer exist."""
+    """True if these are all subjects; others no longer exist."""
 
 
 class Feed:
-    """The states of all subjects. `now`: a monotonic clock; `silence_limit_s`: without a `beat` for
-    so long, pages receive nothing until the next one.
+    """States of all subjects. `now`: a monotonic clock; `silence_limit_s`: time without a `beat`
+    after which pages receive nothing until the next one.
     """
 
     def __init__(self, now: Callable[[], float], *, silence_limit_s: float) -> None:

@@ -1,8 +1,8 @@
-"""Access control of the pages, and their browser policies.
+"""Access control of the pages, and the browser policies in their headers.
 
-Every request must name this server as its host (DNS rebinding). Changes need a POST from a page of
-this server with the token of its session. Answers forbid scripts, styles and connections from
-elsewhere. Where sign-in is required (`flasher.web.login`), only its page is shown before.
+Every request must have a name of this server as its host (against DNS rebinding). Changes need a
+POST from a page of this server with the token of its session. Responses forbid scripts, styles and
+connections from elsewhere. `flasher.web.login` adds sign-in.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from flasher.web.sign_ins import SignIn
 
 TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
 BODY_MAX: Final = 64 * 1024
-"""In bytes, of a request that is not an upload."""
+"""Maximum size in bytes of a request that is not an upload."""
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "font-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -49,10 +49,10 @@ _HEADERS: Final = {
 _ENTER: Final = "/enter"
 _CLOSED: Final = "/closed"
 _OPEN: Final = ("/static/", LOGIN, SIGN_OUT, _ENTER, _CLOSED)
-"""Paths that need no sign-in."""
+"""Paths without sign-in."""
 _ENTERED_S: Final = 14 * 24 * 3600
 _IS_IN: Final = "is_in"
-"""Session key of a browser admitted by the entry address."""
+"""Session key of the browser that opened the entry address."""
 
 
 class BrowserEntry:
@@ -63,8 +63,7 @@ class BrowserEntry:
         self._key = secrets.token_urlsafe(32)
         self.path = f"{_ENTER}?key={self._key}"
         self.cookie = f"flasher-{secrets.token_hex(4)}"
-        """Named by port: cookies apply to all ports of a computer, which may run several
-        servers."""
+        """Contains the port: several servers of a computer share its cookies."""
 
     @property
     def routes(self) -> list[BaseRoute]:
@@ -94,9 +93,11 @@ def application(
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
 ) -> ASGIApp:
-    """Wrap the pages in the guard. `hosts`: names of this server, without port; `secret` signs the
-    cookies; `login` checks sign-ins, and `entry` admits one browser: without either the pages are
-    open to all; `uploads` gives the maximum body size of a path in bytes.
+    """Wrap the pages in the access control.
+
+    `hosts`: names of this server, without port; `secret` signs the cookies; `login` checks
+    sign-ins, and `entry` admits one browser (without either the pages are open to all); `uploads`
+    returns the maximum body size of a path in bytes.
     """
     own: list[BaseRoute] = [
         *([] if entry is None else entry.routes),
@@ -124,7 +125,7 @@ def application(
 
 
 class _Guard:
-    """Outermost layer: checks hosts, origins and sizes, sets headers."""
+    """Outermost layer: checks host, origin and size, and sets headers."""
 
     def __init__(
         self, app: ASGIApp, hosts: Collection[str], limit_of: Callable[[str], int]
@@ -160,12 +161,12 @@ class _Guard:
         if scope["method"] in ("GET", "HEAD"):
             return None
         if scope["method"] != "POST":
-            return PlainTextResponse("Only GET and POST.", 405)
+            return PlainTextResponse("Only GET and POST are allowed.", 405)
         if headers.get("origin", "") != f"{scope['scheme']}://{host}":
             return PlainTextResponse("The request comes from another page.", 403)
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > self._limit_of(scope["path"]):
-            return PlainTextResponse("It is too large.", 413)
+            return PlainTextResponse("The request is too large.", 413)
         return None
 
 
@@ -176,7 +177,7 @@ def _name_of(host: str) -> str:
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Stop reading a body larger than allowed, whatever its header states."""
+    """Stop reading a body that is too large, whatever its header states."""
     taken = 0
 
     async def receive_limited() -> Message:
@@ -189,7 +190,7 @@ def _limited(receive: Receive, limit: int) -> Receive:
 
 
 class _Sessions:
-    """Gives every session a token, which a POST must include. Redirects to the sign-in page, or
+    """Adds a token to every session, which a POST must contain. Redirects to the sign-in page, or
     reports that another browser has the pages.
     """
 
@@ -226,7 +227,7 @@ class _Sessions:
             await self._app(scope, receive, send)
 
     def _refused(self, path: str, session: Mapping[str, Any], sign_in: SignIn | None) -> str:
-        """Redirect target for users without access to the page; "" with access."""
+        """Path to redirect to if this user may not open the page; otherwise ""."""
         if self._entry is not None and not session.get(_IS_IN):
             return _CLOSED
         if self._login is not None and self._login.is_refused(path, sign_in):
@@ -234,7 +235,7 @@ class _Sessions:
         return ""
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """A stream that ends with its sign-in."""
+        """Serve a stream that ends together with its sign-in."""
         session, path = scope["session"], scope["path"]
         with CancelScope() as streaming:
 

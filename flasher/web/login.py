@@ -1,7 +1,7 @@
 """Sign-in and sign-out pages, and the list of active sign-ins.
 
-A PIN is checked in a separate thread, one at a time. A try is counted before its check, few
-requests wait, and others are refused at once: guesses cost neither memory nor the time of users.
+A separate thread checks one PIN at a time. A try is counted before its check, few requests wait,
+and others are refused at once: guesses cost neither memory nor the time of users.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ SIGN_OUT: Final = "/sign-out"
 SIGN_INS: Final = "/sign-ins"
 _END: Final = f"{SIGN_INS}/end"
 _KEYS: Final = "sign_ins"
-"""Session key with the keys of the browser's sign-ins."""
+"""Session key for the keys of the browser's sign-ins."""
 FORMS: Final = (LOGIN, SIGN_OUT, _END)
-"""Forms whose fields include the session's token."""
+"""Forms with the session's token in a field."""
 _WAITING_MAX: Final = 4
-"""PINs checked or waiting."""
+"""Maximum number of PINs that are checked or wait."""
 _WAITING_OF_ONE_MAX: Final = 2
-"""The same for one address, so that one client cannot take all places."""
+"""The same for one address, so that one client cannot use all of them."""
 _QUERY_MAX: Final = 1000
-"""Characters of a page's query kept during sign-in."""
+"""Maximum length of a page's query that is stored during sign-in."""
 _BADGE_MAX: Final = 300
-"""Characters of a badge or a PIN."""
+"""Maximum length of a badge or a PIN."""
 
 
 ROLE_WORDS: Final = {
@@ -60,7 +60,7 @@ ROLE_WORDS: Final = {
 
 @dataclass(frozen=True)
 class Badges:
-    """Users who may open pages."""
+    """Badges of people who may open pages."""
 
     people: Sequence[Person]
     needs_pin: bool
@@ -68,14 +68,14 @@ class Badges:
     is_supervised: Callable[[str], bool]
     """True for the path of a supervisors' page."""
     are_for_all: bool
-    """True if the other pages need a badge too, of any role."""
+    """True if all other pages need a badge too, of any role."""
 
     def find(self, code: str) -> Person | None:
         return next((each for each in self.people if each.code == code), None)
 
     @property
     def any_hash(self) -> str:
-        """A hash to compare for unknown badges, so that timing does not reveal badges."""
+        """A hash for the check of unknown badges, so that timing does not reveal known ones."""
         return next((each.pin for each in self.people if each.pin), "")
 
 
@@ -90,11 +90,11 @@ class _RefusedError(Exception):
         self.status = status
         self.wait_s = wait_s
         self.badge = badge
-        """A scanned badge whose PIN is needed."""
+        """Scanned badge that needs a PIN."""
 
 
 class _Places:
-    """A limited number of waiting requests; further ones are refused at once."""
+    """Limits the number of waiting requests; further ones are refused at once."""
 
     def __init__(self) -> None:
         self._taken: Counter[str] = Counter()
@@ -113,7 +113,7 @@ class _Places:
 
 
 class Login:
-    """Signs users in by a shared password or by a badge."""
+    """Signs people in by a shared password or a badge."""
 
     def __init__(
         self,
@@ -148,11 +148,11 @@ class Login:
     # -- for the guard ----------------------------------------------------------------------------
 
     def find(self, session: dict[str, Any], *, is_use: bool = False) -> SignIn | None:
-        """The active sign-in; `is_use`: a page is viewed."""
+        """The active sign-in of a session; `is_use`: a page is viewed."""
         return self.sign_ins.find(_keys(session), is_use=is_use)
 
     def is_refused(self, path: str, sign_in: SignIn | None) -> bool:
-        """True for a page that this sign-in, or none, may not see."""
+        """True for a page that this sign-in (None: none) may not open."""
         badges = self._badges
         if badges is not None and (path.startswith(SIGN_INS) or badges.is_supervised(path)):
             return sign_in is None or not sign_in.is_supervisor
@@ -162,7 +162,7 @@ class Login:
         return asks_all and sign_in is None
 
     def want(self, session: dict[str, Any], scope: Scope) -> None:
-        """Remember the requested page during sign-in."""
+        """Store the requested page, to open it after sign-in."""
         query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
         # One slash alone: two would begin the name of another computer.
         session["wanted"] = "/" + scope["path"].lstrip("/\\") + (f"?{query}" if query else "")
@@ -204,7 +204,7 @@ class Login:
         return RedirectResponse(request.session.pop("wanted", "/"), 303)
 
     async def _checked(self, address: str, fields: dict[str, str]) -> Person | None:
-        """The user; None for the password. Raises _RefusedError."""
+        """The person of a badge; None for the password. Raises _RefusedError."""
         code, pin = (fields.get(name, "").strip()[:_BADGE_MAX] for name in ("badge", "pin"))
         # Beside the right password too, a wrong badge is a wrong try.
         if self._badges is not None and code:
@@ -217,7 +217,7 @@ class Login:
         return None
 
     async def _person(self, badges: Badges, address: str, code: str, pin: str) -> Person:
-        """The user of a badge, after checking the PIN. Raises _RefusedError."""
+        """The person of a badge, after the check of the PIN. Raises _RefusedError."""
         person = badges.find(code)
         if person is not None and not (person.pin or badges.needs_pin):
             self._count(address, code)
@@ -226,7 +226,7 @@ class Login:
         if not pin:  # a scanner ends what it types by Enter
             self._count(address, None)
             raise _RefusedError(text("Type the PIN of the badge."), badge=code)
-        # Of a badge that opens nothing too, so that the time tells nothing of it.
+        # Also for a badge that opens nothing, so that the time does not reveal it.
         pin_hash = person.pin if person is not None and person.pin else badges.any_hash
         with self._places.of(address):
             self._count(address, code)
@@ -241,7 +241,7 @@ class Login:
         return person
 
     def _count(self, address: str, badge: str | None) -> None:
-        """Count a try before its check. Raises _RefusedError for one too many."""
+        """Count a try before its check. Raises _RefusedError if there were too many."""
         wait_s = ceil(self._attempts.begin(address, badge, self._clock.monotonic_s()))
         if wait_s:
             trouble = text("Too many tries: wait {seconds} s.", seconds=wait_s)
@@ -254,14 +254,14 @@ class Login:
         if pause_s:
             data["pause"] = f"{ceil(pause_s)} s"
         self._note(AuditEvent.SIGN_IN_REFUSED, data)
-        return _RefusedError(text("That is not it."))
+        return _RefusedError(text("The badge, PIN or password is wrong."))
 
     def _check_supervisor(self, address: str, person: Person) -> None:
-        """Raises _RefusedError for another role."""
+        """Raises _RefusedError for a badge with another role."""
         if person.role is not Role.SUPERVISOR:
             data = {"name": person.name, "address": address, "why": "no supervisor"}
             self._note(AuditEvent.SIGN_IN_REFUSED, data)
-            raise _RefusedError(text("That badge is no supervisor's."))
+            raise _RefusedError(text("That is not the badge of a supervisor."))
 
     def _is_for_supervisors(self, request: Request) -> bool:
         wanted = str(request.session.get("wanted", "/")).partition("?")[0]
@@ -306,7 +306,7 @@ def _keys(session: Mapping[str, Any]) -> list[str]:
 
 
 async def _form(request: Request) -> dict[str, str] | None:
-    """The fields of a form; None without this session's token."""
+    """Fields of a form; None if it lacks this session's token."""
     found = parse_qs((await request.body()).decode("utf-8", "replace"), keep_blank_values=True)
     fields = {name: values[0] for name, values in found.items()}
     token: str = request.session["token"]

@@ -1,5 +1,5 @@
-"""Operator page: a tile for each socket, a header, a footer, and an overlay when the line is
-stopped or the station is silent.
+"""Operator page: a tile for each socket, a header, a footer, and an overlay for a stopped line or a
+silent station.
 
 `Screen` receives the station's events in the station's thread; the page follows its `Feed`.
 """
@@ -30,17 +30,17 @@ from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
 
 TAIL_DIGITS: Final = 6
-"""Digits of a serial number shown large: enough to tell the units on a bench apart."""
+"""Digits of a serial number in large type, enough to distinguish the units of a bench."""
 _PAGE_DIGITS: Final = 8
-"""Digits of a page's number."""
+"""Digits of a page's id."""
 SCAN_MAX: Final = 300
-"""Characters of a scan from a page."""
+"""Maximum length of a scan from a page."""
 HEAD_EVERY_S: Final = 0.1
 SILENCE_LIMIT_S: Final = 1.5
-"""A station whose loop is slower than this counts as silent."""
+"""Time without a turn of the station's loop after which the page shows the station as silent."""
 _HEAD: Final = "head"
 LINE: Final = "/line"
-"""Path of the page and prefix of its requests."""
+"""Path of the page, and prefix of its requests."""
 
 WORDS: Final = {
     SocketState.STARTING: text("STARTING"),
@@ -55,7 +55,7 @@ WORDS: Final = {
     SocketState.ERROR: text("ERROR"),
     SocketState.STOPPED: text("STOPPED"),
 }
-"""Large words of a tile."""
+"""State in large letters on a tile."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class CurrentLot:
 
 @dataclass(frozen=True)
 class ScreenHeader:
-    """Page content besides the sockets."""
+    """Content of the page apart from the sockets."""
 
     station: str
     recipe: str
@@ -82,7 +82,7 @@ class ScreenHeader:
     stopped: LineStopped | None
     replies: Replies
     is_secret: bool
-    """Typed characters must not be shown."""
+    """Typed characters must be hidden."""
 
     def to_json(self, translate: Translator, source: Source) -> dict[str, Any]:
         """The header in a language, for the page of the session `source`."""
@@ -136,7 +136,7 @@ def _left(left_s: float, translate: Translator) -> str:
 
 
 def _tile(row: Row, translate: Translator) -> dict[str, Any]:
-    """One socket in a language, for the page's script."""
+    """The tile of a socket in a language, for the page's script."""
     serial = row.serial or row.virtual_label
     return {
         "socket": row.socket,
@@ -155,7 +155,7 @@ def _tile(row: Row, translate: Translator) -> dict[str, Any]:
 
 
 class Screen:
-    """State of the page, from a station's events. Call its methods in the station's thread."""
+    """State of the page, from a station's events. Methods are called in the station's thread."""
 
     def __init__(self, tally: ShiftCounts, watch: HealthWatch) -> None:
         self.feed = Feed(time.perf_counter, silence_limit_s=SILENCE_LIMIT_S)
@@ -163,7 +163,7 @@ class Screen:
         self._watch = watch
         self._turned_at = float("-inf")
         self._passed: dict[str, RunEnded] = {}
-        """Runs that ended with PASS and whose units are still in their sockets."""
+        """Runs that ended with PASS whose units are still in their sockets."""
 
     def show(self, event: StationEvent, board: Board) -> None:
         """Update after the board has applied an event."""
@@ -184,7 +184,7 @@ class Screen:
             self.feed.put(f"socket {name}", replace(row, state=state), word=word)
 
     def turn(self, board: Board, *, operator: str, lot: CurrentLot) -> None:
-        """Call once in each turn of the station's loop."""
+        """Update figures and health; called in each turn of the station's loop."""
         self.feed.beat()
         now = time.perf_counter()
         if now - self._turned_at < HEAD_EVERY_S:
@@ -207,9 +207,7 @@ class Screen:
 
 
 class OperatorPage:
-    """The routes of the page. `submit` passes a scan to the station, with the browser's session as
-    its source.
-    """
+    """Routes of the page. `submit` passes a scan to the station; its source is the session."""
 
     def __init__(
         self,
@@ -258,7 +256,7 @@ class OperatorPage:
 
 
 def _source_of(request: Request) -> Source:
-    """Public id of a browser's session; its token stays secret."""
+    """Public id of a browser's session, without its secret token."""
     token = str(request.session["token"]).encode()
     return Source(PAGE + hashlib.sha256(token).hexdigest()[:_PAGE_DIGITS])
 

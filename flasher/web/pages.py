@@ -1,6 +1,4 @@
-"""Page rendering: the templates of `flasher.report` and of this package, with escaping, language
-and session token.
-"""
+"""Renders the page templates of this package and `flasher.report`, escaped and translated."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ _PART: Final = "part_"
 
 
 def streamed(messages: AsyncIterator[dict[str, Any]]) -> Response:
-    """Server-sent events for a page's script."""
+    """Response with server-sent events for a page's script."""
 
     async def lines() -> AsyncIterator[str]:
         yield "retry: 500\n\n"
@@ -44,8 +42,8 @@ def _environment(language: str) -> Environment:
 
 
 class Pages:
-    """Renders pages. `language`: the default; None: the browser's. With `remembers_language` a
-    chosen language applies to later pages of the session.
+    """Renders pages. `language`: the default; None: the browser's. With `remembers_language`, a
+    chosen language is stored in the session.
     """
 
     def __init__(self, language: str | None = None, *, remembers_language: bool = False) -> None:
@@ -60,7 +58,7 @@ class Pages:
         return chosen(wanted or self._language, accepted)
 
     def parts(self, translate: Translator, template: str, **context: Any) -> dict[str, str]:
-        """Output of each macro `part_...` of a template, by name."""
+        """Render each macro `part_...` of a template, by name."""
         found = _environment(translate.code).get_template(template).make_module(context)
         return {
             name.removeprefix(_PART): str(macro())
@@ -71,7 +69,7 @@ class Pages:
     def show(
         self, request: Request, template: str, *, status: int = 200, **context: Any
     ) -> Response:
-        """Render a page in the language of its request."""
+        """Response with a page in the language of the request."""
         token = request.session.get("token", "")
         context.setdefault("sign_in", request.scope.get("sign_in"))
         return HTMLResponse(
@@ -79,7 +77,7 @@ class Pages:
         )
 
     def text(self, template: str, translate: Translator, token: str, **context: Any) -> str:
-        """Render a page. Templates have `token`, `languages` and `version`."""
+        """Render a page. Templates also get `token`, `languages` and `version`."""
         return (
             _environment(translate.code)
             .get_template(template)

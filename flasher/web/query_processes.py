@@ -1,4 +1,5 @@
-"""Processes that query the records for pages, so that the station that serves them loses no time.
+"""Processes that render pages from the records, so that the station that serves them is not
+delayed.
 
 Questions and answers are plain data. The processes start with the first question.
 """
@@ -37,7 +38,7 @@ HTML: Final = "text/html; charset=utf-8"
 
 @dataclass(frozen=True)
 class Question:
-    """The request of a page."""
+    """The request of a page, as plain data."""
 
     path: str
     """Path of the route."""
@@ -48,14 +49,14 @@ class Question:
     language: str = "en"
     token: str = ""
     sign_in: SignIn | None = None
-    """Sign-in of the requesting person."""
+    """Sign-in of the person."""
     body: bytes = b""
-    """Body of a POST request; else empty."""
+    """Body of a POST request, or empty."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The response: a page, a file to save, or a redirection."""
+    """The response: a page, a file to save, or a redirect."""
 
     body: bytes = b""
     media_type: str = HTML
@@ -63,13 +64,13 @@ class Answer:
     file_name: str = ""
     """Name of a file to save."""
     location: str = ""
-    """Path of another page of this server, for a redirection."""
+    """Path on this server to redirect to."""
     after: str = ""
-    """Start of the next part of a file in parts: a field of the question for it."""
+    """Start of the next part of a long file: the field `after` of the next question."""
 
 
 class Answering(Protocol):
-    """Answers questions."""
+    """Renders answers to questions."""
 
     def answer(self, question: Question) -> Answer: ...
 
@@ -78,8 +79,8 @@ Ask = Callable[[Question], Awaitable[Answer]]
 
 
 class QueryProcesses:
-    """Processes that answer questions. `make` is called in each process, and has to be picklable;
-    `close` ends them.
+    """Pool of processes that answer questions. `make` is called in each process and must be
+    picklable; `close` ends them.
     """
 
     def __init__(self, make: Callable[[], Answering]) -> None:
@@ -87,11 +88,11 @@ class QueryProcesses:
         self._pool: ProcessPoolExecutor | None = None
 
     def begin(self) -> None:
-        """Start a process, which the first question does else."""
+        """Start a process now instead of with the first question."""
         self._submit(os.getpid)
 
     async def ask(self, question: Question) -> Answer:
-        """The answer to a question. Raises TimeoutError, or what the process raised."""
+        """Answer a question. Raises TimeoutError, or the exception of the process."""
         try:
             answer = self._submit(_answer, question)
             return await asyncio.wait_for(asyncio.wrap_future(answer), ANSWER_LIMIT_S)
@@ -108,7 +109,7 @@ class QueryProcesses:
             return self._pool.submit(function, *arguments)
 
     def close(self) -> None:
-        """End the processes, also in the middle of an answer."""
+        """End the processes, even during an answer."""
         pool, self._pool = self._pool, None
         if pool is None:
             return
@@ -125,7 +126,7 @@ _answering: Answering | None = None
 
 
 def _begin(make: Callable[[], Answering]) -> None:
-    """Called once in each process. It does not fail: another process would be started at once."""
+    """Called once in each process. It must not fail, or another process would start at once."""
     global _make  # noqa: PLW0603  a process has one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -135,7 +136,7 @@ def _begin(make: Callable[[], Answering]) -> None:
 
 
 def _end_with_parent() -> None:
-    """A station that was killed ends nothing."""
+    """End this process with its parent: a station that was killed cannot do it."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -152,7 +153,7 @@ def _answer(question: Question) -> Answer:
 
 
 def question_of(path: str, request: Request, pages: Pages) -> Question:
-    """Make the question of a request; `path`: the path of its route."""
+    """Build the question of a request; `path`: the path of its route."""
     fields = {
         name: value.strip()[:FIELD_MAX]
         for name, value in request.query_params.items()
@@ -169,7 +170,7 @@ def question_of(path: str, request: Request, pages: Pages) -> Question:
 
 
 async def _parts(ask: Ask, question: Question, answer: Answer) -> AsyncIterator[bytes]:
-    """A file in parts, however long it is. Raises what `ask` does: a file that breaks off."""
+    """Stream a file in parts. An exception of `ask` ends the file early."""
     yield answer.body
     while answer.after:
         answer = await ask(replace(question, fields={**question.fields, "after": answer.after}))
@@ -181,7 +182,7 @@ async def _parts(ask: Ask, question: Question, answer: Answer) -> AsyncIterator[
 def answer_routes(
     pages: Pages, ask: Ask, paths: Iterable[str], uploads: Iterable[str] = ()
 ) -> list[BaseRoute]:
-    """The routes of pages that are answered by `ask`; those of `uploads` take a file too."""
+    """Routes of pages that are answered by `ask`; those in `uploads` accept a file."""
 
     async def page(path: str, request: Request) -> Response:
         question = question_of(path, request, pages)
@@ -190,7 +191,7 @@ def answer_routes(
         try:
             answer = await ask(question)
         except TimeoutError:
-            return PlainTextResponse("That took too long: narrow it down.", 503)
+            return PlainTextResponse("That took too long: choose a shorter period.", 503)
         if answer.location:
             return RedirectResponse(answer.location, 303)
         headers = {}

@@ -1,4 +1,4 @@
-"""Web server in its own thread, for the life of a program."""
+"""Runs a web server in its own thread."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
-"""Addresses that other computers cannot reach."""
+"""Host names that only this computer can reach."""
 # The server prints nothing into the program's terminal; a log takes its messages.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 _END_LIMIT_S: Final = 1.0
-"""Open streams are cut after this time."""
+"""Time after which open streams are closed at the end."""
 
 
 _CONNECTIONS_MAX: Final = 200
 _OF_ONE_MAX: Final = 100
-"""Open connections of one client, so that it cannot use them all."""
+"""Maximum number of connections of one client."""
 
 
 class _Protocol(H11Protocol):
-    """Limits the connections of a client."""
+    """HTTP protocol that limits the connections of a client."""
 
     place = ""
 
@@ -45,9 +45,7 @@ class _Protocol(H11Protocol):
 
 
 def client_at(host: str) -> str:
-    """The client of an address: all addresses of this computer, or of an IPv6 network, are one
-    client.
-    """
+    """Client of an address: all addresses of this computer, or of an IPv6 network, count as one."""
     try:
         found = ip_address(host.partition("%")[0])
     except ValueError:
@@ -67,8 +65,8 @@ class Tls(NamedTuple):
 
 
 class Server:
-    """Serves an ASGI application while the block runs; `url` is its address, with the actual port.
-    Raises UsageError for an unusable address.
+    """Serves an ASGI application while the block runs; `url` contains the actual port. Raises
+    UsageError for an address that cannot be used.
     """
 
     def __init__(self, app: Any, host: str, port: int, tls: Tls | None = None) -> None:
@@ -123,7 +121,7 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         raise UsageError(
             f"Port {port} of {printable(host)} cannot be used: {error.strerror or error}.",
-            cause="another program uses it, or the address is none of this computer",
+            cause="another program uses it, or this computer does not have the address",
             remedy="Give another port, or 0 for any.",
             code=ErrorCode.PAGES_NOT_SERVED,
         ) from error

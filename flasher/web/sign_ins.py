@@ -1,5 +1,6 @@
-"""Active sign-ins, in the server's memory only: none survives a restart, and an ended one never
-returns. Cookies hold only the keys of sign-ins.
+"""Active sign-ins, in memory only: none survives a restart, and an ended one never returns.
+
+Cookies contain only the keys of sign-ins.
 """
 
 from __future__ import annotations
@@ -18,18 +19,16 @@ SHIFT_S: Final = 8 * 3600.0
 IDLE_S: Final = 900.0
 """Maximum time without a page view, for a supervisor."""
 _OF_ONE_MAX: Final = 100
-"""Sign-ins of one person, or by the password; beyond, the oldest one ends."""
+"""Maximum number of sign-ins of one person, or by the password; then the oldest one ends."""
 _BY_PASSWORD: Final = "(password)"  # noqa: S105  what the audit trail has in place of a name
 
 Note = Callable[[AuditEvent, Mapping[str, str]], None]
-"""Writes to the audit trail."""
+"""Appends an entry to the audit trail."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment on two clocks: wall time may be set, the monotonic one may stop while the computer
-    sleeps.
-    """
+    """A time on two clocks: wall time may be set, the monotonic one may stop during sleep."""
 
     utc: datetime
     monotonic_s: float
@@ -39,13 +38,13 @@ class Moment:
         return cls(clock.utc(), clock.monotonic_s())
 
     def until_s(self, later: Moment) -> float:
-        """Time until a later moment, by the clock that advanced further."""
+        """Seconds to a later moment, by the clock that advanced further."""
         return max(later.monotonic_s - self.monotonic_s, (later.utc - self.utc).total_seconds())
 
 
 @dataclass(frozen=True)
 class SignIn:
-    """A user at a browser. `name` and `role` come from the badge; empty for the password."""
+    """A person signed in at a browser. `name` and `role`: of the badge; "" for the password."""
 
     number: int
     name: str
@@ -59,12 +58,12 @@ class SignIn:
         return self.role is Role.SUPERVISOR
 
     def data(self, **more: str) -> dict[str, str]:
-        """Its data in the audit trail."""
+        """Data for the audit trail."""
         name = self.name or _BY_PASSWORD
         return {"number": str(self.number), "name": name, "address": self.address, **more}
 
     def over(self, now: Moment) -> str:
-        """Why it has expired; "" while it is active."""
+        """Reason why it has expired; "" while it is active."""
         if self.begun.until_s(now) >= SHIFT_S:
             return f"{SHIFT_S / 3600:g} h"
         if self.is_supervisor and self.used.until_s(now) >= IDLE_S:
@@ -73,19 +72,19 @@ class SignIn:
 
 
 class SignIns:
-    """The sign-ins of a server. `note` is called for each begin and end. Not thread-safe."""
+    """Active sign-ins. `note` is called when one begins or ends. Not thread-safe."""
 
     def __init__(self, clock: StationClock, note: Note) -> None:
         self._clock = clock
         self._note = note
         self._known: dict[str, SignIn] = {}
-        """By key, in the order of their begin."""
+        """By key, oldest first."""
         self._count = 0
 
     def begin(self, person: Person | None, address: str, keys: Iterable[str] = ()) -> list[str]:
-        """Sign a person in (None: by password) at a browser with these keys; returns its new keys.
+        """Sign a person in (None: by password) at a browser with these keys; returns the new keys.
 
-        A supervisor's visit at a screen of the line does not end the operator's sign-in.
+        A supervisor who signs in at a page of the line does not end the operator's sign-in.
         """
         self._count += 1
         now = Moment.now(self._clock)
@@ -106,7 +105,7 @@ class SignIns:
         return [*kept, key]
 
     def find(self, keys: Iterable[str], *, is_use: bool) -> SignIn | None:
-        """The last active one of these; `is_use`: a page is viewed."""
+        """The last active sign-in of these keys; `is_use`: a page is viewed."""
         self._end_old()
         found = next((key for key in reversed(list(keys)) if key in self._known), None)
         if found is None:
@@ -116,12 +115,12 @@ class SignIns:
         return self._known[found]
 
     def listed(self) -> list[SignIn]:
-        """All active ones, the oldest first."""
+        """All active sign-ins, oldest first."""
         self._end_old()
         return list(self._known.values())
 
     def sign_out(self, sign_in: SignIn, *, everywhere: bool = False) -> None:
-        """End a sign-in at its user's request; `everywhere`: all of that user."""
+        """End a sign-in for its owner; `everywhere`: all sign-ins of that person."""
         self._forget(sign_in)
         self._note(AuditEvent.SIGN_OUT, sign_in.data())
         for other in self.listed() if everywhere and sign_in.name else ():
@@ -129,7 +128,7 @@ class SignIns:
                 self._end(other, by=sign_in.name)
 
     def end(self, number: str, by: SignIn) -> None:
-        """End a sign-in at a supervisor's request, unless it has ended."""
+        """End a sign-in for a supervisor, if it is still active."""
         for each in self.listed():
             if str(each.number) == number:
                 self._end(each, by=by.name or _BY_PASSWORD)

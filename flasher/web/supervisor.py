@@ -1,6 +1,6 @@
-"""Supervisor pages: queries of the records, from the form in the address to a page.
+"""Supervisor pages: runs, units, yield, times, images and audit trail from the records.
 
-Times are the server's local time; the pages name its zone.
+The query of an address becomes a page. Times are the server's local time; pages state the zone.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question
 
 USUAL_DAYS: Final = 30
-"""Days with runs that figures cover by default."""
+"""Default period of pages with figures: this number of days with runs."""
 CAUSES_DRAWN: Final = 12
 _HOURS_UP_TO: Final = timedelta(days=2)
 _DAYS_UP_TO: Final = timedelta(days=62)
@@ -81,9 +81,9 @@ _NAMES: Final = {
     "/audit": text("Audit trail"),
     CHECK: text("Check a certificate"),
 }
-"""Menu entries."""
+"""Titles in the menu."""
 _SIGN_INS: Final = {"/sign-ins": text("Sign-ins")}
-"""Additional menu entry where users sign in."""
+"""Title in the menu if people sign in."""
 BY_WORDS: Final = {
     By.SOCKET: text("socket"),
     By.RECIPE: text("recipe"),
@@ -91,7 +91,7 @@ BY_WORDS: Final = {
     By.SHIFT: text("shift"),
 }
 PART_SIZE: Final = 2000
-"""Rows of a file read at once."""
+"""Rows of a spreadsheet file that are read at once."""
 _CSV: Final = "text/csv; charset=utf-8"
 _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
     "/runs.csv": (_CSV, Report.to_csv),
@@ -101,7 +101,7 @@ _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
 
 
 class PartOfCauses(NamedTuple):
-    """A row of the table of causes. `share`: cumulative, of 1."""
+    """Row of the table of causes. `share`: cumulative share, from 0 to 1."""
 
     code: str
     meaning: str
@@ -112,7 +112,7 @@ class PartOfCauses(NamedTuple):
 
 @dataclass(frozen=True)
 class SupervisorPages:
-    """Answers queries of the pages. `shifts`: their begins, in local time."""
+    """Renders the supervisor pages. `shifts`: local start times."""
 
     store: Store
     shifts: Sequence[time] = DEFAULT_SHIFTS
@@ -127,7 +127,7 @@ class SupervisorPages:
         return Pages()
 
     def answer(self, question: Question) -> Answer:
-        """The page; an error page if there is none."""
+        """Render a page; an error page if there is none."""
         try:
             return PAGES[question.path](self, question)
         except NotFoundError as error:
@@ -179,7 +179,7 @@ class SupervisorPages:
         return Answer(location=f"/units?{urlencode(unit)}")
 
     def trace(self, question: Question) -> Answer:
-        """The full story of a run's bus trace."""
+        """The complete explanation of a run's bus trace."""
         details = self.store.read.run(RunId(question.run))
         found = self._story(details)
         if not isinstance(found, Story):
@@ -246,7 +246,7 @@ class SupervisorPages:
         return self._page(question, "certificate.html", path="/units", **made)
 
     def file_of_certificate(self, question: Question) -> Answer:
-        """The certificate as a file for later verification."""
+        """Download of a certificate, to check it later."""
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
         proof = proven(self.store, life)
@@ -255,7 +255,7 @@ class SupervisorPages:
         return Answer(made.encode("utf-8"), file_name=f"{name}.html")
 
     def check(self, question: Question) -> Answer:
-        """Check that a certificate is signed, unchanged, and from these records."""
+        """Check whether an uploaded certificate is signed, unchanged, and of these records."""
         found = error = None
         if question.body.strip():
             try:
@@ -298,9 +298,9 @@ class SupervisorPages:
     # -- figures ----------------------------------------------------------------------------------
 
     def _figured(self, question: Question) -> tuple[RunFilter, Span]:
-        """The filter of a page of figures, and its period."""
+        """Filter and period of a page with figures."""
         chosen = filter_of(question)
-        # Whenever the period begins, its last run is the newest one, or it has none.
+        # The newest run of the filter is the last of any period, or the period has none.
         last = None if chosen.until else self.overview.last_begin(replace(chosen, since=None))
         if last is not None and chosen.since is not None and last < chosen.since:
             last = None
@@ -356,7 +356,7 @@ class SupervisorPages:
     def _causes(
         self, chosen: RunFilter, span: Span, by: By, translate: Translator
     ) -> tuple[list[str], list[PartOfCauses]]:
-        """The groups, and the codes by descending frequency."""
+        """Names of the groups, and the codes by descending frequency."""
         shifts = list(shifts_of(span, self.shifts)) if by is By.SHIFT else []
         found = self.overview.causes(chosen, by, shifts)
         sizes: Counter[str] = sum(found.values(), Counter())
@@ -411,12 +411,12 @@ class SupervisorPages:
             "audit.html",
             page=page,
             events=chain.EVENTS,
-            told=lambda row: ", ".join(_facts(row.data)),
+            content_of=lambda row: ", ".join(_facts(row.data)),
         )
 
 
 def frame(question: Question, now: datetime) -> dict[str, Any]:
-    """The common frame of all supervisor pages."""
+    """Values of the frame that all supervisor pages share."""
     return {
         "layout": "supervise.html",
         "menu": _NAMES if question.sign_in is None else _NAMES | _SIGN_INS,
@@ -438,7 +438,7 @@ Place = tuple[str, Path, KeyLocations]
 
 
 def place_of(store: Store) -> Place:
-    """Location of these records: their URL, the folder of their files, external files."""
+    """Database URL, folder of files, and key locations of opened records."""
     url = store.database.location.url.render_as_string(hide_password=False)
     return url, store.files.folder, store.signer.key_locations
 
@@ -446,7 +446,7 @@ def place_of(store: Store) -> Place:
 def open_supervisor(
     url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
 ) -> SupervisorPages:
-    """Open the records of a place read-only. Raises what `Store.open` does."""
+    """Open records read-only. Raises as `Store.open`."""
     store = Store.open(
         url, station="pages", folder=folder, read_only=True, key_locations=key_locations
     )
@@ -456,7 +456,7 @@ def open_supervisor(
 def serve_supervisor(
     url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
 ) -> SupervisorPages:
-    """The same, and keep daily figures updated while this process lives."""
+    """Open records read-only, and update the daily sums while this process runs."""
     supervisor = open_supervisor(url, folder, key_locations, shifts)
     rollup = Rollup(supervisor.store.database)
     Thread(
@@ -487,7 +487,7 @@ PAGES: Final[dict[str, Callable[[SupervisorPages, Question], Answer]]] = {
 
 
 def filter_of(question: Question) -> RunFilter:
-    """The filter of a form. Raises UsageError for an invalid time or outcome."""
+    """Parse the filter of a form. Raises UsageError for an invalid time or outcome."""
     fields = question.fields
     outcome = fields.get("outcome")
     if outcome is not None and outcome not in set(RunState):
@@ -514,19 +514,19 @@ def _moment(question: Question, name: str) -> datetime | None:
         return datetime.fromisoformat(text).astimezone()
     except (ValueError, OverflowError) as error:
         raise UsageError(
-            f"{text!a:.40} is no time.", remedy="Write 2026-05-17 or 2026-05-17T06:00."
+            f"{text!a:.40} is not a time.", remedy="Write 2026-05-17 or 2026-05-17T06:00."
         ) from error
 
 
 def _oldest(question: Question) -> PageCursor:
-    """Begin of a part of a file; the first one starts at the oldest row."""
+    """Start of a part of a file; the first part starts at the oldest row."""
     return PageCursor(after=_cursor(question).after or 0)
 
 
 def _part(
     question: Question, page: Page[Any], heads: Iterable[str], rows: Iterable[Iterable[object]]
 ) -> Answer:
-    """A part of a spreadsheet file; the first one has the column names."""
+    """A part of a spreadsheet file; the first part has the column names."""
     name = {"/images.csv": "units.csv"}.get(question.path, question.path.lstrip("/"))
     is_first = bool(page.rows) and "after" not in question.fields
     text = csv_text([*([heads] if is_first else []), *rows])
@@ -543,7 +543,7 @@ def _cursor(question: Question) -> PageCursor:
 
 
 class _Addresses:
-    """Addresses of this server with the fields of the current form."""
+    """Builds addresses of pages with the fields of the current form."""
 
     def __init__(self, question: Question) -> None:
         self._fields = {
@@ -553,7 +553,7 @@ class _Addresses:
         }
 
     def with_cursor(self, path: str, cursor: PageCursor | None = None, **more: str) -> str:
-        """The same list from a cursor on."""
+        """Address of the same list from a cursor on."""
         fields = self._fields | more
         if cursor is not None and cursor.before is not None:
             fields["before"] = str(cursor.before)
@@ -562,7 +562,7 @@ class _Addresses:
         return f"{path}?{urlencode(fields)}" if fields else path
 
     def of(self, path: str, **fields: object) -> str:
-        """Another page in the same language."""
+        """Address of another page in the same language."""
         lang = {"lang": self._fields["lang"]} if "lang" in self._fields else {}
         return f"{path}?{urlencode(fields | lang)}" if fields or lang else path
 
@@ -571,7 +571,7 @@ class _Addresses:
 
 
 def spans_of(whole: Span) -> Iterator[Span]:
-    """Hours, days, weeks or months of local time, as many as can be viewed."""
+    """Hours, days, weeks or months in local time, the finest that fit into a chart."""
     length = whole.end - whole.begin
     begin = whole.begin.astimezone()
     midnight = datetime.combine(begin, time())
@@ -596,7 +596,7 @@ def spans_of(whole: Span) -> Iterator[Span]:
 
 
 def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
-    """From each start to the next, up to the one that contains `end`."""
+    """Spans from each start to the next, up to the one that contains `end`."""
     before: datetime | None = None
     for start in starts:
         if before is not None:
@@ -607,7 +607,7 @@ def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
 
 
 def shifts_of(whole: Span, shifts: Sequence[time]) -> Iterator[tuple[Span, str]]:
-    """The shifts of a period, each with the begin of its kind."""
+    """Shifts of a period, each with its start time as name."""
     day = datetime.combine(whole.begin.astimezone(), time()) - timedelta(days=1)
     days = (whole.end - whole.begin).days + 3
     starts = [
@@ -641,7 +641,7 @@ def _is_trace(file: AttachmentFile) -> bool:
 
 
 def _facts(data: dict[str, Any]) -> Iterator[str]:
-    """The content of an audit row, without digests."""
+    """Content of an audit row as texts, without digests."""
     for name, value in data.items():
         if name == "digests" or value in ("", None):
             continue

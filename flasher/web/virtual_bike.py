@@ -1,4 +1,4 @@
-"""Virtual bikes for trying the bench, each with or without a fault."""
+"""Virtual bikes for the bench page, each with one fault or none."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 
 _ONE_FAULT: Final = 1 << 3
 _HAND_S: Final = 2.0
-"""Delay and duration of a user's power interruption."""
+"""Time until the user interrupts the power, and duration of the interruption."""
 _OTHER_HARDWARE: Final = "V0r0r1_20200101"
 _FOREIGN: Final = bytes.fromhex("55AA168700000000")
-"""Begin of a message that only a tool sends."""
+"""First bytes of a message that only a tool sends."""
 
 
 class BikeFault(Enum):
-    """Fault of a virtual bike; the value is its name."""
+    """Fault of a virtual bike; the value is the bike's name."""
 
     NONE = "virtual bike"
     POWER = "virtual bike 2"
@@ -43,10 +43,10 @@ class BikeFault(Enum):
 
 
 NOTES: Final = {
-    BikeFault.NONE: text("nothing is wrong with it"),
+    BikeFault.NONE: text("has no fault"),
     BikeFault.POWER: text("loses its power in the middle of the upgrade"),
     BikeFault.PULLED: text("the adapter is pulled out in the middle of the upgrade"),
-    BikeFault.SECOND_TOOL: text("a second tool speaks in the middle of the upgrade"),
+    BikeFault.SECOND_TOOL: text("another tool sends in the middle of the upgrade"),
     BikeFault.REFUSES: text("its devices refuse the image at the end"),
     BikeFault.HARDWARE: text("has other hardware, and reports a fault"),
     BikeFault.NO_APPLICATION: text("its upgrade was interrupted: its devices do not start"),
@@ -55,7 +55,7 @@ NOTES: Final = {
 
 
 class _BikeClock:
-    """Advances only while the bus is in use: an unwatched bike does nothing."""
+    """Clock that advances only while the bus is used, so that an unwatched bike stands still."""
 
     def __init__(self, speed: float) -> None:
         self.speed = speed
@@ -77,7 +77,7 @@ class _BikeClock:
 
 
 class VirtualBike:
-    """Three upgradable devices on their own bus. With `speed` 0 they take no time."""
+    """Three upgradable devices on a simulated bus. With `speed` 0 transfers take no time."""
 
     def __init__(self, fault: BikeFault, dialect: Dialect, *, speed: float = 1.0) -> None:
         self._fault = fault
@@ -111,7 +111,7 @@ class VirtualBike:
 
     @contextmanager
     def connect(self) -> Iterator[Connection]:
-        """Plug the adapter in and return the bus."""
+        """Connect an adapter and yield the bus."""
         self._bus.plug()
         if isinstance(self._clock, _BikeClock):
             self._clock.resume()

@@ -203,7 +203,7 @@ def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: P
     run = flasher(*RUN, "--units", "1", "--web", "0", "--web-password", password)
     assert run.code in (ExitCode.OK, ExitCode.PARTIAL)
     page, refused = asked
-    assert "asks for its password" in page
+    assert "the password of this station" in page
     assert refused == httpx2.codes.UNAUTHORIZED
 
 

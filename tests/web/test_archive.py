@@ -1,4 +1,4 @@
-"""What this computer keeps, without a page around it."""
+"""Files on this computer, without a page around it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_nothing_but_what_is_listed_is_given_out(
 ) -> None:
     answer = _asked(kept, path, **{field: name})
     assert answer.status == 400
-    assert "is not there any more" in answer.body.decode()
+    assert "no longer exists" in answer.body.decode()
 
 
 def test_a_story_names_the_file_and_not_where_it_was_put(kept: Archive, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page
     page.set_input_files("#file", {"name": "own <b>.bin", "mimeType": "", "buffer": image})
     expect(page.locator("#image-2")).to_have_text("own <b>.bin")
     page.set_input_files("#file", {"name": "run.sh", "mimeType": "", "buffer": image})
-    expect(page.locator("#said")).to_contain_text("neither an image")
+    expect(page.locator("#message")).to_contain_text("neither an image")
 
 
 def test_files_are_taken_before_anything_is_chosen_and_a_trace_tells_its_story(
@@ -164,9 +164,9 @@ def test_a_failure_is_explained_and_its_bundle_downloaded_in_one_click(page: Pag
 
 def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
     page.click(f"#adapter button:text-is('{BikeFault.HARDWARE.value}')")
-    page.click("#told-all")
-    expect(page.locator("#told")).to_contain_text("over discharge protection")
-    expect(page.locator("#told")).to_contain_text("most recent charge interval")
+    page.click("#answers-all")
+    expect(page.locator("#answers")).to_contain_text("over discharge protection")
+    expect(page.locator("#answers")).to_contain_text("most recent charge interval")
     page.click("#do-watch")
     expect(page.locator("#watched tbody")).to_contain_text("voltage 40153 mV")
     page.click("#stop")
@@ -175,7 +175,7 @@ def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
     page.focus("#area-1")
     _check(page)
     page.click("#area-1")
-    expect(page.locator("#saved")).to_contain_text("It names the version that runs.")
+    expect(page.locator("#saved")).to_contain_text("It contains the running version.")
     with page.expect_download() as download:
         page.click("#download")
     with zipfile.ZipFile(download.value.path()) as archive:
@@ -189,7 +189,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": wrong})
     expect(page.locator("#refused-all")).to_contain_text("2 files")
     page.click("#refused-all")
-    page.click("#refused summary:text('Take it all the same')")
+    page.click("#refused summary:text('Use it anyway')")
     # Its piece comes anew while it is read.
     page.evaluate(
         "() => apply({parts: {"
@@ -209,7 +209,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
         "() => apply({parts: {"
         "refused: byId('refused').innerHTML.replaceAll('another.bin', 'odd.bin')}})"
     )
-    page.click("#refused summary:text('Take it all the same')")
+    page.click("#refused summary:text('Use it anyway')")
     expect(page.locator("#refused")).to_contain_text("do not look like a program for the device")
     page.click("#waive-2-go")  # not without the tick
     expect(page.locator("#waive-2-risk:invalid")).to_be_visible()

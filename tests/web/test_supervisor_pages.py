@@ -11,7 +11,9 @@ import pytest
 
 from flasher.station.certificate_check import check_certificate
 from flasher.station.records.model import Measurement, RunState, StepState
+from flasher.translation import NAMES
 from flasher.web.server import Server
+from tests.loops import each
 from tests.station.factory import Bench
 from tests.web.answering import app_of
 from tests.web.barriers import barriers
@@ -38,9 +40,10 @@ def plant() -> Iterator[Bench]:
             bench.make(RunState.PASS, serial, lot=f"L{number}")
         run_id = bench.claim("W2605009", lot=LONG, reason=LONG).run_id
         bench.work(run_id)
-        out = Measurement("voltage", 29.0, "V", 30.0, 42.0)
+        found = [Measurement("voltage", 29.0, "V", 30.0, 42.0)]
+        found += (Measurement("bms model", text="W" * size) for size in range(1, 41, 3))
         bench.store.step(
-            run_id, "check", StepState.FAIL, duration_s=0.5, text=LONG, measurements=[out]
+            run_id, "check", StepState.FAIL, duration_s=0.5, text=LONG, measurements=found
         )
         bench.store.finish(run_id, bench.ending(RunState.FAIL, "LIMIT"))
         yield bench
@@ -142,3 +145,20 @@ def test_a_printed_certificate_is_checked(
     changed = page.pdf(format="A4", prefer_css_page_size=True, display_header_footer=has_edges)
     (problem,) = check_certificate(plant.store, changed).problems
     assert "Batterz36" in problem
+
+
+@each("language", NAMES)
+def test_no_word_of_a_measurement_breaks_on_a_phone(tab: Tab, url: str, language: str) -> None:
+    page = tab.page
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.goto(f"{url}units?serial=W2605009&lang={language}")
+    broken = page.evaluate(
+        """() => [...document.querySelectorAll("tr.measured td")].filter((cell) => {
+          const range = document.createRange();
+          range.selectNodeContents(cell);
+          const lines = new Set([...range.getClientRects()].map((each) => Math.round(each.top)));
+          return !/\\s/.test(cell.textContent.trim()) && lines.size > 1;
+        }).map((cell) => cell.textContent)"""
+    )
+    assert page.locator("tr.measured").count()
+    assert broken == []

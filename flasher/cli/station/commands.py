@@ -1,5 +1,6 @@
-"""`flasher station`: options of its actions. The actions are in modules beside this one, imported
-only when called: they need the extra `station`.
+"""`flasher station`: options of its actions, which are in modules beside this one.
+
+Those need the extra `station` and are imported when called.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def _path_option(*names: str, **more: Any) -> Decorator:
 
 @dataclass(frozen=True)
 class RecordsOptions:
-    """Location of the records."""
+    """Options for the location of the records."""
 
     database: Annotated[str | None, option(
         "--database", metavar="FILE|URL", panel="records", brief=True,
@@ -174,7 +175,7 @@ _WRITTEN: Final = "files to write"
 
 @dataclass(frozen=True)
 class PagesOptions:
-    """Access to the pages, and their language."""
+    """Options of the pages: access and language."""
 
     web_password: Annotated[Path | None, _path_option(
         "--web-password", panel=_PAGES,
@@ -210,7 +211,7 @@ def check(output: Output, recipe: Path, sockets: Path | None) -> int:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Settings of a station's run."""
+    """Options of `flasher station run`."""
 
     recipe: Annotated[Path, _path_option(
         "--recipe", required=True, help="the recipe (TOML): steps, images and limits of a unit",
@@ -308,7 +309,7 @@ def pin(output: Output) -> int:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Selection of runs, and the files to write."""
+    """Options of a report: which runs, and the files to write."""
 
     lot: Annotated[str | None, option(
         "--lot", metavar="NAME", panel=_WHICH, brief=True, help="runs of this lot",

@@ -40,7 +40,7 @@ class CheckedTargetDocument:
     version: str
     """Empty when neither image nor manifest has one."""
     required: str
-    """Required verification, in words."""
+    """Required verification level, in words."""
 
 
 @dataclass(frozen=True)
@@ -58,45 +58,45 @@ class StationCheckDocument:
 
 @dataclass(frozen=True)
 class FindingsDocument:
-    """Problems of an invalid recipe; part of the error."""
+    """Problems of a recipe, as details of the error."""
 
     findings: list[RecipeFindingDocument]
 
 
 @dataclass(frozen=True)
 class FiguresDocument:
-    """The figures of runs. They exclude golden units."""
+    """Figures of runs, without golden units."""
 
     runs: int
     units: int
-    """Units with at least one run that ended in PASS or FAIL."""
+    """Number of units with a run that ended in PASS or FAIL."""
     passed: int
     first_passed: int
-    """Units whose first such run is a PASS."""
+    """Number of units whose first such run is a PASS."""
     yield_share: float | None
     """From 0 to 1; null without units."""
     first_pass_share: float | None
     by_state: dict[str, int]
     failures: dict[str, int]
-    """Runs that ended in another state than PASS, by code."""
+    """Number of runs that ended without PASS, by code."""
     duration_median_s: float | None
-    """Of runs that passed."""
+    """Median over runs that passed."""
     duration_longest_s: float | None
     virtual_runs: int
-    """Runs of virtual units, which are counted above too; none of them made a product."""
+    """Number of runs of virtual units, included in the counts above."""
 
 
 @dataclass(frozen=True)
 class StationRunDocument:
-    """Result of a station's run."""
+    """Result of `flasher station run`."""
 
     station: str
     recipe: str
     revision: str
     records: str
-    """Path or URL of the records; empty for virtual units whose records were not kept."""
+    """Path or URL of the records; "" for temporary records of virtual units."""
     is_complete: bool
-    """False when it was ended before all scans, or virtual units, were done."""
+    """False if the station ended before all scans, or all virtual units, were done."""
     figures: FiguresDocument | None
     """null when they cannot be read."""
     units: list[RunEnded]
@@ -122,12 +122,12 @@ class UnitTraceDocument:
     """null when it cannot be read."""
     text: str
     story: Story | None
-    """With --story."""
+    """Only with --story."""
 
 
 @dataclass(frozen=True)
 class UnitDocument:
-    """The whole history of a unit."""
+    """A unit with all its runs."""
 
     unit: UnitLife
     traces: list[UnitTraceDocument]
@@ -139,14 +139,14 @@ class RoleDocument:
 
     name: str
     may: str
-    """"add" or "read": adds and reads records, or only reads them."""
+    """"add" (adds and reads records) or "read"."""
     is_new: bool
-    """True for a user created by this command, which has no password yet."""
+    """True for a user that this command created, which has no password yet."""
 
 
 @dataclass(frozen=True)
 class StationRolesDocument:
-    """Users who received rights."""
+    """Database users that received rights."""
 
     records: str
     roles: list[RoleDocument]
@@ -169,7 +169,7 @@ class SigningKeyDocument:
 
 @dataclass(frozen=True)
 class AcceptedDocument:
-    """A person's decision that lets the station continue."""
+    """Decision of a person that lets the station continue."""
 
     station: str
     what: str
@@ -177,7 +177,7 @@ class AcceptedDocument:
 
 @dataclass(frozen=True)
 class PinDocument:
-    """The hash of a PIN that was typed, for the badge table."""
+    """Hash of a typed PIN, for the badge table."""
 
     pin: str
 
@@ -198,7 +198,7 @@ DOCUMENTS: Final = (
     Upgraded,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
-"""The events of a station, which are printed while it runs."""
+"""Events that a station prints as JSON lines."""
 
 
 def figures_document(figures: Figures) -> FiguresDocument:

@@ -1,6 +1,4 @@
-"""Maintenance of records: `flasher station backup`, `verify`, `key`, `accept`, `upgrade`,
-`roles`.
-"""
+"""`flasher station backup`, `verify`, `key`, `accept`, `upgrade`, `roles`: maintains records."""
 
 from __future__ import annotations
 
@@ -36,7 +34,7 @@ ELSEWHERE: Final = "heads stored elsewhere"
 
 
 def _open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
-    """Open the records for the one station that the options or the records name."""
+    """Open the records as the station in the options, or as their only station."""
     place = records_of(records)
     name = place.station
     if name is None:
@@ -96,9 +94,7 @@ def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> i
 
 
 def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
-    """Format problems, one on each line. Problems of the schema come first; those with the same
-    cause share a line.
-    """
+    """Format problems as lines: first those of the schema; equal problems share a line."""
     schema, others = "schema, ", []
     alike: dict[str, list[str]] = {}
     for each in problems:
@@ -233,7 +229,7 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
 
 
 def roles(output: Output, records: RecordsOptions, station_role: str, reader_role: str) -> int:
-    """Also creates missing records, since a station has no right to create tables."""
+    """Also creates missing records, since a station may not create tables."""
     place = records_of(records)
     location = locate(place.url, Path())
     check_roles(location, station_role, reader_role)

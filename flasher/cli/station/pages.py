@@ -1,5 +1,6 @@
-"""Serves the pages of a station: operator and supervisor pages for `flasher station run --web`,
-supervisor pages only for `flasher station pages`; and controls access to them.
+"""Serves the pages of a station, and controls access to them.
+
+`flasher station run --web` serves all pages, `flasher station pages` those of supervisors.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _LOG: Final = logging.getLogger("flasher.web")
 
 
 class OperatorView:
-    """Passes the events of a station to the operator page; called in the station's thread."""
+    """Passes events of a station to the operator page, in the station's thread."""
 
     def __init__(self, screen: Screen, station: Station, board: Board) -> None:
         self._screen = screen
@@ -70,7 +71,7 @@ class OperatorView:
         self._board = board
         self._lot = ""
         self._good: dict[str, bool] = {}
-        """Units of the lot by serial number: True when the last run passed."""
+        """Units of the lot by serial number; True if the last run passed."""
 
     def show(self, event: StationEvent) -> None:
         """Show an event that the board has applied."""
@@ -79,7 +80,7 @@ class OperatorView:
         self._screen.show(event, self._board)
 
     def turn(self) -> None:
-        """Update the operator and the lot; called once in each turn of the station's loop."""
+        """Update operator and lot; called in each turn of the station's loop."""
         line, board = self._station.line, self._board
         rule = self._station.recipe.recipe
         if rule.lot.quantity_max and line.lot != self._lot:
@@ -234,7 +235,7 @@ def served(
 
 
 def _hosts(address: Address) -> set[str]:
-    """Names by which a browser may call this server."""
+    """Host names of this server."""
     hosts = {address.host, *LOOPBACK, "[::1]"}
     if address.host not in LOOPBACK:
         hosts |= {socket.gethostname(), socket.getfqdn(), f"[{address.host}]"}
@@ -246,7 +247,7 @@ def _hosts(address: Address) -> set[str]:
 def _check_open(
     options: PagesOptions, address: Address, *, has_password: bool, has_tls: bool
 ) -> None:
-    """Raises UsageError for pages that other computers could reach without TLS or password."""
+    """Raises UsageError for pages that other computers can reach without TLS or password."""
     if address.host in LOOPBACK:
         return
     if not (has_tls or options.web_insecure):
@@ -291,9 +292,7 @@ def _password(options: PagesOptions) -> str:
 
 
 def kept_secret(key_locations: KeyLocations) -> str:
-    """Read the secret that signs the cookies of the pages from a file of this user; create the file
-    if it is missing. Raises UsageError.
-    """
+    """Read the secret that signs cookies; create its file if missing. Raises UsageError."""
     path: Path = key_locations.keys_folder / "pages.secret"
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

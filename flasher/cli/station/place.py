@@ -1,4 +1,4 @@
-"""Finds the records and the operator from the options."""
+"""Opens the records that the options describe."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
 
 _READER: Final = "report"
-"""Station name of a reader, which claims no units."""
+"""Station name for opening records that are only read."""
 
 
 @dataclass(frozen=True)
 class RecordsPlace:
-    """Location of the records, with its settings."""
+    """The records' URL and settings, from the options."""
 
     url: str
     """A file, or an SQLAlchemy URL."""
@@ -30,7 +30,7 @@ class RecordsPlace:
     lock_timeout_s: float
     key_locations: KeyLocations
     station: str | None
-    """The station's name, if the options give its file."""
+    """Name of the station, if the options include a station file."""
 
     def open(
         self,
@@ -54,7 +54,7 @@ class RecordsPlace:
 
 
 def records_of(options: RecordsOptions) -> RecordsPlace:
-    """Location of the records in the options. Raises UsageError."""
+    """Settings of the records from the options. Raises UsageError."""
     config = load_config(options.sockets) if options.sockets is not None else None
     database, files, keys, heads = options.database, options.files, options.keys, options.heads
     if config is None:
@@ -81,7 +81,7 @@ def open_to_read(options: RecordsOptions) -> Store:
 
 
 def the_station(names: tuple[str, ...]) -> str:
-    """The only station of the records. Raises UsageError if they have none or several."""
+    """The only station of the records. Raises UsageError for none or several."""
     if len(names) != 1:
         listed = ", ".join(map(printable, names)) or "none"
         raise UsageError(
@@ -92,7 +92,7 @@ def the_station(names: tuple[str, ...]) -> str:
 
 
 def operator_of(named: str | None) -> str:
-    """The named operator, else the user of the computer."""
+    """The given name, or the login of the user."""
     try:
         return named or getpass.getuser()
     except (OSError, KeyError):

@@ -1,4 +1,4 @@
-"""`flasher station report` and `unit`: read the records, also while a station runs."""
+"""`flasher station report` and `unit`: read the records, even while a station runs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
 
 
 def _moment(text: str | None, option: str) -> datetime | None:
-    """Parse a time, local unless it has a time zone. Raises UsageError."""
+    """Parse a time; it is local without a time zone. Raises UsageError."""
     if text is None:
         return None
     try:
@@ -101,7 +101,7 @@ def _moment(text: str | None, option: str) -> datetime | None:
 
 
 def _certificates(folder: Path, report: Report, store: Store, output: Output) -> int:
-    """Write a certificate for each unit. Returns the number of units that got none, because their
+    """Write a certificate for each unit. Returns the number of units without one, because their
     records were changed.
     """
     option = "--certificates"
@@ -133,7 +133,7 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
 
 
 def certificate(store: Store, life: UnitLife) -> bytes:
-    """Render the certificate of a unit. Raises UnprovenError when its records were changed."""
+    """Render the certificate of a unit. Raises UnprovenError if its records were changed."""
     from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
     proof = proven(store, life)
@@ -205,9 +205,7 @@ def figure_lines(figures: Figures) -> Iterator[str]:
 def unit_lines(
     life: UnitLife, stories: Mapping[RunId, Sequence[Story | str]], *, full: bool
 ) -> Iterator[str]:
-    """Format all runs of a unit. `stories`: for each run the stories of its traces, or texts why
-    there is none.
-    """
+    """Format all runs of a unit. `stories`: explanations of its traces, or reasons for none."""
     nature = ", a VIRTUAL unit, no product" if life.is_virtual else ""
     yield printable(f"{life.serial}, part {life.part}: {life.state.value}{nature}")
     for details in life.runs:

@@ -1,4 +1,4 @@
-"""`flasher station run`: runs a station and shows its events, until its scans are used up."""
+"""`flasher station run`: runs a station and shows its events."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ if TYPE_CHECKING:
 LAUNCH: Launch = ProcessPort
 """Starts the process of a socket; tests replace it."""
 END_LIMIT_S: Final = 10.0
-"""Time for stopped runs to end; runs that take longer are INTERRUPTED at the next start."""
+"""Time limit for aborted runs; runs that take longer are INTERRUPTED at the next start."""
 WAIT_LEFT_S: Final = 4.0
-"""How long a label waits for its unit after the last scan."""
+"""Time that a label waits for its unit after the last scan."""
 RETURN_LIMIT_S: Final = 10.0
-"""Time within which an exchanged virtual unit is put in again."""
+"""Time limit for the return of an exchanged virtual unit."""
 _LEAVE_S: Final = 2.0
-"""How long the verdict on a virtual unit is shown."""
+"""Time for which the verdict on a virtual unit is shown."""
 
 
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
@@ -121,8 +121,8 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 def _find_sockets(
     options: RunOptions, file: Path | None
 ) -> tuple[StationConfig, tuple[Resolved, ...]]:
-    """The station file or virtual station of the options, with the adapters of its sockets. Raises
-    UsageError, and BusError for a missing adapter.
+    """Station settings from the station file or for virtual units, with the sockets' adapters.
+    Raises UsageError, BusError for a missing adapter.
     """
     if file is not None and options.mock_sockets is None:
         config = load_config(file)
@@ -160,7 +160,7 @@ def _find_sockets(
 
 
 def _is_temporary(options: RunOptions, records: RecordsOptions) -> bool:
-    """True for virtual units without --database."""
+    """True for virtual units without --database, whose records are temporary."""
     return options.mock_sockets is not None and records.database is None
 
 
@@ -168,10 +168,7 @@ def _is_temporary(options: RunOptions, records: RecordsOptions) -> bool:
 def _opened_records(
     options: RunOptions, records: RecordsOptions, config: StationConfig, output: Output
 ) -> Iterator[Store]:
-    """Open the records; temporary ones for virtual units without --database.
-
-    Raises UsageError, RecordError.
-    """
+    """Open the records of the options, or temporary ones. Raises UsageError, RecordError."""
     if not _is_temporary(options, records):
         with records_of(records).open(config.name, report=output.progress) as store:
             yield store
@@ -195,7 +192,7 @@ class _Session:
     config: StationConfig
     is_virtual: bool
     is_temporary: bool
-    """The records are deleted afterwards."""
+    """True if the records are deleted at the end."""
     station: Station = field(init=False)
     file: ScanFile | None = None
     _pipe: LineReader | None = None
@@ -203,16 +200,16 @@ class _Session:
     _was_submitted: bool = False
     _is_used_up: bool = False
     _busy_at: float = 0.0
-    """When a socket was last busy, in monotonic seconds."""
+    """Time at which a socket was last busy, in monotonic seconds."""
     _used_up_at: float = 0.0
-    """When the last scan was submitted, in monotonic seconds."""
+    """Time at which the last scan was submitted, in monotonic seconds."""
     _failure: FlasherError | None = None
     _page: OperatorView | None = None
     _is_begun: bool = False
 
     @property
     def scans_itself(self) -> bool:
-        """True when the station scans the labels of its virtual units itself."""
+        """True if the station scans the labels of its virtual units automatically."""
         options = self.options
         by_hand = options.scan_by_hand or self.crew is not None or bool(self.config.scanner)
         return self.is_virtual and options.scans is None and not by_hand
@@ -220,9 +217,7 @@ class _Session:
     # -- at work ----------------------------------------------------------------------------------
 
     def work(self) -> None:
-        """Run the station until its scans are used up or it is stopped. Raises RecordError when it
-        cannot start.
-        """
+        """Run the station until its scans are used up or it is stopped. Raises RecordError."""
         try:
             with ExitStack() as stack:
                 stopped = stack.enter_context(stop_on_signal(self._first_stop, self._second_stop))
@@ -234,7 +229,7 @@ class _Session:
             self._failure = _stopped_now()
 
     def _open_page(self, stack: ExitStack) -> None:
-        """Serve the pages with --web. Raises UsageError."""
+        """Serve the pages if --web is given. Raises UsageError."""
         address = self.options.web
         if address is None:
             return
@@ -259,7 +254,7 @@ class _Session:
             self._page.show(event)
 
     def turn(self) -> None:
-        """Refresh the view; called once in each turn of the station's loop."""
+        """Refresh the view; called in each turn of the station's loop."""
         if not self._is_begun:
             self._is_begun = True
             if (page := self.view.board.page) and not isinstance(self.view, Table):
@@ -272,7 +267,7 @@ class _Session:
             self._page.turn()
 
     def _open_scans(self, stack: ExitStack) -> None:
-        """Open all sources of scans: scanners, keyboard or pipe. Raises UsageError."""
+        """Open the scanners and the keyboard or pipe. Raises UsageError."""
         for scanner in scanners_of(self.config, self.station):
             stack.enter_context(scanner)
         if sys.stdin is None:
@@ -302,7 +297,7 @@ class _Session:
         self.view.refresh()
 
     def _is_over(self, *, is_stopped: bool) -> bool:
-        """True when the station has to end; called once in each turn, in the station's thread."""
+        """True if the station has to end; called in each turn of its loop."""
         if is_stopped:
             return True
         try:
@@ -334,7 +329,7 @@ class _Session:
         return self._is_used_up
 
     def _drop_what_waits(self) -> None:
-        """Drop cards and labels that still wait for a unit some time after the last scan."""
+        """Drop cards and labels that wait too long for a unit after the last scan."""
         now = self.station.clock.monotonic_s()
         is_starting = any(socket.is_starting for socket in self.station.line.sockets.values())
         if self.scans_itself or is_starting or not self._was_submitted:
@@ -343,7 +338,7 @@ class _Session:
             self.station.drop_waiting()
 
     def _check_sockets(self) -> None:
-        """Raises BusError when no socket will ever work again."""
+        """Raises BusError if no socket can work any more."""
         broken = self.view.board.broken
         if broken.keys() >= self.station.line.sockets.keys():
             name, reason = next(iter(broken.items()))
@@ -364,7 +359,7 @@ class _Session:
     # -- summary ----------------------------------------------------------------------------------
 
     def report(self) -> int:
-        """Print the summary; returns the exit code."""
+        """Print the summary and return the exit code."""
         board = self.view.board
         code = ExitCode.PARTIAL if board.bad_units or self._not_done() else ExitCode.OK
         self.output.results(self._summary())
@@ -387,9 +382,7 @@ class _Session:
         return code
 
     def _not_done(self) -> list[str]:
-        """Labels without a run: refused labels of the file, or those of standard input that still
-        waited at its end.
-        """
+        """Labels without a run: refused ones of a file, or those of a pipe that still waited."""
         refused = {
             each.text
             for each in self.view.board.refused

@@ -1,6 +1,7 @@
-"""Sources of scans for a running station: keys of a terminal (scanners act as keyboards), lines of
-a pipe, or a file whose labels are submitted when units wait for them. A thread reads keys and
-lines, and only passes them on.
+"""Sources of scans for a running station: keys of a terminal, lines of a pipe, or a file.
+
+Scanners act as keyboards. The labels of a file are submitted when units wait for them. Threads read
+keys and lines, and only pass them on.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from flasher.station.scans import Label, ScanCommand, Word, understand
 from flasher.station.socket import Socket
 
 _ESCAPES: Final = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
-"""Escape sequences of arrows and other keys that type no character."""
+"""Escape sequences of keys that type no character, such as arrows."""
 _BACK: Final = "\x08\x7f"
 _CLEAR: Final = "\x15\x03"
 """Ctrl-U."""
@@ -60,10 +61,10 @@ def read_scans(path: Path) -> list[str]:
 
 
 class ScanFile:
-    """Submits the scans of a file. A label goes to the socket that a command before it names, else
-    to the next socket with a waiting unit; a virtual unit gets its own label if the file has it.
+    """Submits the scans of a file, without a time limit for units.
 
-    Labels wait for units without a time limit.
+    A label goes to the socket of the command before it, or else to the next socket with a waiting
+    unit; a virtual unit gets its own label if the file has it.
     """
 
     def __init__(
@@ -90,11 +91,11 @@ class ScanFile:
         self._left = deque(scans)
         self._submit = submit
         self._again: Counter[str] = Counter()
-        """How often each label was submitted again."""
+        """Number of times that each label was submitted again."""
 
     @property
     def is_used_up(self) -> bool:
-        """True when every scan was submitted."""
+        """True if every scan was submitted."""
         return not self._left
 
     def turn(
@@ -162,7 +163,7 @@ class ScanFile:
 
 
 class Typing:
-    """Builds lines from keys. `text` is the unfinished line."""
+    """Builds lines from keys; `text` is the unfinished line."""
 
     def __init__(self, submit: Submit) -> None:
         self.text = ""
@@ -183,7 +184,7 @@ class Typing:
 
 
 class LineReader:
-    """Reads the lines of a pipe, and submits each as a scan."""
+    """Reads lines from a pipe and submits each as a scan."""
 
     def __init__(self, stream: TextIO, submit: Submit) -> None:
         self.is_at_end = False
@@ -207,9 +208,7 @@ class LineReader:
 
 @contextmanager
 def keyboard(typing: Typing) -> Iterator[None]:
-    """Read keys from the terminal into `typing` while the block runs, without echo. Restores the
-    terminal afterwards.
-    """
+    """Read keys of the terminal without echo while the block runs; restores the terminal."""
     ended = threading.Event()
     reader = _windows_keys if os.name == "nt" else _posix_keys
     with reader(typing, ended) as work:

@@ -26,7 +26,7 @@ from flasher.station.station import Station
 def crew_of(
     options: RunOptions, config: StationConfig, serial_number: SerialNumberRule
 ) -> Crew | None:
-    """The people of the badge table; None without a table. Raises UsageError."""
+    """People of the badge table; None without a table. Raises UsageError."""
     table = options.badges or (Path(config.badges) if config.badges else None)
     if table is None:
         return None
@@ -41,7 +41,7 @@ def crew_of(
 
 
 def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | None:
-    """The label printer; None without one. Raises UsageError."""
+    """Label printer of the station file; None without one. Raises UsageError."""
     label = config.label
     if label is None:
         return None
@@ -54,7 +54,7 @@ def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | Non
 
 
 def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
-    """The scanners that the station reads directly. Raises UsageError."""
+    """Scanners of the station file. Raises UsageError."""
     needs = {"serial": any(each.port for each in config.scanner)}
     needs["evdev"] = not all(each.port for each in config.scanner)
     missing = [name for name, is_needed in needs.items() if is_needed and not find_spec(name)]
@@ -79,7 +79,7 @@ def pin(output: Output) -> int:
 
 
 def _typed(prompt: str) -> str:
-    """Read a line without echo; from a pipe its first line."""
+    """Read a line without echo from a terminal, or the first line of a pipe."""
     if sys.stdin is None or not sys.stdin.isatty():
         return "" if sys.stdin is None else sys.stdin.readline().strip()
     try:

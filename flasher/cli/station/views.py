@@ -1,7 +1,7 @@
-"""Views of `flasher station run`: a live table, a line of text for each event, JSON lines.
+"""Views of `flasher station run`: a live table, lines of text, or JSON lines.
 
-Text from outside enters the table as `Text`, which is never parsed as markup. A state has a colour
-and a word. The widths of columns do not depend on their content, so the table does not move.
+External text enters the table as `Text`, which is never parsed as markup. A state has a colour and
+a word. Column widths do not depend on content, so the table does not move.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flasher.station.events import LineStopped, SocketState, StationEvent
 from flasher.station.records.model import Figures
 
 WIDE: Final = 140
-"""Width of the terminal from which the instruction is in the row, not below it."""
+"""Terminal width from which the instruction is in the row instead of below it."""
 REFRESH_S: Final = 0.1
 """Minimum time between two refreshes of the table."""
 _STYLES: Final = {
@@ -46,7 +46,7 @@ _STYLES: Final = {
 _LOUD: Final = frozenset(
     {SocketState.FAIL, SocketState.RECHECK, SocketState.ERROR, SocketState.SCAN}
 )
-"""States in which a person has to act."""
+"""States in which the operator has to act."""
 _STATE_WIDTH: Final = max(map(len, SocketState)) + 2
 _Column = tuple[int | None, int | None]
 _COLUMNS: Final[Sequence[_Column]] = ((None, 6), (None, _STATE_WIDTH), (6, None), (5, None))
@@ -54,26 +54,26 @@ _COLUMNS: Final[Sequence[_Column]] = ((None, 6), (None, _STATE_WIDTH), (6, None)
 _PROGRESS: Final[_Column] = (None, 13)
 _WHAT_TO_DO: Final[_Column] = (6, None)
 _HEAD_LINES: Final = 2
-"""Title and head."""
+"""Number of lines for title and column names."""
 _REPLY_LINES: Final = 3
 """Lines for the reply to the last scan."""
 _HIGH: Final = 20
-"""Windows of fewer lines have one line for it."""
+"""Minimum height for these reply lines; lower windows have one."""
 _KEYS: Final = "Ctrl-C: no further unit; twice: stop now"
 
 
 class View:
-    """Applies the events of the station to the board, and shows them."""
+    """Applies events to the board and shows them."""
 
     def __init__(self, output: Output) -> None:
         self.output = output
         self.board = Board()
         self.typed: str | None = None
-        """Text of the scan line; None when scans are not typed."""
+        """Text in the scan line; None if scans are not typed."""
 
     @contextmanager
     def on_screen(self) -> Iterator[None]:
-        """Context of a running view; the table takes over the screen."""
+        """Context in which the view is active; the table then uses the whole screen."""
         yield
 
     def __call__(self, event: StationEvent) -> None:
@@ -82,10 +82,10 @@ class View:
         self.show(event)
 
     def show(self, event: StationEvent) -> None:
-        """Show an event that the board has applied."""
+        """Show an event after the board has applied it."""
 
     def refresh(self, *, at_once: bool = False) -> None:
-        """Draw again if `at_once`, or `REFRESH_S` after the last time."""
+        """Draw if `at_once` is true or `REFRESH_S` has passed."""
 
 
 class JsonLines(View):
@@ -96,7 +96,7 @@ class JsonLines(View):
 
 
 class Lines(View):
-    """Prints a line of text for each event that the operator needs."""
+    """Prints a line of text for each event that concerns the operator."""
 
     def show(self, event: StationEvent) -> None:
         for line in _words(event):
@@ -144,9 +144,8 @@ class Table(View):
 
 
 def draw(board: Board, console: Console, typed: str | None = "") -> RenderableType:
-    """Draw the board to fit the console: a row for each socket, with its instruction on a line
-    below if there is room, and totals at the bottom. `typed`: text of the scan line so far; None:
-    no scan line.
+    """Draw the board to fit the console: a row for each socket, with its instruction below if there
+    is room, and totals. `typed`: text in the scan line; None: no scan line.
     """
     width, height = console.size
     foot = _foot(board, typed, width, height)
@@ -226,7 +225,7 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
 
 
 def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
-    """Format reason and remedy of a stopped line; when they are too long, the reason is cut."""
+    """Format reason and remedy of a stopped line; a long reason is shortened."""
     remedy = printable(f"{stop.remedy} Then scan RESUME.")
     reason = printable(f"LINE STOPPED  {stop.code}: {stop.reason}")
     lines = textwrap.wrap(f"{reason} {remedy}", width)
@@ -242,7 +241,7 @@ def _cut(line: str, style: str = "") -> Text:
 
 
 def percent(share: float | None) -> str:
-    """Format a share from 0 to 1, rounded down: 100 % only if all."""
+    """Format a share from 0 to 1 as a percentage, rounded down: 100 % only for 1."""
     if share is None:
         return "-"
     return f"{int(share * 1000) / 10:g} %"

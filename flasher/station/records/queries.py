@@ -197,7 +197,7 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
     run, unit = content["run"], content["unit"]
     begun_s, ended_s = run["begun_monotonic_s"], run["ended_monotonic_s"]
     images = {each["id"]: each for each in content["artifacts"] if each is not None}
-    # What is no number is refused below.
+    # Other values than numbers are refused below.
     has_numbers = all(isinstance(each, int | float) for each in (begun_s, ended_s))
     facts = {
         **{name: unit[name] for name in ("serial", "part")},

@@ -33,12 +33,12 @@ function apply(message) {
 }
 
 async function send(path, body) {
-  const said = byId("said");
-  said.textContent = "";
+  const notice = byId("message");
+  notice.textContent = "";
   try {
     return await post(path, body);
   } catch (error) {
-    said.textContent = document.body.dataset[`said${error.message}`] ?? document.body.dataset.said;
+    notice.textContent = document.body.dataset[`message${error.message}`] ?? document.body.dataset.message;
   }
 }
 

@@ -17,7 +17,6 @@ const SHAPES = {
 const TONES = { pass: [660, 880], fail: [220, 160], recheck: [440, 330], error: [220, 160] };
 const REFUSED = [330, 330, 330];
 const tiles = new Map();
-const said = new Map();
 let audio = null;
 let isFirst = true;
 
