@@ -372,6 +372,7 @@ class Bench:
             raise Unsupported("the bench has no readback")
         if source != BY_BUS:
             stored = self.subject.readback()[: len(image)]
+            self.tester.forgive_stall()
             pairs = enumerate(zip(stored, image, strict=False))
             at = next((at for at, (one, other) in pairs if one != other), len(stored))
             return None if at == len(image) else at
@@ -397,11 +398,13 @@ class Bench:
     def power_off(self) -> None:
         """Switch the device off. Raises Unsupported."""
         self.subject.power(on=False)
+        self.tester.forgive_stall()
         self.is_off = True
 
     def power_on(self) -> None:
         """Switch the device on. Raises Unsupported."""
         self.subject.power(on=True)
+        self.tester.forgive_stall()
         self.is_off = False
 
     def power_cycle(self, off_s: float = 0.5) -> None:

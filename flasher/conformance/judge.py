@@ -40,6 +40,8 @@ class Judge:
         self.checks: list[Check] = []
         self.measurements: list[MeasuredTime] = []
         self.infos: list[str] = []
+        self.stall = ""
+        """How this program stalled in the wait of the first failed check; "" when it did not."""
         self._tester = tester
         self._step = ""
         self._stimuli = self._heard = self._unanswered = 0
@@ -217,6 +219,9 @@ class Judge:
         self._record(outcome, expected, f"{_spread(values_s)} +- {unsure_s * 1000:.1f} ms")
 
     def _record(self, outcome: CheckOutcome, expected: str, got: str) -> None:
+        is_first = all(check.outcome is not CheckOutcome.FAIL for check in self.checks)
+        if outcome is CheckOutcome.FAIL and is_first and self._tester.stalled_s:
+            self.stall = f"this program stalled for {self._tester.stalled_s * 1000:.0f} ms"
         self.checks.append(Check(self._step, outcome, expected, got, self._tester.elapsed_s))
 
 

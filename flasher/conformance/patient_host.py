@@ -66,10 +66,13 @@ class PatientHost:
         if not self._encoder.has_version_query:
             raise Unsupported("the document has no version query for this target")
         tester, kind = self._tester, Reply.VERSION_INFORMATION
-        deadline, unanswered = tester.now + within_s, 0
-        while tester.now < deadline:
+        deadline, unanswered, is_last = tester.now + within_s, 0, False
+        while not is_last:
+            # One that starts at the end of its limit answers the last query.
+            is_last = tester.now >= deadline
             tester.send(self._encoder.query_version())
-            reply = tester.wait_for(kind, within_s=min(every_s, deadline - tester.now))
+            left_s = every_s if is_last else min(every_s, deadline - tester.now)
+            reply = tester.wait_for(kind, within_s=left_s)
             if reply is None:
                 unanswered += 1
                 continue

@@ -37,7 +37,9 @@ class CaseVerdict(Enum):
     DEVIATION = "deviation"
     """Failed in the way that the profile documents."""
     INCONCLUSIVE = "inconclusive"
-    """The uncertainty of a measurement exceeds the margin."""
+    """The uncertainty of a measurement exceeds the margin, no stimulus was heard, or two runs
+    differ.
+    """
     NOT_RUN = "not_run"
     """The run ended before it."""
     ERROR = "error"
@@ -323,8 +325,13 @@ class RunReport:
             return False
         if self.strict and (self.resolved_deviations or self.count(CaseVerdict.PASS_IN_PART)):
             return False
+        # A case that failed in one of two runs is inconclusive, and no reason to be content.
         bad = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN)
-        return not any(result.verdict in bad for result in self.results)
+        unsure = CaseVerdict.INCONCLUSIVE
+        return not any(
+            result.verdict in bad or (result.verdict is unsure and result.counts.failed)
+            for result in self.results
+        )
 
     @property
     def headline(self) -> str:

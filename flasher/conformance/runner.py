@@ -7,7 +7,7 @@ the case and lists the rest as not run.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Final, NamedTuple
 
@@ -219,6 +219,16 @@ class SuiteRun:
         if self.stopped:
             return self._add(CaseResult(case.id, CaseVerdict.NOT_RUN, repeat, note=self.stopped))
         self._observer.case_began(case, repeat)
+        result, stall = self._run_once(case, repeat)
+        if result.verdict is CaseVerdict.FAIL and stall and not self.stopped:
+            again, _ = self._run_once(case, repeat)
+            result = _of_two_runs(result, again, stall)
+        return self._add(result)
+
+    def _run_once(self, case: Case, repeat: int) -> tuple[CaseResult, str]:
+        """Run a case and restore the device. Returns the result, and how this program stalled when
+        the case failed, or "".
+        """
         seed = f"{self._options.seed}/{case.id}/{repeat}"
         bench = Bench(
             self._subject,
@@ -239,23 +249,21 @@ class SuiteRun:
         is_known = case.id in self._profile.deviations
         if verdict is CaseVerdict.FAIL and is_known:
             verdict, note = CaseVerdict.DEVIATION, self._profile.deviations[case.id]
-        return self._add(
-            CaseResult(
-                case.id,
-                verdict,
-                repeat,
-                seed,
-                note,
-                tuple(checks),
-                tuple(bench.judge.measurements),
-                tuple(bench.judge.infos),
-                duration_s,
-                bench.tester.trace,
-                bench.tester.trace_dropped,
-                deviation_resolved=is_known
-                and verdict in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART),
-            )
+        result = CaseResult(
+            case.id,
+            verdict,
+            repeat,
+            seed,
+            note,
+            tuple(checks),
+            tuple(bench.judge.measurements),
+            tuple(bench.judge.infos),
+            duration_s,
+            bench.tester.trace,
+            bench.tester.trace_dropped,
+            deviation_resolved=is_known and verdict in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART),
         )
+        return result, bench.judge.stall
 
     def restore_after(self, what: str, bench: Bench, *, flash: bool) -> str:
         """Restore the device after a case or a user's test that used `bench`; flashes the good
@@ -380,3 +388,30 @@ class SuiteRun:
                 self._not_upgradable = done.reason
                 return RestoreResult("reset", done.reason)
         return done
+
+
+def _of_two_runs(first: CaseResult, second: CaseResult, stall: str) -> CaseResult:
+    """The result of a case that failed while this program stalled, and was run once more. Both are
+    in it; when they differ, neither counts.
+    """
+    failed = [
+        replace(check, step=", ".join(filter(None, ("first run", check.step))))
+        for check in first.checks
+        if check.outcome is not CheckOutcome.PASS
+    ]
+    checks = (*failed, *second.checks)
+    if second.verdict is first.verdict:
+        return replace(second, checks=checks, note=f"failed twice; in the first run {stall}")
+    got = (
+        f"first run: {first.verdict.text}, while {stall}; second run: {second.verdict.text}. "
+        "Run the case again on a computer that has less to do"
+    )
+    differs = Check("", CheckOutcome.INCONCLUSIVE, "the same result twice", got, second.duration_s)
+    return replace(
+        second,
+        verdict=CaseVerdict.INCONCLUSIVE,
+        note=got,
+        checks=(differs, *checks),
+        trace=first.trace,
+        trace_dropped=first.trace_dropped,
+    )

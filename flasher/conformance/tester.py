@@ -120,6 +120,9 @@ class BusTester:
         self.left_at = self.began_at
         """End of the last frame sent."""
         self._stopped = stopped
+        self._stalled_s = 0.0
+        self._left_port_at = self.began_at
+        """When the port was last used."""
         self._decoder = DeviceDecoder(encoder)
         self._received: deque[Received] = deque(maxlen=_RECEIVED_LIMIT)
         self._trace: deque[TraceEntry] = deque(maxlen=TRACE_FRAMES)
@@ -151,6 +154,24 @@ class BusTester:
         while self.now < moment:
             self._pump(moment)
 
+    # -- stalls -----------------------------------------------------------------------------------
+
+    @property
+    def stalled_s(self) -> float:
+        """Longest time since the start of the last message for which this program neither sent nor
+        received although it was due to, beyond `Waits.stall_s`; 0 without one.
+        """
+        return self._stalled_s
+
+    def forgive_stall(self) -> None:
+        """What this program did since it last used the port takes its time, like a power switch."""
+        self._left_port_at = self.now
+
+    def _note_stall(self, since: float) -> None:
+        gap_s = self.port.now() - since
+        if gap_s > self.waits.stall_s:
+            self._stalled_s = max(self._stalled_s, gap_s)
+
     # -- sending ----------------------------------------------------------------------------------
 
     def send(
@@ -167,6 +188,7 @@ class BusTester:
         if at is not None:
             self.wait_until(at)
         began_at = self.now
+        self._stalled_s = 0.0
         raw = b"".join(frame.data for frame in frames if frame.can_id == self.encoder.to_device)
         if writes := len(_NO_READ.findall(raw)):
             self._feedback_due += writes
@@ -272,8 +294,12 @@ class BusTester:
             )
         if self._stopped():
             raise RunStopped("the run was stopped")
-        arrival = self.port.receive(min(deadline, self.ends_at, now + _POLL_S))
+        self._note_stall(self._left_port_at)
+        until = min(deadline, self.ends_at, now + _POLL_S)
+        arrival = self.port.receive(until)
+        self._left_port_at = self.port.now()
         if arrival is None:
+            self._note_stall(max(now, until))
             return
         frame, at, is_echo = arrival
         self._record(at, frame, sent=is_echo)
@@ -317,7 +343,11 @@ class BusTester:
     def _send_frame(self, frame: RawFrame) -> None:
         if frame.can_id == self.encoder.to_device and frame.data.startswith(_UPDATE_HEAD):
             self.update_was_sent = True
+        self._note_stall(self._left_port_at)
+        self._left_port_at = self.port.now()
         self.port.send(frame)
+        self._note_stall(self._left_port_at)
+        self._left_port_at = self.port.now()
         if self.port.echoes:
             self._echoes_due += 1
             return

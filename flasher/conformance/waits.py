@@ -18,6 +18,8 @@ _WINDOW_MAX_S: Final = 1.0
 _INCOMPLETE: Final = 2
 """A device waits for the rest of a message at most this many times the gap that it accepts."""
 _LATE_VERSION: Final = 4
+_STALL_LEAST_S: Final = 0.005
+"""A scheduler gives other programs about this much time."""
 _FRAME_BITS: Final = 135
 """Bits of an 8-byte frame with all possible stuff bits and the interframe space."""
 
@@ -41,10 +43,17 @@ class Waits:
         return (count - 1) * spacing_s + window_s
 
     @property
+    def stall_s(self) -> float:
+        """Shortest pause of this program that can make a device miss a message, or look late."""
+        limit = self._limit
+        windows_s = (limit("window_s") / 2, limit("version_spacing_tolerance_s"))
+        return max(min(limit("inter_frame_s"), *windows_s), _STALL_LEAST_S)
+
+    @property
     def next_version_s(self) -> float:
         """How long to wait for the next boot version of a burst; RS-01 judges its time."""
-        spacing_s = self._limit("version_spacing_s") + self._limit("version_spacing_tolerance_s")
-        return _LATE_VERSION * spacing_s
+        spacing_s, off_s = map(self._limit, ("version_spacing_s", "version_spacing_tolerance_s"))
+        return max(_LATE_VERSION * spacing_s, spacing_s + off_s)
 
     @property
     def settle_s(self) -> float:

@@ -17,11 +17,13 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import Any, ClassVar, Final, NamedTuple
 
 from flasher.conformance.catalogue import Selection
+from flasher.conformance.explore import Explorer
 from flasher.conformance.mock import MockSubject, profile_of_mock
-from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.profile import ConformanceProfile, Limits, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import AnyMessage, MockDevice
@@ -34,6 +36,7 @@ from flasher.protocol import messages
 from flasher.protocol.spec import TARGETS, WELLING, Command, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Reassembler
+from tests.campaigns.dual_bank import CopiesImage, SwapsBanks
 
 HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
@@ -135,7 +138,9 @@ class _SilentToShort(MockDevice):
 
 
 class AnswersLate(MockDevice):
-    """Sends each kind of answer only after this time, and none before an earlier one."""
+    """Sends each kind of answer only after this time, and none before an earlier one. Announcements
+    do not wait.
+    """
 
     late_s: ClassVar[Mapping[type[messages.UpgradeMessage], float]] = {}
     _at = 0.0
@@ -149,7 +154,14 @@ class AnswersLate(MockDevice):
         super()._handle(event, now)
 
     def _send(self, row: messages.UpgradeMessage) -> None:
-        due_at = max(self._at + self.late_s.get(type(row), 0.0), self._held_until)
+        late_s = self.late_s.get(type(row), 0.0)
+        # A bootloader that sends general feedback sends it at once (R15).
+        if isinstance(row, messages.GeneralFeedbackMessage) and self.state in _BOOTLOADER:
+            late_s = 0.0
+        if isinstance(row, messages.BootVersion):
+            super()._send(row)
+            return
+        due_at = max(self._at + late_s, self._held_until)
         if due_at > self._at:
             self._held.append((due_at, row))
         else:
@@ -187,6 +199,16 @@ class AnswersLate(MockDevice):
         self._due_at += max(0.0, self._held_until - now)
         return detail
 
+    def _complete_again(self, now: float) -> str:
+        # Nothing to check this time, when it has answered the first one.
+        if self.profile.repeated_end == "same_answer" and not self._held:
+            super()._send(messages.Complete())
+        return ""
+
+    def _start(self, now: float) -> str:
+        self._held.clear()
+        return super()._start(now)
+
 
 def answers_late(**late_s: float) -> type[AnswersLate]:
     """A device that sends these messages late: `answers_late(Nak=0.4)`."""
@@ -223,6 +245,18 @@ _BEHAVIOURS: Final[tuple[tuple[type[MockDevice], dict[str, Value]], ...]] = (
     (_SilentToShort, {}),
     (FillerChecked, {"tx_08": "rejected"}),
 )
+
+
+class AsksBeyondTheEnd(MockDevice):
+    """Answers a packet after the last one by NAK with the number after the last one."""
+
+    def _answer_bad(self, now: float) -> str:
+        transfer = self._transfer
+        if transfer.stored == transfer.total and self.profile.bad_packet != "silence":
+            return self._reply(messages.Nak(transfer.total + 1), now)
+        return super()._answer_bad(now)
+
+
 _FRAMINGS: Final[tuple[tuple[type[Reassembler], dict[str, Value]], ...]] = (
     (ShortFrameEnds, {"fr_01": "rejected"}),
     (HeaderAtFrameStart, {"fr_02": "lost"}),
@@ -230,6 +264,9 @@ _FRAMINGS: Final[tuple[tuple[type[Reassembler], dict[str, Value]], ...]] = (
 )
 """What a device may do, with what a profile says of it."""
 
+
+_LIMITS: Final = Limits()
+_ON_BUS_S: Final = 0.012
 
 # -- a device by its seed --------------------------------------------------------------------------
 
@@ -256,7 +293,9 @@ class RightDevice(NamedTuple):
         )
 
     def __str__(self) -> str:
-        kinds = [kind.__name__ for kind in self.device_type.__mro__[1:] if kind.__name__[0] == "_"]
+        mro = self.device_type.__mro__
+        kinds = [kind.__name__ for kind in mro[1 : mro.index(MockDevice)]]
+        late_s = {kind.__name__: s for kind, s in getattr(self.device_type, "late_s", {}).items()}
         framing = [kind.__name__ for kind in self.device_type.reassembler_type.__mro__[:-2]]
         default = DeviceProfile()
         choices = {
@@ -265,15 +304,20 @@ class RightDevice(NamedTuple):
             if value != getattr(default, key, value)
         }
         bench = "bare bench" if self.is_bare else "full bench"
-        return f"{self.target}, {bench}, {kinds}, {framing}, {self.timings}, {choices}"
+        return f"{self.target}, {bench}, {kinds}, {framing}, {self.timings}, {late_s}, {choices}"
 
 
-def right_device(seed: int) -> RightDevice:
-    """The device of that seed."""
+def right_device(seed: int, *, at_limits: bool = False) -> RightDevice:
+    """The device of that seed; with `at_limits` many of its times are at their limits, and it may
+    have two banks.
+    """
     chance = random.Random(f"right/{seed}")
     target = chance.choice(("bms", "bms", "bms", "bms", "wmc", "obc"))
     choices = _choices(chance)
     behaviours = [one for one in _BEHAVIOURS if chance.random() < 0.25]
+    if at_limits:
+        choices, more = _strained(choices, random.Random(f"limits/{seed}"))
+        behaviours += more
     framings = [one for one in _FRAMINGS if chance.random() < 0.25]
     framing = type("Framing", (*(kind for kind, _ in framings), Reassembler), {})
     kinds = tuple(kind for kind, _ in behaviours if kind is not MockDevice)
@@ -284,6 +328,9 @@ def right_device(seed: int) -> RightDevice:
         "boot_version_spacing_s": round(chance.uniform(0.046, 0.054), 4),
         "inter_frame_timeout_s": round(chance.uniform(0.1, 0.18), 3),
     }
+    if at_limits:
+        spacing_s = random.Random(f"spacing/{seed}").choice((0.042, 0.05, 0.058))
+        timings["boot_version_spacing_s"] = spacing_s
     fitting = dict(profile_of_mock(choices).given)
     for _, given in (*behaviours, *framings):
         fitting |= given
@@ -292,6 +339,8 @@ def right_device(seed: int) -> RightDevice:
         "device.application_bytes": choices.application_area_bytes,
         "device.largest_image_bytes": choices.image_limit_bytes,
     }
+    if choices.transfer_timeout_s < _LIMITS.pause_s:
+        sizes["limits.pause_s"] = choices.transfer_timeout_s
     only_power = (choices.pause_in_transfer, choices.reset_in_transfer, choices.update_in_transfer)
     is_bare = chance.random() < 0.3 and only_power != ("waits", "ignored", "ignored")
     profiles = {
@@ -337,12 +386,70 @@ def _choices(chance: random.Random) -> DeviceProfile:
     return DeviceProfile(**picked)
 
 
+def _strained(
+    choices: DeviceProfile, chance: random.Random
+) -> tuple[DeviceProfile, list[tuple[type[MockDevice], dict[str, Value]]]]:
+    """Put times of a device to the ends of the default profile's limits, and add what it may do."""
+
+    def drawn(limit_s: float, used_s: float = 0.0) -> float:
+        """Nothing, anything, or the limit but for the time of an answer on a loaded bus."""
+        left_s = max(limit_s - used_s - _ON_BUS_S, 0.0)
+        return round(chance.choice((0.0, chance.random() * left_s, left_s)), 4)
+
+    bank = chance.choice((None, None, SwapsBanks, CopiesImage))
+    pages = choices.application_area_bytes // choices.page_size_bytes
+    packets = choices.application_area_bytes // 128
+    program_s, erase_s = drawn(_LIMITS.ack_s), drawn(_LIMITS.erase_s)
+    window_s = chance.choice((0.0525, 0.2, 0.995))
+    burst_s = 3 * 0.058 + window_s
+    copying_s = 0.0
+    if bank is CopiesImage:  # twice: once more after the power was cut
+        program_s, erase_s = min(program_s, 0.4 / packets), min(erase_s, 0.4)
+        copying_s = erase_s + (packets + 3) * program_s + erase_s
+    restarts = bank is CopiesImage or choices.after_complete == "restarts"
+    start_s = drawn(_LIMITS.start_s, copying_s + (burst_s if restarts else 0.0))
+    changed = dataclasses.replace(
+        choices,
+        window_s=window_s,
+        reset_delay_s=drawn(_LIMITS.first_version_s, _LIMITS.feedback_s + copying_s),
+        transfer_timeout_s=chance.choice((2.5, _LIMITS.pause_s, 9.0)),
+        refused_hold_s=drawn(_LIMITS.refused_s),
+        start_delay_s=start_s,
+        after_complete="restarts" if restarts else "starts",
+        erase_time_s=erase_s / (pages + 1),
+        program_time_s=program_s,
+    )
+    late = answers_late(
+        GeneralFeedbackMessage=drawn(_LIMITS.feedback_s),
+        RequestTransfer=drawn(_LIMITS.erase_s, erase_s),
+        Ack=drawn(_LIMITS.ack_s, program_s),
+        Nak=drawn(_LIMITS.ack_s),
+        Complete=drawn(_LIMITS.complete_s, program_s),
+    )
+    found: list[tuple[type[MockDevice], dict[str, Value]]] = [(late, {})]
+    if chance.random() < 0.5:
+        found.append((CountsFromPackets, {}))
+    if chance.random() < 0.25:
+        found.append((AsksBeyondTheEnd, {}))
+    if bank is not None:
+        found.append((bank, {"rs_03_old": "kept"}))
+    return changed, found
+
+
 # -- the run ---------------------------------------------------------------------------------------
 
 
-def faults_of(seed: int, selection: Selection = Selection()) -> list[str]:  # noqa: B008  frozen
-    """What the suite holds against the device of that seed: nothing, as it is right."""
-    device = right_device(seed)
+def faults_of(
+    seed: int,
+    selection: Selection = Selection(),  # noqa: B008  frozen
+    *,
+    at_limits: bool = False,
+    steps: int = 0,
+) -> list[str]:
+    """What the suite, and `steps` of random walks, find wrong with the device of that seed. It is
+    right, so anything found is a fault of the suite.
+    """
+    device = right_device(seed, at_limits=at_limits)
     found: list[str] = []
     for name, profile in device.profiles.items():
         subject = MockSubject(device.target, profile=device.choices, make_device=device.make)
@@ -357,6 +464,11 @@ def faults_of(seed: int, selection: Selection = Selection()) -> list[str]:  # no
         ]
         if report.final_image != "verified":
             found.append(f"{seed} {name}: the good image at the end: {report.final_image}")
+        explored = Explorer(subject, profile, seed=str(seed)).explore(steps) if steps else None
+        if explored is not None and (explored.finding or explored.stopped):
+            finding = explored.finding
+            text = f"{finding.text} ({' '.join(finding.steps)})" if finding else explored.stopped
+            found.append(f"{seed} {name} explore: {text}")
     return found
 
 
@@ -366,14 +478,26 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=500, help="how many devices (500)")
     parser.add_argument("--seed", type=int, default=1, help="number of the first one (1)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
+    parser.add_argument("--plain", action="store_true", help="no times at their limits")
+    parser.add_argument("--steps", type=int, default=0, help="steps of random walks (0)")
+    parser.add_argument("--cases", default="", help="only these cases, separated by commas")
     options = parser.parse_args(words)
+    cases = tuple(filter(None, options.cases.split(",")))
+    judge = partial(
+        faults_of,
+        selection=Selection(cases=cases),
+        at_limits=not options.plain,
+        steps=options.steps,
+    )
     began, bad = time.perf_counter(), 0
     seeds = range(options.seed, options.seed + options.count)
     with ProcessPoolExecutor(options.jobs) as pool:
-        for seed, faults in zip(seeds, pool.map(faults_of, seeds), strict=True):
+        for seed, faults in zip(seeds, pool.map(judge, seeds), strict=True):
             bad += bool(faults)
             if faults:
-                sys.stdout.write("\n".join([*faults, f"  {right_device(seed)}", ""]))
+                sys.stdout.write(
+                    "\n".join([*faults, f"  {right_device(seed, at_limits=not options.plain)}", ""])
+                )
                 sys.stdout.flush()
     took_s = time.perf_counter() - began
     sys.stdout.write(

@@ -22,10 +22,10 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants.ending import RecordErasedLast
 from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
-from flasher.protocol import messages
 from tests.campaigns.dual_bank import CopiesImage, SwapsBanks
 from tests.campaigns.right_devices import (
     HELD,
+    AsksBeyondTheEnd,
     CountsFromPackets,
     ListensAfterBurst,
     RefusesByNak,
@@ -118,19 +118,9 @@ def test_a_restart_of_the_bootloader_may_take_as_long_as_one_of_the_application(
     assert blamed("RS-02", device=device, given={"rs_02": choice}) == []
 
 
-class _AsksBeyondTheEnd(MockDevice):
-    """Answers a packet after the last one by NAK with the number after the last one."""
-
-    def _answer_bad(self, now: float) -> str:
-        transfer = self._transfer
-        if transfer.stored == transfer.total:
-            return self._reply(messages.Nak(transfer.total + 1), now)
-        return super()._answer_bad(now)
-
-
 @each("step", ("packet-beyond", "packet-skip", "packet-total", "packet-zero"))
 def test_a_nak_after_all_packets_may_name_any_number(step: str) -> None:
-    explorer = Explorer(subject(_AsksBeyondTheEnd), profile_of_mock(), seed="1")
+    explorer = Explorer(subject(AsksBeyondTheEnd), profile_of_mock(), seed="1")
     walk = ["reset", "update=384", "packets=all", step, step]
     assert explorer.replay(walk).finding is None
 

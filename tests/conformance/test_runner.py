@@ -14,10 +14,11 @@ from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Re
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import completed, to_bytes
-from flasher.conformance.results import CaseVerdict, Unsupported
+from flasher.conformance.results import CaseVerdict, CheckOutcome, Unsupported
 from flasher.conformance.runner import SuiteOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
+from flasher.mock.model import MockDevice
 from flasher.mock.store import AREA_START
 from tests.loops import each
 
@@ -472,3 +473,81 @@ def test_the_trace_keeps_the_newest_frames_and_counts_the_others(
     result = one(run_case(talks), "FR-00")
     assert [entry.frame.data[0] for entry in result.trace] == list(range(15, 25))
     assert result.trace_dropped == 15
+
+
+# -- stalls of this program ------------------------------------------------------------------------
+
+
+def _stand_still(bench: Bench, for_s: float) -> None:
+    """Let time pass while the suite does nothing."""
+    bus, until = bench.subject.port.bus, bench.now + for_s  # type: ignore[attr-defined]
+    while bench.now < until:
+        bus.advance(until)
+
+
+class _Stalls:
+    """A case that sends packet 1, and stands still for 0.3 s in it in its first `times` runs."""
+
+    def __init__(self, times: int) -> None:
+        self.runs = 0
+        self._times = times
+
+    def __call__(self, bench: Bench) -> None:
+        self.runs += 1
+        image = bench.filler(10)
+        bench.start_transfer(len(image))
+        port, send = bench.subject.port, bench.subject.port.send
+        stalls_due = [self.runs <= self._times]
+
+        def stalling(frame: RawFrame) -> None:
+            send(frame)
+            if stalls_due.pop() if stalls_due else False:
+                _stand_still(bench, 0.3)
+
+        vars(port)["send"] = stalling
+        try:
+            bench.packet(image, 1)
+        finally:
+            del vars(port)["send"]
+
+
+class _NeverAcknowledges(MockDevice):
+    def _acknowledge(self, now: float) -> str:
+        self._transfer.stored += 1
+        return ""
+
+
+def test_a_failure_while_this_program_stalled_is_run_again_and_is_inconclusive() -> None:
+    case = _Stalls(times=1)
+    report = run_case(case)
+    result = one(report, "FR-00")
+    assert result.verdict is CaseVerdict.INCONCLUSIVE
+    assert case.runs == 2
+    assert "first run: fail, while this program stalled for 300 ms" in result.note
+    assert "second run: pass" in result.note
+    failed = [check.step for check in result.checks if check.outcome is CheckOutcome.FAIL]
+    assert failed == ["first run"]
+    assert not report.ok
+
+
+def test_a_failure_in_both_runs_is_a_failure() -> None:
+    case = _Stalls(times=2)
+    result = one(run_case(case), "FR-00")
+    assert result.verdict is CaseVerdict.FAIL
+    assert case.runs == 2
+    assert "failed twice" in result.note
+
+
+def test_a_failure_without_a_stall_is_not_run_again() -> None:
+    case = _Stalls(times=0)
+    result = one(run_case(case, device=subject(_NeverAcknowledges)), "FR-00")
+    assert result.verdict is CaseVerdict.FAIL
+    assert case.runs == 1
+
+
+def test_a_stall_that_harms_nothing_is_not_run_again() -> None:
+    def stalls_before(bench: Bench) -> None:
+        _stand_still(bench, 0.3)
+        bench.check_application()
+
+    assert one(run_case(stalls_before), "FR-00").verdict is CaseVerdict.PASS
