@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from flasher.conformance.bench import Bench
+from flasher.conformance.bench import QUIET_S, Bench
 from flasher.conformance.cases.tx import check_out_of_turn, transfer_image
 from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
 from flasher.conformance.wire import END, WRITE, Received, Reply, describe, packet_count, version_in
@@ -76,7 +76,7 @@ def end_early_and_twice(bench: Bench) -> None:
             # A NAK of any number (R6) and no other message.
             bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
             bench.judge.note_stimulus(heard=True)
-            bench.expect_silence(bench.limit("ack_s"), ignoring=(Reply.BOOT_VERSION,))
+            bench.expect_silence(QUIET_S, ignoring=(Reply.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
             reply = bench.wait_for(Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
             if str(reply) == f"ACK {stored + 1}":
@@ -122,7 +122,8 @@ def _restart_transfer(
 def _check_second_end(bench: Bench, first_answer: Reply) -> None:
     """Send end of transfer again, immediately after its answer, and check the second answer."""
     bench.send(bench.encoder.end())
-    replies = bench.collect(bench.limit("ack_s"))
+    reply = bench.wait_for(*_UPGRADE_KINDS, within_s=bench.limit("complete_s"))
+    replies = [] if reply is None else [reply, *bench.collect(QUIET_S)]
     answers = [one for one in replies if one.kind in _UPGRADE_KINDS]
     # A running application may send general feedback to an unknown message (R17).
     silence: list[list[Reply]] = [[], [Reply.FEEDBACK]]

@@ -198,8 +198,8 @@ def _check_count(bench: Bench, count: int, expected: str, *others: int) -> None:
     """Check that exactly `count` boot versions, or one of `others` after a restart, and no other
     messages arrive until burst and window are over.
     """
-    restart_s = bench.limit("first_version_s")
-    replies = bench.collect(bench.waits.burst_s + (restart_s if others else restart_s / 4))
+    next_s = bench.limit("first_version_s") if others else bench.waits.next_version_s
+    replies = bench.collect(bench.waits.burst_s + next_s)
     wanted = " or ".join(map(str, (count, *others)))
     bench.check(_versions(replies) in (count, *others), f"{expected}: {wanted}", describe(replies))
     bench.check_only(replies, Reply.BOOT_VERSION, Reply.FEEDBACK, why="nothing but boot versions")

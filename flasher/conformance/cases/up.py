@@ -265,8 +265,8 @@ def _finish_requested(bench: Bench, choice: str) -> None:
     again at a second one (R16); `choice` says how many may come.
     """
     image, erase_s = bench.good_image, bench.limit("erase_s")
-    # It may erase again first; where it need not, wait no longer than the transfer lasts.
-    within_s = erase_s if choice == "each" else min(erase_s, bench.limit("pause_s") / 2)
+    # It may erase again first. Where it need not, a later request is met after packet 1.
+    within_s = erase_s if choice == "each" else bench.waits.settle_s
     again = bench.wait_for(*Reply, within_s=within_s, unlike=_is_version)
     replies = [] if again is None else [again]
     bench.check_only(replies, Reply.REQUEST, why="request transfer, or nothing")
