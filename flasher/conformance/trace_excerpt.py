@@ -53,11 +53,11 @@ def excerpt(result: CaseResult, messages: int, frames: int) -> Excerpt:
     many = messages * _FRAMES_A_MESSAGE
     if failure is not None:
         entries = [one for one in result.trace if one.at_s <= failure.at_s + _AFTER_S]
-        rows = _decoded(entries[-many:])[-messages:]
+        rows = decoded_rows(entries[-many:])[-messages:]
         text = f"up to the first failed check, {len(rows)} messages"
         shown = entries[-frames:]
     else:
-        found = _decoded(result.trace[:many])
+        found = decoded_rows(result.trace[:many])
         rows = found[:messages]
         whole = len(rows) == len(found) and len(result.trace) <= many
         text = f"{'all' if whole else 'the first'} {len(rows)} messages"
@@ -77,7 +77,7 @@ def frame_lines(frames: Sequence[TraceEntry]) -> Iterator[str]:
         yield f"{entry.at_s:10.6f} {way} {can_id} [{len(frame.data)}] {data}{kind}".rstrip()
 
 
-def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
+def decoded_rows(entries: Sequence[TraceEntry]) -> list[TraceRow]:
     """Decode the frames into messages, including bytes without a message."""
     decoder = Decoder()
     found: list[BusEvent] = []
@@ -100,7 +100,7 @@ def boot_versions(report: RunReport) -> tuple[str, ...]:
     found: dict[str, None] = {}
     for result in report.results:
         replies = [entry for entry in result.trace[:_FIRST_FRAMES] if not entry.sent]
-        for row in _decoded(replies):
+        for row in decoded_rows(replies):
             if row.seen.command == BOOT_VERSION:
                 found[" ".join(field.text for field in row.seen.fields)] = None
     return tuple(found)

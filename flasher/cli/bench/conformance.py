@@ -15,7 +15,12 @@ from typing import Annotated, Final
 import click
 
 from flasher.cli import values
-from flasher.cli.bench import conformance_explore, conformance_init, conformance_serve
+from flasher.cli.bench import (
+    conformance_explore,
+    conformance_init,
+    conformance_replay,
+    conformance_serve,
+)
 from flasher.cli.bench.conformance_bench import (
     OUTPUT_OPTIONS,
     bench_options,
@@ -26,6 +31,7 @@ from flasher.cli.bench.conformance_bench import (
 )
 from flasher.cli.bench.conformance_explore import explore
 from flasher.cli.bench.conformance_init import init
+from flasher.cli.bench.conformance_replay import replay
 from flasher.cli.bench.conformance_serve import serve
 from flasher.cli.bench.conformance_text import (
     ListedCase,
@@ -177,6 +183,7 @@ DOCUMENTS: Final = (
     ConformanceDocument, CaseListDocument, Difference, SideBySide, ProfileKeysDocument,
     HeaderDocument,
     *conformance_explore.DOCUMENTS, *conformance_init.DOCUMENTS, *conformance_serve.DOCUMENTS,
+    *conformance_replay.DOCUMENTS,
 )  # fmt: skip
 
 
@@ -591,4 +598,5 @@ def header(output: Output, *, folder: Path) -> int:
 
 conformance.add_command(explore, "explore")
 conformance.add_command(init, "init")
+conformance.add_command(replay, "replay")
 conformance.add_command(serve, "serve")

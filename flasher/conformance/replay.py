@@ -1,0 +1,154 @@
+"""Replays a recorded trace against a device, and compares what the device answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import SequenceMatcher
+from itertools import groupby
+from typing import Final
+
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.restore import restore
+from flasher.conformance.results import DeviceCrashed, RunStopped, TraceEntry
+from flasher.conformance.subject import Subject
+from flasher.conformance.trace_excerpt import decoded_rows
+from flasher.conformance.wire import RawFrame
+from flasher.errors import UsageError
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import TARGETS, Node, can_id
+from flasher.trace.decoder import Decoder
+
+_LIMITS: Final = ("first_version_s", "erase_s", "ack_s", "complete_s", "start_s")
+"""A slower device gets the longest of these times for the answers of the recorded one."""
+_TAIL_S: Final = 1.0
+"""Time after the last frame in which answers still count."""
+_POLL_S: Final = 0.2
+
+
+@dataclass(frozen=True)
+class ReplayDifference:
+    """A place at which the device did not answer as in the trace; one side may be empty."""
+
+    recorded: tuple[str, ...]
+    answered: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """A replayed trace."""
+
+    subject: str
+    frames_sent: int
+    messages_recorded: int
+    """Messages of the device in the trace; equal ones in a row count once."""
+    differences: tuple[ReplayDifference, ...]
+    trouble: str = ""
+    """Why the good image could not be flashed, or why the device stopped; empty for none."""
+
+
+def replay(
+    subject: Subject,
+    profile: ConformanceProfile,
+    frames: Sequence[tuple[float, Frame]],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+) -> ReplayResult:
+    """Flash the good image, send the tool's frames of a trace again at their times, and compare the
+    device's messages. Raises UsageError for a trace without a frame to the device, BusError, and
+    RunStopped.
+    """
+    target = TARGETS[subject.target]
+    answer_ids = {can_id(target.node, to) for to in (None, *Node) if to != target.node}
+    recorded = [
+        TraceEntry(at_s, frame.can_id == target.request_id, RawFrame(*frame[:5]))
+        for at_s, frame in frames
+        if frame.can_id == target.request_id or (frame.is_payload and frame.can_id in answer_ids)
+    ]
+    if not any(entry.sent for entry in recorded):
+        raise UsageError(
+            f"The trace has no frame to the {target.node.name}.",
+            remedy="Name the target with -t, or another trace.",
+        )
+    done = restore(subject, profile, flash=True, stopped=stopped)
+    if not done.ok:
+        trouble = f"the good image could not be flashed first: {done.reason}"
+        return ReplayResult(subject.name, 0, len(_messages(recorded)), (), trouble)
+    patience_s = max(map(profile.limit, _LIMITS))
+    player = _Player(subject, answer_ids, patience_s, stopped)
+    trouble = ""
+    try:
+        player.play(recorded)
+    except DeviceCrashed as crashed:
+        trouble = str(crashed)
+    done = restore(subject, profile, flash=True, stopped=stopped)
+    if not (trouble or done.ok):
+        trouble = f"the good image could not be flashed afterwards: {done.reason}"
+    before, after = _messages(recorded), _messages(player.answers)
+    matcher = SequenceMatcher(a=before, b=after, autojunk=False)
+    differences = tuple(
+        ReplayDifference(tuple(before[i:j]), tuple(after[m:n]))
+        for kind, i, j, m, n in matcher.get_opcodes()
+        if kind != "equal"
+    )
+    return ReplayResult(subject.name, player.frames_sent, len(before), differences, trouble)
+
+
+class _Player:
+    """Sends frames at their times, later where the device is slower than the recorded one."""
+
+    def __init__(
+        self,
+        subject: Subject,
+        answer_ids: set[int],
+        patience_s: float,
+        stopped: Callable[[], bool],
+    ) -> None:
+        self._port = subject.port
+        self._answer_ids = answer_ids
+        self._patience_s = patience_s
+        self._stopped = stopped
+        self._decoder = Decoder()
+        self._messages = 0
+        """Messages that the device has sent since the last frame to it."""
+        self.answers: list[TraceEntry] = []
+        self.frames_sent = 0
+
+    def play(self, recorded: Sequence[TraceEntry]) -> None:
+        late_s = self._port.now() - recorded[0].at_s
+        decoder, wanted = Decoder(), 0
+        for entry in recorded:
+            if not entry.sent:
+                wanted += len(decoder.feed(Frame(*entry.frame), entry.at_s))
+                continue
+            late_s += self._await(wanted, entry.at_s + late_s)
+            self._port.send(entry.frame)
+            self.frames_sent += 1
+            wanted = self._messages = 0
+        self._await(wanted, recorded[-1].at_s + late_s + _TAIL_S)
+
+    def _await(self, wanted: int, due_at: float) -> float:
+        """Receive until this time, and longer until the device has sent so many messages. Returns
+        how much longer.
+        """
+        give_up_at = due_at + self._patience_s
+        while (now := self._port.now()) < due_at or (self._messages < wanted and now < give_up_at):
+            if self._stopped():
+                raise RunStopped
+            until = due_at if now < due_at else give_up_at
+            arrival = self._port.receive(min(until, now + _POLL_S))
+            if arrival is None or arrival.is_echo:
+                continue
+            if arrival.frame.can_id in self._answer_ids:
+                self.answers.append(TraceEntry(arrival.at, False, arrival.frame))  # noqa: FBT003
+                self._messages += len(self._decoder.feed(Frame(*arrival.frame), arrival.at))
+        return max(0.0, self._port.now() - due_at)
+
+
+def _messages(entries: Sequence[TraceEntry]) -> list[str]:
+    """Texts of the device's messages; equal ones in a row once, as how often a device announces
+    itself depends on times.
+    """
+    rows = decoded_rows([entry for entry in entries if not entry.sent])
+    texts = (f"{row.seen.title} {row.text}".rstrip() for row in rows)
+    return [text for text, _ in groupby(texts)]
