@@ -98,6 +98,10 @@ class ListensAfterBurst(MockDevice):
         return BootloaderEvent.NO_CONCERN if is_deaf and event in updates else event
 
 
+class RefusesInBurst(RefusesByNak, ListensAfterBurst):
+    """Answers update commands between its announcements by NAK, too."""
+
+
 class _RequestsForEach(QueuesUpdates):
     """Erases and requests the transfer for each update command that comes before packet 1 (R25)."""
 

@@ -29,6 +29,7 @@ from tests.campaigns.right_devices import (
     CountsFromPackets,
     ListensAfterBurst,
     RefusesByNak,
+    RefusesInBurst,
     answers_late,
     faults_of,
     right_device,
@@ -116,6 +117,32 @@ def test_a_restart_of_the_bootloader_may_take_as_long_as_one_of_the_application(
         MOCK_PROFILE, reset_in_bootloader="restarts", reset_delay_s=delay_s
     )
     assert blamed("RS-02", device=device, given={"rs_02": choice}) == []
+
+
+@each("choice", ("either", "restarts"))
+@each("pause", ("announces", "waits"))
+def test_a_restart_in_a_transfer_may_take_longer_than_a_pause(choice: str, pause: Any) -> None:
+    device = dataclasses.replace(
+        MOCK_PROFILE,
+        reset_in_transfer="restarts",
+        reset_delay_s=4.0,
+        transfer_timeout_s=2.5,
+        pause_in_transfer=pause,
+    )
+    given: dict[str, Value] = {"tx_13": choice, "tx_12": "either"}
+    assert blamed("TX-13", device=device, given=given) == []
+
+
+def test_an_application_may_start_at_the_end_of_its_limit() -> None:
+    device = dataclasses.replace(MOCK_PROFILE, start_delay_s=4.99)
+    assert blamed("BR-01", "EN-01", "EN-02", "EN-07", device=device) == []
+
+
+def test_an_update_command_in_the_burst_may_be_answered_by_nak() -> None:
+    kind = type("Right", (RefusesInBurst, answers_late(Nak=0.3)), {})
+    given: dict[str, Value] = {"up_04_burst": "rejected", "up_02": "nak"}
+    device = dataclasses.replace(MOCK_PROFILE, window_s=0.9)
+    assert blamed("CR-04", "UP-02", "EN-01", "TX-13", kind=kind, device=device, given=given) == []
 
 
 @each("step", ("packet-beyond", "packet-skip", "packet-total", "packet-zero"))

@@ -518,10 +518,6 @@ def _waits(bench: Bench) -> None:
 def reset(bench: Bench) -> None:
     choice, image = bench.choice("tx_13"), transfer_image(bench)
     total = packet_count(len(image))
-    within_s = bench.limit("first_version_s")
-    if bench.choice("tx_12") != "waits":
-        # Later than that, the pause ends the transfer.
-        within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
     with bench.step("reset during the erase"):
         _reset_while_it_erases(bench)
     bench.start_transfer(len(image))
@@ -534,16 +530,42 @@ def reset(bench: Bench) -> None:
             if choice == "ignored":
                 bench.expect_silence(why="silence, no restart")
                 continue
-            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_restart_s(bench))
+            if reply is None and bench.limit("first_version_s") > _restart_s(bench):
+                reply = _restarts_later(bench, image, stored)
+                done += reply is None and stored < total
             if choice == "restarts":
+                within_s = bench.limit("first_version_s")
                 bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
             if reply is not None:
                 bench.update(len(image))
                 bench.packets(image, 1, stored)
-    bench.finish(image, total + 1)
+    bench.finish(image, min(done, total) + 1)
     with bench.step("a new upgrade"):
         bench.start_transfer(len(image))
         bench.finish(image)
+
+
+def _restart_s(bench: Bench) -> float:
+    """How long to wait for a restart: no longer than a transfer lasts without a packet."""
+    within_s = bench.limit("first_version_s")
+    if bench.choice("tx_12") == "waits":
+        return within_s
+    return min(within_s, _JUST_NOT * bench.limit("pause_s"))
+
+
+def _restarts_later(bench: Bench, image: bytes, stored: int) -> Received | None:
+    """Send what is next, to learn whether the device ignored a reset or is still restarting.
+    Returns its boot version, or None when it answers.
+    """
+    total, within_s = packet_count(len(image)), bench.limit("first_version_s")
+    number = min(stored + 1, total)  # a repetition when all are stored
+    bench.send_packet(image, number)
+    kinds = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
+    reply = bench.require_received(
+        bench.wait_for(*kinds, within_s=within_s), "an answer, or boot version", within_s
+    )
+    return reply if reply.kind is Reply.BOOT_VERSION else None
 
 
 def _reset_while_it_erases(bench: Bench) -> None:
@@ -560,16 +582,20 @@ def _reset_while_it_erases(bench: Bench) -> None:
     reply = bench.wait_for(Reply.REQUEST, Reply.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(reply, "request transfer, or boot version", within_s)
     restarts: Received | None = found
+    is_begun = False
     if found.kind is Reply.REQUEST and bench.choice("tx_13") != "ignored":
         # The device may process the reset after the erase; earlier boot versions do not count.
         restarts = bench.wait_for(
             Reply.BOOT_VERSION,
-            within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),
+            within_s=_restart_s(bench),
             unlike=lambda one: one.at < found.at + LEFTOVER_S,
         )
+        if restarts is None and bench.limit("first_version_s") > _restart_s(bench):
+            restarts = _restarts_later(bench, image, 0)
+            is_begun = restarts is None
     if restarts is not None and restarts.kind is Reply.BOOT_VERSION:
         bench.update(len(image))
-    bench.finish(image)
+    bench.finish(image, 2 if is_begun else 1)
 
 
 def _step_text(what: str, stored: int) -> str:
