@@ -1,6 +1,6 @@
 """Firmware upgrades for the Welling mid-drive e-bike system over CAN.
 
-The whole job:
+Upgrade a device:
 
     result = flasher.flash("firmware.hex", "bms", interface="socketcan", channel="can0")
     print(result.running_version)

@@ -1,4 +1,4 @@
-"""`python -m flasher`."""
+"""Command line: `python -m flasher`."""
 
 import sys
 

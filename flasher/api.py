@@ -1,4 +1,4 @@
-"""Public API: connections, the devices on them, and `flash`, the whole job in one call.
+"""Public API: connections to a bus, its devices, and `flash`, which upgrades a device in one call.
 
 `Device` blocks; `AsyncDevice` runs the same methods in a thread, for programs with an event loop.
 """
@@ -94,9 +94,9 @@ T = TypeVar("T")
 P = ParamSpec("P")
 C = TypeVar("C", bound=Content)
 _TURN_PAUSE_S: Final = 0.01
-"""Interval of checks whether another task's call has ended, and whether this one was cancelled."""
+"""Interval at which a call checks whether another one has ended, and whether it was cancelled."""
 _LOOP_GONE_S: Final = 5.0
-"""An event loop that does not handle an event for this long has ended."""
+"""Time without a handled event after which an event loop has ended."""
 
 
 # -- the bus --------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ class Connection:
     channel: str = ""
     """Channel of the adapter as in python-can; may be empty."""
     _turn: Lock = field(default_factory=Lock, init=False, repr=False, compare=False)
-    """Held by the current call: two at once would take each other's frames."""
+    """Held during a call: two at once would take each other's frames."""
 
     def device(
         self,
@@ -143,7 +143,7 @@ class Connection:
         is_alone: bool = False,
         **watch: Unpack[CallOptions],
     ) -> AsyncDevice:
-        """Same as `device`, for a program with an event loop."""
+        """Create a device for a program with an event loop; arguments as for `device`."""
         chosen = profile or _default_profile(target, dialect)
         return AsyncDevice(self, chosen, is_alone=is_alone, watch=watch)
 
@@ -155,8 +155,8 @@ class Connection:
             steps.listen_first()
 
     def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[CallOptions]) -> Survey:
-        """Listen for a second, then ask the BMS for its version and state; return the traffic of
-        all nodes. Raises BusError; InterruptedByUserError if cancelled.
+        """Listen for a second, then query version and state of the BMS; return the traffic of all
+        nodes. Raises BusError; InterruptedByUserError if cancelled.
         """
         with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
             return steps.scan()
@@ -183,7 +183,7 @@ def connect(
     dialect's unless `bus` itself names another one. The adapter is locked against other programs of
     this user that send as the tool: `holder` names this program to them; None does not lock, for
     programs that never send as the tool (a device model, a monitor). A program with `sends` False
-    can use an interface that only listens. Raises UsageError or BusError.
+    can use an interface in listen-only mode. Raises UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
     from flasher.bus.link import MonotonicClock  # noqa: PLC0415
@@ -201,7 +201,7 @@ def connect(
 async def aconnect(
     dialect: str | Dialect = "welling", *, holder: str | None = "a program", **bus: Any
 ) -> AsyncIterator[Connection]:
-    """`connect` without blocking an event loop while the adapter opens and closes."""
+    """Open an adapter like `connect`, without blocking the event loop."""
     import asyncio  # noqa: PLC0415  for programs that have it already
 
     opened = connect(dialect, holder=holder, **bus)
@@ -256,10 +256,10 @@ def connect_mock(
 def bit_rate(
     dialect: str | Dialect = "welling", *, fallback: Fallback | None = None, **bus: Any
 ) -> BitRate:
-    """Return the bit rate with which `connect` would open; same arguments. Opens nothing.
+    """Return the bit rate with which `connect` would open an adapter, without opening it.
 
-    Raises UsageError and BusError as `connect` does for a bit rate. Without a configured adapter it
-    is the one that `bus` or else the dialect names.
+    Raises UsageError for an invalid bit rate, BusError for one that differs from the dialect's.
+    Without a configured adapter it is the bit rate that `bus` or else the dialect names.
     """
     from flasher.bus import bit_rate as settling  # noqa: PLC0415  loads python-can
     from flasher.bus.opening import bus_config  # noqa: PLC0415
@@ -275,7 +275,7 @@ def bit_rate(
 
 
 class Device:
-    """A device on a bus, for blocking programs; created by `Connection.device`.
+    """Device on a bus, for blocking programs; created by `Connection.device`.
 
     Every method takes the keywords of `CallOptions`. It raises BusError if the adapter fails or
     another tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and
@@ -309,37 +309,37 @@ class Device:
     def identify(self, **watch: Unpack[CallOptions]) -> DeviceInfo:
         """Send all documented queries; only listen if there are none.
 
-        Silence is not an error: see `DeviceInfo.is_there`. Takes 12 s if a device sends but answers
-        nothing, 4 s if it is silent.
+        Silence is not an error: see `DeviceInfo.is_there`. Takes 12 s if a device sends but does
+        not answer, 4 s if it is silent.
         """
         with self._turn(watch) as steps:
             return steps.identify()
 
     def is_present(self, **watch: Unpack[CallOptions]) -> bool:
-        """True if it sends or answers anything. Sends only a version query; takes 5 s at most."""
+        """True if the device sends or answers. Sends only a version query; takes up to 5 s."""
         with self._turn(watch) as steps:
             return steps.is_present()
 
     def version(self, **watch: Unpack[CallOptions]) -> Content:
         """Return the version information, or the answer to the product's own version query. Raises
-        NoAnswerError if it does not answer or no query is known.
+        NoAnswerError if the device does not answer or has no version query.
         """
         with self._turn(watch) as steps:
             return steps.version()
 
     @overload
-    def read(self, what: type[C], **watch: Unpack[CallOptions]) -> C: ...
+    def read(self, item: type[C], **watch: Unpack[CallOptions]) -> C: ...
     @overload
-    def read(self, what: str, **watch: Unpack[CallOptions]) -> Content: ...
-    def read(self, what: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
+    def read(self, item: str, **watch: Unpack[CallOptions]) -> Content: ...
+    def read(self, item: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
         """Read an item by its name ("running-information"), or by the class of its content
         (`flasher.protocol.contents.RunningInformation`) if only one item has it. "model" and
         "serial-number" return the version information, which contains them.
 
-        Raises UsageError for an unknown item, NoAnswerError if it does not answer.
+        Raises UsageError for an unknown item, NoAnswerError if the device does not answer.
         """
         with self._turn(watch) as steps:
-            return steps.read(what)
+            return steps.read(item)
 
     def ask(self, request: Request, **watch: Unpack[CallOptions]) -> Content:
         """Send your own request. Raises NoAnswerError."""
@@ -347,10 +347,10 @@ class Device:
             return steps.ask(request)
 
     def read_memory(self, start: int, end: int, **watch: Unpack[CallOptions]) -> bytes:
-        """Read the bytes from address `start` up to `end`, exclusive (R5).
+        """Read memory from address `start` up to `end`, exclusive (R5).
 
         Raises UsageError for an impossible range or a target without a memory query, NoAnswerError
-        if a piece is not answered.
+        if a part of the range is not answered.
         """
         with self._turn(watch) as steps:
             return steps.read_memory(start, end)
@@ -394,13 +394,13 @@ class Device:
         in_session: bool = False,
         **watch: Unpack[CallOptions],
     ) -> Result:
-        """Upgrade it with an image file (or a loaded `Image`), and verify it.
+        """Upgrade the device with an image file (or a loaded `Image`), and verify it.
 
         `verify` is "none", "version" or "memory"; None chooses (`default_level`). `identity` None
-        uses the manifest next to the file, if any, and waives no check. With `in_session`, a device
-        that answers nothing gets an update command (R26), because an interrupted upgrade may have
-        left it waiting. Returns the result of a successful session, or of one that found nothing to
-        do; any other is raised as its FlasherError (see flasher.errors).
+        uses the manifest next to the file, if any, and waives no check. With `in_session`, a silent
+        device gets an update command (R26), because an interrupted upgrade may have left it in its
+        transfer. Returns the result of a successful session, or of one that found nothing to do;
+        raises any other as its FlasherError (see flasher.errors).
         """
         return self._carried_out(image, options, verify, identity, watch, in_session=in_session)
 
@@ -414,9 +414,9 @@ class Device:
         in_session: bool = False,
         **watch: Unpack[CallOptions],
     ) -> Result:
-        """`flash` for a device whose application does not run: wait until it announces its
-        bootloader at power-up, for `power_up_timeout_s` of the options, then upgrade it. With
-        `in_session`, first try to reach it as `flash` does.
+        """Upgrade a device whose application does not run: wait until it announces its bootloader
+        at power-up, for `power_up_timeout_s` of the options, then continue like `flash`. With
+        `in_session`, a silent device gets an update command first.
         """
         return self._carried_out(
             image, options, verify, identity, watch, in_session=in_session, at_power_up=True
@@ -434,9 +434,9 @@ class Device:
         """Run the upgrade alone and return its result, so that a failure can be examined instead of
         caught: only an adapter failure is raised.
 
-        `identity` sets the requirements: the device is identified and compared with them before
-        anything is written. Raises UsageError if the target or the image cannot be verified at this
-        level; BusError if the adapter fails, with the progress and the state of the device.
+        With `identity`, the device is identified and checked before anything is written. Raises
+        UsageError if the target or the image cannot be verified at this level; BusError if the
+        adapter fails, with the progress and the state of the device.
         """
         with self._turn(watch) as steps:
             return steps.upgrade(image, options, verify, identity)
@@ -444,14 +444,14 @@ class Device:
     def verify(
         self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[CallOptions]
     ) -> Verification:
-        """Check whether it runs this image, by the reported version or also by its memory.
-        Contradictions are in the result. Raises UsageError for an impossible level.
+        """Check whether the device runs an image, by its reported version or also by its memory.
+        The result lists contradictions. Raises UsageError for an impossible level.
         """
         with self._turn(watch) as steps:
             return steps.verify(image, as_level(level))
 
     def reset(self, **watch: Unpack[CallOptions]) -> None:
-        """Restart its application. Raises NoAnswerError if unconfirmed or not documented."""
+        """Restart the application. Raises NoAnswerError if unconfirmed or not documented."""
         with self._turn(watch) as steps:
             steps.reset()
 
@@ -562,12 +562,12 @@ class AsyncDevice:
     run = _in_thread(Device.run)
 
     @overload
-    async def read(self, what: type[C], **watch: Unpack[CallOptions]) -> C: ...
+    async def read(self, item: type[C], **watch: Unpack[CallOptions]) -> C: ...
     @overload
-    async def read(self, what: str, **watch: Unpack[CallOptions]) -> Content: ...
-    async def read(self, what: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
+    async def read(self, item: str, **watch: Unpack[CallOptions]) -> Content: ...
+    async def read(self, item: str | type[Content], **watch: Unpack[CallOptions]) -> Content:
         """Read an item; see `Device.read`."""
-        return await self._call(Device.read, what, **watch)
+        return await self._call(Device.read, item, **watch)
 
     async def _call(self, method: Callable[..., T], *args: object, **kwargs: Any) -> T:
         import asyncio  # noqa: PLC0415  for programs that have it already
@@ -606,7 +606,7 @@ class _LoopBridge:
     loop_is_gone: bool = False
 
     def is_cancelled(self) -> bool:
-        """Called in the thread."""
+        """True if task, loop or caller cancelled the call; called in the thread."""
         if self.task_is_cancelled or self.loop_is_gone or self.loop.is_closed():
             return True
         return self.cancelled is not None and self.cancelled()
@@ -667,11 +667,11 @@ class Job:
         return self
 
     def in_session(self) -> Job:
-        """Return this job for a device that may have been left in its session (R26)."""
+        """Return this job for a device that may still be in an earlier transfer (R26)."""
         return replace(self, options=replace(self.options, in_session=True))
 
     def run(self, device: Device, **watch: Unpack[CallOptions]) -> Result:
-        """Run it to its end, good or bad; see `Device.upgrade`."""
+        """Run the upgrade and return its result, a failure too; see `Device.upgrade`."""
         return device.upgrade(
             self.plan,
             options=self.options,
@@ -733,7 +733,7 @@ def flash(
     on_event: EventHandler | None = None,
     **bus: Any,
 ) -> Result:
-    """Do the whole job in one call: open the bus, `Device.flash`, close it.
+    """Upgrade a device in one call: open the bus, run `Device.flash`, close the bus.
 
     `bus` are python-can's keywords, as for `connect`; `mock` upgrades the built-in device model
     instead. An unusable image is refused before the bus is opened.
@@ -753,7 +753,7 @@ def flash(
 
 
 def _check_result(result: Result) -> Result:
-    """Return a good result; raise the error of any other."""
+    """Return a successful result; raise the error of any other."""
     error = result.error()
     if error is not None:
         raise error

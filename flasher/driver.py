@@ -1,4 +1,4 @@
-"""Driver loop: runs an engine on a link against a clock until it is done.
+"""Driver loop: runs a protocol engine on a CAN link against a clock until it is done.
 
 All waiting frames are received before `tick`, which gets the earlier time, so that a stall of the
 computer does not become a timeout of the device. Frames are sent one at a time, and the engine is
@@ -18,18 +18,18 @@ from flasher.protocol.frame import Frame
 MAX_WAIT_S: Final = 0.1
 """Maximum blocking receive, in real seconds; also the maximum delay of a cancellation."""
 STALL_S: Final = 0.25
-"""Minimum reported pause of the loop, in real seconds: half the time that a device has for an ACK
-(R12)."""
+"""Minimum pause of this computer that is reported, in real seconds: half the time that a device has
+for an ACK (R12)."""
 _CATCH_UP_FRAMES: Final = 10_000
 """Maximum number of frames received before a due `tick`: a babbling bus must not stop the
 timers."""
 
 
 class Tap(Protocol):
-    """Observes every frame in both directions."""
+    """Observer of every frame in both directions."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Process one frame; `now` is on the driver's clock."""
+        """Process a frame; `now` is on the driver's clock."""
         ...
 
 
@@ -52,7 +52,7 @@ def drive(
     cancel_seen = False
     came = None
     late_s = 0.0
-    """How late the last wait ended, plus the time of callbacks before it."""
+    """Delay of the end of the last wait, plus the time of callbacks before it."""
     while True:
         received_until = _receive_waiting(came, engine, link, clock, taps)
         sending_s = 0.0
@@ -93,7 +93,7 @@ def _receive_waiting(
     """Pass on a frame and all that wait after it, so that the next message sent does not look like
     their cause. Return the time up to which frames were received.
     """
-    now_of, hear, receive = clock.now, engine.receive, link.receive
+    now_of, process_frame, receive = clock.now, engine.receive, link.receive
     now = now_of()
     if frame is None:
         frame = receive(AT_ONCE)
@@ -102,7 +102,7 @@ def _receive_waiting(
             return now
         for tap in taps:
             tap(frame, sent=False, now=now)
-        hear(frame, now)
+        process_frame(frame, now)
         now = now_of()
         frame = receive(AT_ONCE)
     return now

@@ -1,4 +1,4 @@
-"""All errors of flasher, with exit codes and remedies.
+"""Exceptions with exit code, error code, likely cause and remedy; hiding of passwords.
 
 Each class has the exit code of the command line; each instance describes what happened, where
 (phase, packet), the likely cause, and the next step. Printing and exiting are left to the command
@@ -15,21 +15,21 @@ from enum import IntEnum, StrEnum
 from typing import ClassVar, Final, Self
 
 _PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
-"""Between the user and the last @ of a URL: a password may contain an @."""
+"""Matches from the user to the last @ of a URL: a password may contain an @."""
 _NO_PORT: Final = re.compile(r"(:/+[^\s:/@]*):(?!\d+\b|\*+@)[^\s/@]+")
-"""A port that is not a number: the host was omitted."""
+"""Matches a port that is not a number: a password of a URL without host."""
 _SECRET_NAME: Final = r"[\w-]*(?:password|passwd|passphrase|secret|token|api_?key)[\w-]*"  # noqa: S105  a pattern
 _SECRET: Final = re.compile(_SECRET_NAME, re.IGNORECASE)
 _IN_QUERY: Final = re.compile(rf"(?i)([?&]{_SECRET_NAME}=)[^\s&]*")
-"""In the query of a URL."""
+"""Matches a secret in the query of a URL."""
 _ARGUMENT: Final = re.compile(
     rf"(?i)(?<![\w?&-])({_SECRET_NAME}=)(?!\*\*\*['\")]*(?:[\s,]|$))(?:'[^']*'|\"[^\"]*\"|\S+?(?=['\"]?(?:\s|$)))"
 )
-"""In arguments: `--bus-kwargs password=X`, `Bus(password='X')`."""
+"""Matches a secret in arguments: `--bus-kwargs password=X`, `Bus(password='X')`."""
 _WORD: Final = re.compile(rf"(?is)((?:--[\w-]+=)?{_SECRET_NAME}=).*")
-"""A whole command-line argument with any value."""
+"""Matches a whole command-line argument with a secret."""
 _IN_DICT: Final = re.compile(rf"(?i)((['\"]){_SECRET_NAME}\2: )(?:'[^']*'|\"[^\"]*\"|[^\s,}}]+)")
-"""In a Python dictionary or in JSON."""
+"""Matches a secret in a Python dictionary or in JSON."""
 
 
 class ExitCode(IntEnum):
@@ -159,7 +159,7 @@ def is_secret(name: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """Escape everything but printable ASCII."""
+    """Escape all characters except printable ASCII."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -169,21 +169,21 @@ def printable(text: str) -> str:
 
 
 def _hidden(text: str) -> str:
-    """Replace passwords; a sentence without any stays translatable."""
+    """Replace passwords; a translatable sentence without any stays one."""
     hidden = hide_passwords(text)
     return text if hidden == text else hidden
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One problem in a file: "target[0].base cannot be -1."."""
+    """Problem in a file: "target[0].base cannot be -1."."""
 
     place: str
     """Key with its tables; "" for the whole file."""
     what: str
     remedy: str = ""
     alone: str = ""
-    """Message with its place, if it is the only fault; empty: as `sentence`."""
+    """Message with its place, for a file without other problems; empty: `sentence`."""
 
     @property
     def sentence(self) -> str:
@@ -219,21 +219,21 @@ class FlasherError(Exception):
         self.command = ""
         """Command that repairs the state, ready to be copied; "" without one."""
         self.needs_rescue = False
-        """A device was left without an application, or perhaps without one."""
+        """True if a device was left without an application, or perhaps without one."""
         self.waiver = ""
-        """Refusing check of flasher.host.waivers, if it can be waived."""
+        """Check of flasher.host.waivers that refused, if it can be waived."""
         self.faults: tuple[Fault, ...] = ()
-        """All problems of a file, for an error about one."""
+        """All problems of a file."""
 
     def with_faults(self, faults: Iterable[Fault]) -> Self:
-        """Return this error with these faults of a file."""
+        """Return this error with these problems of a file."""
         self.faults = tuple(faults)
         if self.code is ErrorCode.USAGE:
             self.code = ErrorCode.FILE_FAULTS
         return self
 
     def __str__(self) -> str:
-        """Whole message, one part per line."""
+        """Return the whole message, one part per line."""
         lines = [self.what]
         if self.where:
             lines.append(f"  where: {self.where}")

@@ -1,4 +1,4 @@
-"""Events reported during work: one frozen dataclass per kind.
+"""Events of upgrades, queries and the device model: one frozen dataclass per kind.
 
 Engines create them, the driver passes them on, and the caller (command line, station, program)
 decides which to show. Times are seconds on the engine's clock.
@@ -27,7 +27,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class PhaseEntered:
-    """The upgrade entered a phase; attempts count from 1."""
+    """An upgrade entered a phase; attempts count from 1."""
 
     phase: Phase
     attempt: int
@@ -43,15 +43,15 @@ class BootVersionSeen:
 
 @dataclass(frozen=True)
 class PowerCycleAwaited:
-    """The device must be switched off and on within this time."""
+    """The device must be switched off and on within `limit_s` seconds."""
 
     limit_s: float
 
 
 @dataclass(frozen=True)
 class CheckMade:
-    """A check before the first write: `check` is its name, `verdict` is "passed", "unknown"
-    (nothing to compare with), "warned", "waived", "refused" or "skipped", `text` is one sentence.
+    """Result of the check named `check` before the first write. `verdict` is "passed", "unknown"
+    (no value to compare with), "warned", "waived", "refused" or "skipped".
     """
 
     check: str
@@ -61,7 +61,7 @@ class CheckMade:
 
 @dataclass(frozen=True)
 class ShutdownHeard:
-    """The battery announces that it switches off (0x1308)."""
+    """The battery announced that it switches off (0x1308)."""
 
     sender: str
 
@@ -78,7 +78,7 @@ class ForeignQuery:
 @dataclass(frozen=True)
 class SecondToolAwaited:
     """Another tool writes to the device, which has no application any more; `seen` describes its
-    frame. Nothing is sent until it was silent for `quiet_s`; then the upgrade starts over.
+    frame. The upgrade starts over when that tool has been silent for `quiet_s` seconds.
     """
 
     seen: str
@@ -87,7 +87,7 @@ class SecondToolAwaited:
 
 @dataclass(frozen=True)
 class AdapterLost:
-    """The adapter failed; flasher tries to open it again for `wait_s`."""
+    """The adapter failed; flasher tries to open it again for `wait_s` seconds."""
 
     reason: str
     wait_s: float
@@ -95,7 +95,7 @@ class AdapterLost:
 
 @dataclass(frozen=True)
 class AdapterAwaited:
-    """The lost adapter has `left_s` seconds more to come back. Reported every second."""
+    """Seconds that the lost adapter has left to come back. Reported every second."""
 
     left_s: int
 
@@ -103,7 +103,7 @@ class AdapterAwaited:
 @dataclass(frozen=True)
 class BusBlocked:
     """The adapter's frames are not sent. The upgrade of a device without application keeps trying
-    for `limit_s`, until the overall deadline.
+    for `limit_s` seconds, until the overall deadline.
     """
 
     reason: str
@@ -117,7 +117,7 @@ class AdapterBack:
 
 @dataclass(frozen=True)
 class HostStalled:
-    """This computer paused the loop for `stalled_s` longer than intended."""
+    """This computer paused the driver loop for `stalled_s` seconds."""
 
     stalled_s: float
 
@@ -133,7 +133,7 @@ class PacketAcknowledged:
 
 @dataclass(frozen=True)
 class MessageRepeated:
-    """A message is sent again; `what` names it, `reason` is one word."""
+    """A message is sent again; `what` names it, `reason` is a `flasher.host.table.Reason`."""
 
     what: str
     reason: str
@@ -142,7 +142,7 @@ class MessageRepeated:
 
 @dataclass(frozen=True)
 class Reported:
-    """Unexpected observation that does not stop the upgrade; one sentence."""
+    """Unexpected observation that does not stop the upgrade; `what` is one sentence."""
 
     what: str
 
@@ -150,7 +150,7 @@ class Reported:
 @dataclass(frozen=True)
 class UpgradeLeftOpen:
     """The upgrade begun at `at` with `image` has no end (`has_end` False), or may have left the
-    device without an application. If the device stays silent, it may still be in that session, and
+    device without an application. If the device stays silent, it may still be in that transfer, and
     gets an update command (R26).
     """
 
@@ -161,7 +161,7 @@ class UpgradeLeftOpen:
 
 @dataclass(frozen=True)
 class AttemptStarted:
-    """The transfer starts over; attempts count from 1. `left_s` is the time until the overall
+    """The upgrade starts over; attempts count from 1. `left_s` is the time until the overall
     deadline if only that limits the attempts, else 0.
     """
 
@@ -175,7 +175,7 @@ class AttemptStarted:
 
 @dataclass(frozen=True)
 class QueryAnswered:
-    """The device answered; `content` is the answer (a `flasher.protocol.fields.Content`)."""
+    """The device answered a query; `content` is a `flasher.protocol.fields.Content`."""
 
     title: str
     content: object
@@ -184,7 +184,7 @@ class QueryAnswered:
 
 @dataclass(frozen=True)
 class QueryUnanswered:
-    """The device did not answer within the time allowed."""
+    """The device did not answer a query in time, after `tries` transmissions."""
 
     title: str
     tries: int
@@ -217,7 +217,7 @@ class MemoryRead:
 
 @dataclass(frozen=True)
 class BytesDamaged:
-    """Received bytes on a CAN id that are not a message."""
+    """Received bytes of a CAN id that are not a message."""
 
     can_id: int
     reason: str
@@ -255,7 +255,7 @@ class ImageStored:
 
 @dataclass(frozen=True)
 class DeviceReported:
-    """The device model refused or ignored something; one sentence."""
+    """The device model refused or ignored a message; `what` is one sentence."""
 
     what: str
 
@@ -271,7 +271,7 @@ class DeviceWritten:
 
 @dataclass(frozen=True)
 class ShutdownAnnounced:
-    """The BMS model announces that it switches off, and why."""
+    """The BMS model announces that it switches off, and the reason."""
 
     why: str
 

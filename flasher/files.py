@@ -20,13 +20,13 @@ from typing import Any, Final
 from flasher.errors import ErrorCode, Fault, FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
-"""In bytes, for settings files."""
+"""Bytes of a settings file."""
 JSON_MAX_SIZE: Final = 6 * 1024 * 1024
-"""In bytes, for reports. JSON takes up to thirty times its size in memory."""
+"""Bytes of a report. JSON takes up to thirty times its size in memory."""
 _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
 _DOTS_MAX: Final = 128
-"""Per line of TOML. The time of tomllib grows with the square of the parts of a key."""
+"""Dots in a line of TOML. The time of tomllib grows with the square of the parts of a key."""
 _OWNER_ONLY: Final = 0o600
 _OF_OTHERS: Final = 0o077
 _OPEN_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -58,7 +58,7 @@ def opened(
     shown = printable(os.fspath(path))
     subject = f"The {what} {shown}" if what else shown
     try:
-        _check_regular(os.stat(path), subject)  # noqa: PTH116  a name that is no path fails here
+        _check_regular(os.stat(path), subject)  # noqa: PTH116  a name that is not a path fails here
         descriptor = os.open(path, _OPEN_FLAGS)
     except (FileNotFoundError, NotADirectoryError, ValueError) as missing:
         raise UsageError(
@@ -69,7 +69,7 @@ def opened(
     except OSError as problem:
         raise _unreadable(subject, problem, error) from problem
     try:
-        with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor is no path
+        with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor is not a path
             before = os.fstat(descriptor)
             _check_regular(before, subject)
             if not was_named:
@@ -104,7 +104,7 @@ def read(
     if_missing: str = "Correct the name.",
     was_named: bool = True,
 ) -> bytes:
-    """Read all bytes of a file. Raises as `opened`."""
+    """Read all bytes of a file. Raises UsageError and `error` like `opened`."""
     with opened(
         path, max_size, what=what, error=error, if_missing=if_missing, was_named=was_named
     ) as (file, size):
@@ -119,7 +119,7 @@ def read_toml(
     if_missing: str = "Correct the name.",
     was_named: bool = True,
 ) -> dict[str, Any]:
-    """Read a TOML settings file. Raises as `opened`, and `error` for invalid TOML."""
+    """Read a TOML file. Raises UsageError like `opened`, and `error` for invalid TOML."""
     raw = read(
         path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing, was_named=was_named
     )
@@ -161,7 +161,7 @@ def parse_toml(raw: bytes) -> dict[str, Any]:
 
 
 def parse_json(raw: bytes) -> Any:
-    """Parse JSON. Raises ValueError as `parse_toml`, and for infinite numbers."""
+    """Parse JSON. Raises ValueError for invalid JSON, long integers and infinite numbers."""
     try:
         document = json.loads(raw)
     except RecursionError as error:
@@ -199,7 +199,7 @@ def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) 
     touched. Raises OSError, also for a file of another user.
     """
     with suppress(FileNotFoundError):
-        if not stat.S_ISREG(os.stat(path).st_mode):  # noqa: PTH116  a name that is no path
+        if not stat.S_ISREG(os.stat(path).st_mode):  # noqa: PTH116  a name that is not a path
             return
     how = os.O_WRONLY | os.O_CREAT | (0 if is_appended_to else os.O_TRUNC)
     descriptor = owner_only(os.fspath(path), how)
@@ -230,7 +230,7 @@ def _check_regular(status: os.stat_result, subject: str) -> None:
 
 def _check_trusted(path: str | os.PathLike[str], status: os.stat_result, subject: str) -> None:
     """Raise UsageError for a file at a default place that another user owns or may write. Its
-    folder does not matter: the owner of a replaced file is checked too.
+    folder is not checked, because the owner of a replaced file is.
     """
     if os.name != "posix":
         return

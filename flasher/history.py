@@ -1,11 +1,11 @@
-"""History of the flashes on this computer: a file of JSON lines in the user's data folder.
+"""History of the upgrades on this computer: a file of JSON lines in the user's data folder.
 
-Each flash has two lines, at its beginning and its end, so that one whose program was killed has no
-end. Lines are only appended, under a lock; incomplete lines are skipped when reading. The file is
-private, because it contains serial numbers and paths.
+Each upgrade has two lines, at its beginning and its end, so that one whose program was killed has
+no end. Lines are only appended, under a lock; incomplete lines are skipped when reading. The file
+is private, because it contains serial numbers and paths.
 
-During a flash, a lock (which the operating system releases in any case) and a progress file exist
-next to it. A killed program leaves them behind.
+During an upgrade, a lock (which the operating system releases in any case) and a progress file
+exist next to the history. A killed program leaves them there.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from flasher.i18n import text
 from flasher.wording import wording_of
 
 SIZE_MAX: Final = 2 * 1024 * 1024
-"""In bytes; above it the older half is dropped: some thousand flashes."""
+"""Bytes above which the older half is dropped: some thousand upgrades."""
 _READ_MAX: Final = 2 * SIZE_MAX
-"""In bytes, from the end of the file: other programs may have made it larger."""
+"""Bytes read from the end of the file: other programs may have made it larger."""
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
 _REACHED_SIZE: Final = 32
-"""In bytes; written at once."""
+"""Bytes of a progress file, written at once."""
 MOCK: Final = "the built-in mock"
 """Adapter name of a device model, which ends with its program."""
 _LEFT_IN: Final = {
@@ -62,7 +62,7 @@ _COMPLETED: Final = {
 
 @dataclass(frozen=True)
 class Began:
-    """Beginning of a flash: nothing was written to the device yet."""
+    """Beginning of an upgrade, before anything is written to the device."""
 
     at: str
     """Local time with UTC offset."""
@@ -70,12 +70,12 @@ class Began:
     """"flash" or "rescue"."""
     target: str
     is_virtual: bool
-    """A device model, or a bus without hardware."""
+    """True for a device model, or a bus without hardware."""
     adapter: str
     image: str
     """File name as given."""
     image_sha256: str
-    """Of the bytes to send."""
+    """SHA-256 of the bytes to send."""
     image_size_bytes: int
     image_version: str | None
     waived: str = ""
@@ -83,17 +83,17 @@ class Began:
     again: str = ""
     """Command line, quoted for a shell; empty for a page."""
     folder: str = ""
-    """Its working directory."""
+    """Working directory of the command."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """End of a flash. For the three claims, null means unknown."""
+    """End of an upgrade. For the three claims, null means unknown."""
 
     at: str
     exit_code: int
     what: str
-    """The error in a sentence; may be empty."""
+    """Error as a sentence; empty for a success."""
     serial_number: str | None
     previous_version: str | None
     transferred: bool | None
@@ -101,7 +101,7 @@ class Ended:
     completed: bool | None
     """The device confirmed the complete image."""
     running_version: str | None
-    """Version answered by the application."""
+    """Firmware version that the application reported."""
     needs_rescue: bool
     """The device was left without an application, or perhaps without one."""
     bundle: str | None
@@ -109,7 +109,7 @@ class Ended:
 
     @property
     def claims(self) -> tuple[str, str, str]:
-        """The three separate claims in words."""
+        """Texts of the three claims."""
         version = self.running_version
         return (
             _TRANSFERRED[self.transferred],
@@ -120,7 +120,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Reached:
-    """Progress of a flash without an end, after the update command."""
+    """Progress of an upgrade without an end, after the update command."""
 
     phase: str
     packet: int
@@ -129,30 +129,30 @@ class Reached:
 
 @dataclass(frozen=True)
 class Flash:
-    """One flash; `ended` is null if no end was recorded."""
+    """Upgrade in the history; `ended` is null if no end was recorded."""
 
     began: Began
     ended: Ended | None
     is_running: bool = False
-    """A program is running it."""
+    """True while a program runs the upgrade."""
     reached: Reached | None = None
-    """Set if it has no end."""
+    """Set for an upgrade without an end."""
 
     @property
     def device_left(self) -> str:
-        """State in which a flash without an end left the device, as a sentence."""
+        """State in which an upgrade without an end left the device, as a sentence."""
         if self.reached is None:
             return text("as far as is known it received no update command")
         return text(wording_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
 
     @property
     def left_device_open(self) -> bool:
-        """The device may be in the session that it began."""
+        """True if the device may still be in the transfer of this upgrade."""
         return not self.is_running and (self.ended is None or self.ended.needs_rescue)
 
     @property
     def shows_application(self) -> bool:
-        """The device had an application at its end."""
+        """True if the device had an application at the end."""
         ended = self.ended
         if ended is None or ended.needs_rescue:
             return False
@@ -163,15 +163,15 @@ T = TypeVar("T", Began, Ended)
 
 
 class FlashHistory:
-    """The history file. Writing raises OSError, or TimeoutError if it is locked."""
+    """History file. Writing raises OSError, or TimeoutError if it is locked."""
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or user_data_path("flasher", appauthor=False) / "history.jsonl"
         self._held: dict[str, FileLock] = {}
-        """Locks of the flashes running here."""
+        """Locks of the upgrades that this program runs."""
 
     def begin(self, began: Began) -> str:
-        """Add the beginning of a flash; return its name for `end`."""
+        """Add the beginning of an upgrade; return its name for `end`."""
         name = token_hex(8)
         for folder in (self.path.parent, self._folder):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -183,9 +183,9 @@ class FlashHistory:
         return name
 
     def reached(self, name: str, reached: Reached) -> None:
-        """Note the progress of the flash `name`. Suitable for every packet: nothing is synced, so
-        it survives the program but not the computer. Phases without erasing are ignored, because a
-        later attempt begins with them.
+        """Record the progress of the upgrade `name`. Suitable for every packet: nothing is synced,
+        so it survives the program but not the computer. Phases without erasing are ignored, because
+        a later attempt begins with them.
         """
         if reached.phase not in _LEFT_IN:
             return
@@ -197,7 +197,7 @@ class FlashHistory:
             os.close(descriptor)
 
     def end(self, name: str, ended: Ended) -> None:
-        """Add the end of the flash `name`."""
+        """Add the end of the upgrade `name`."""
         try:
             self._add({"flash": name, "event": _ENDED, **dataclasses.asdict(ended)})
         finally:
@@ -214,7 +214,7 @@ class FlashHistory:
         return self._folder / f"{name}.reached"
 
     def _forget(self, name: str) -> None:
-        """Release its lock and delete its files."""
+        """Release the lock of an upgrade and delete its files."""
         self._held.pop(name).release()
         for path in (self._lock_of(name), self._place_of(name)):
             with contextlib.suppress(OSError):
@@ -240,7 +240,7 @@ class FlashHistory:
             return None
 
     def flashes(self) -> tuple[list[Flash], int]:
-        """Return all flashes, the latest last, and the number of unreadable lines. Raises
+        """Return all upgrades, the latest last, and the number of unreadable lines. Raises
         UsageError if the file cannot be read.
         """
         begun: dict[str, Began] = {}
@@ -335,7 +335,7 @@ _TYPES: Final = {
     }
     for kind in (Began, Ended)
 }
-"""Types of each key."""
+"""Allowed types of each key."""
 
 
 def working_folder() -> str:
@@ -347,8 +347,8 @@ def working_folder() -> str:
 
 
 def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | None:
-    """Return the latest flash of a target on an adapter that may have left its device in a session;
-    None without one, or if the device had an application later.
+    """Return the latest upgrade of a target on an adapter that may have left its device in the
+    transfer; None without one, or if the device had an application later.
     """
     found = None
     for each in flashes:
@@ -364,7 +364,7 @@ def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | Non
 def matching(
     flashes: list[Flash], *, target: str | None, serial_number: str | None
 ) -> Iterator[Flash]:
-    """Yield the flashes of a target, and those whose serial number contains this text."""
+    """Yield the upgrades of a target whose serial number contains a text; None matches all."""
     for each in flashes:
         serial = (each.ended and each.ended.serial_number) or ""
         if target in (None, each.began.target) and (serial_number or "").lower() in serial.lower():

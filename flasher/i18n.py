@@ -1,8 +1,8 @@
 """Translatable sentences: an English text that keeps its template and values.
 
 `text("Put {serial} into socket {socket}.", serial="W1", socket="A")` is the English sentence, a
-`str`, wherever it is used. It keeps its template and values, so that a page can translate the
-template and fill in the values. A value that is a `Text` itself is translated too.
+`str`. It keeps its template and values, so that a page can translate the template and fill in the
+values. A value that is a `Text` is translated too.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class Text(str):
-    """A sentence with its template and values."""
+    """Sentence with its template and values."""
 
     __slots__ = ("template", "values")
     template: str
@@ -32,7 +32,7 @@ def text(template: str, **values: Any) -> Text:
 
 
 def with_value(sentence: str, old: str, new: str) -> str:
-    """Replace the value `old`, at any depth, by `new`."""
+    """Replace a value of a sentence, at any depth."""
     if not isinstance(sentence, Text) or not sentence.values:
         return new if sentence == old else sentence
     values = {

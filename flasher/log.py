@@ -1,4 +1,4 @@
-"""Logs events with the standard library, under loggers named `flasher.*`.
+"""Logging of events with the standard library, under loggers named `flasher.*`.
 
 Only callers of engines log; engines report events. Nothing is shown unless the program using
 flasher configures logging.
@@ -33,7 +33,7 @@ _INFO: Final = frozenset(
         events.ShutdownEnded,
     }
 )
-"""Phases, and what the user waits for."""
+"""Phases and waits."""
 _WARNING: Final = frozenset(
     {
         events.HostStalled,
@@ -79,7 +79,7 @@ def log_event(event: object) -> None:
 
 
 def level_of(event: object) -> int:
-    """The level at which an event is logged."""
+    """Log level of an event."""
     if isinstance(event, events.CheckMade) and event.verdict in _BAD_VERDICTS:
         return logging.WARNING
     if type(event) in _WARNING:

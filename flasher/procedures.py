@@ -1,4 +1,4 @@
-"""Procedures of `flasher.api.Device`: sequences of engines."""
+"""Procedures of `flasher.api.Device`: query, read, write, identify, scan, verify, upgrade."""
 
 from __future__ import annotations
 
@@ -67,30 +67,30 @@ if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate
 
 INFO_LISTEN_S: Final = 0.5
-"""Long enough to receive faults twice: they are sent every 200 ms while any is set (5.1)."""
+"""Long enough to receive faults twice: they are sent every 200 ms while any is set (table 5)."""
 INFO_LISTEN_ONLY_S: Final = 3.0
-"""For devices without queries: they send about once a second."""
+"""For devices without queries, which send about once a second."""
 SCAN_LISTEN_S: Final = 1.0
 _WAS_OFF: Final = frozenset({TroubleKind.BUS_OFF, TroubleKind.RESTARTED})
 _REOPEN_PAUSE_S: Final = 0.1
-"""Pause between two tries to open a lost adapter."""
+"""Pause between two tries to open a lost adapter, in seconds."""
 
 
 EventHandler = Callable[[object], None]
 
 
 class CallOptions(TypedDict, total=False):
-    """Callbacks of a call; missing ones are those of the device."""
+    """Callbacks of a call; those of the device apply if missing."""
 
     taps: Sequence[Tap]
-    """Observe every frame in both directions."""
+    """Called with every frame in both directions."""
     on_event: EventHandler | None
-    """Gets the events, dataclasses of `flasher.events`."""
+    """Called with the events, dataclasses of `flasher.events`."""
     cancelled: Callable[[], bool] | None
     """Called repeatedly; True ends the call at the next message boundary."""
     ends_write: Callable[[], bool] | None
     """Like `cancelled`, while an item is written, which `cancelled` does not end: the device may
-    have been exchanged, and nothing must be repeated to another one."""
+    have been exchanged, and the write must not be repeated to another one."""
     hung_up: Callable[[], bool] | None
     """Like `cancelled`, for a closed terminal: it does not end an upgrade that has begun to
     erase."""
@@ -98,7 +98,7 @@ class CallOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class ItemReading:
-    """One query of `identify` and its answer (None without one). `misfit` describes an answer of
+    """Query of `identify` with its answer (None without one). `misfit` describes an answer of
     another format; `was_asked` is False if the device was silent to earlier queries.
     """
 
@@ -110,12 +110,12 @@ class ItemReading:
 
     @property
     def title(self) -> str:
-        """Name for people."""
+        """Display name."""
         return self.name.replace("-", " ")
 
     @property
     def why(self) -> str:
-        """Why there is no answer."""
+        """Reason for a missing answer."""
         if not self.was_asked:
             return "not asked: the device is silent"
         if self.misfit:
@@ -125,7 +125,7 @@ class ItemReading:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """Answers of a device, and the traffic received meanwhile."""
+    """Answers of a device to all queries, and the traffic received meanwhile."""
 
     target: Target
     dialect: Dialect
@@ -135,12 +135,12 @@ class DeviceInfo:
 
     @property
     def is_there(self) -> bool:
-        """True if the device answered or sent anything."""
+        """True if the device answered or sent a message."""
         return self.target.node in self.survey.heard
 
     @property
     def version(self) -> VersionInformation | None:
-        """Answer to the version query."""
+        """Answer to the version query; None without one."""
         answers = (reading.answer for reading in self.readings)
         return next((each for each in answers if isinstance(each, VersionInformation)), None)
 
@@ -190,7 +190,7 @@ class Procedures:
             self.link,
             self.clock,
             taps=(*self.watch.get("taps", ()), *taps),
-            on_event=partial(self._tell, of_step=on_event),
+            on_event=partial(self._emit, of_step=on_event),
             cancelled=(
                 partial(self._is_cancelled, hang_up_ends)
                 if may_cancel
@@ -199,7 +199,7 @@ class Procedures:
         )
 
     def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:
-        """Wait until this time; True if cancelled, or the terminal closed and may end it."""
+        """Wait until `moment`. Return True if cancelled or ended by a closed terminal."""
         self.clock.wait_until(moment)
         return self._is_cancelled(hang_up_ends)
 
@@ -209,13 +209,13 @@ class Procedures:
             return True
         return bool(hang_up_ends and hung_up and hung_up() and hang_up_ends())
 
-    def _tell(self, event: object, of_step: EventHandler | None = None) -> None:
+    def _emit(self, event: object, of_step: EventHandler | None = None) -> None:
         log_event(event)
         for handle in (of_step, self.watch.get("on_event")):
             if handle is not None:
                 handle(event)
 
-    # -- asking ----------------------------------------------------------------------------------
+    # -- queries -----------------------------------------------------------------------------------
 
     def listen_first(self, *, may_cancel: bool = True) -> None:
         """Listen for another tool before a query. Raises BusError if one is detected."""
@@ -223,35 +223,35 @@ class Procedures:
             _check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
 
     def ask(self, request: Request, *, for_write: str = "") -> Content:
-        """Send one request. Raises NoAnswerError, and as `_asked`."""
+        """Send a request. Raises NoAnswerError, InterruptedByUserError and WrongDeviceError."""
         self.listen_first()
-        query = self._asked(request, for_write=for_write)
+        query = self._query(request, for_write=for_write)
         if query.cancelled:
             raise _interrupted()
         if query.answer is None:
             raise _no_answer(query)
         return query.answer
 
-    def read(self, what: str | type[Content]) -> Content:
+    def read(self, item: str | type[Content]) -> Content:
         """Read an item by name, or by the type of its content."""
-        return self.ask(Request(self._readable(what).item))
+        return self.ask(Request(self._readable(item).item))
 
-    def _readable(self, what: str | type[Content]) -> Readable:
+    def _readable(self, item: str | type[Content]) -> Readable:
         items = readable(self.target, self.profile.dialect)
-        if isinstance(what, str):
-            return find_item(what, items, self.target, "read")
-        matching = [each for each in items.values() if each.content is what and not each.field]
+        if isinstance(item, str):
+            return find_item(item, items, self.target, "read")
+        matching = [each for each in items.values() if each.content is item and not each.field]
         if len(matching) == 1:
             return matching[0]
         names = ", ".join(each.name for each in matching)
         raise UsageError(
-            f"{what.__name__} is the content of {len(matching) or 'no'} items of the "
+            f"{item.__name__} is the content of {len(matching) or 'no'} items of the "
             f"{self.target.node.name}.",
             remedy=f"Read by name: {names or ', '.join(items) or 'there are none'}.",
         )
 
     def version(self) -> Content:
-        """Send the version query of the document or the product."""
+        """Send the documented version query, or the product's own."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         if request is None:
             raise NoAnswerError(
@@ -261,13 +261,13 @@ class Procedures:
         return self.ask(request)
 
     def read_memory(self, start: int, end: int) -> bytes:
-        """Read the bytes from `start` up to `end`, exclusive (R5)."""
+        """Read memory from `start` up to `end`, exclusive (R5)."""
         if READ_MEMORY.receiver is not self.target.node:
             node = self.target.node.name
             raise UsageError(f"The documents give no way to read memory of the {node}.")
         check_range(start, end)
         self.listen_first()
-        reading = self._queries(memory_requests(start, end))
+        reading = self._make_queries(memory_requests(start, end))
         self.run(reading)
         data = b"".join(memory_bytes(each) for each in reading.answers if isinstance(each, Memory))
         if len(data) == end - start:
@@ -276,11 +276,11 @@ class Procedures:
             raise _interrupted()
         error = _no_answer(reading.queries[-1])
         error.where = f"memory at 0x{start + len(data):08X}"
-        error.cause = "the address is outside of what the device shows, or it went away"
+        error.cause = "the address is outside of the readable memory, or the device went away"
         raise error
 
     def reset(self) -> None:
-        """Restart the application, by the reset of the document or the product (R3)."""
+        """Restart the application by the documented reset, or the product's own (R3)."""
         profile = self.profile
         reset = BY_KEY.get((self.target.request_id, Command.RESET))
         documented = (UpgradeOptions.reset_command, UpgradeOptions.reset_data)
@@ -309,14 +309,14 @@ class Procedures:
         """
         self.listen_first(may_cancel=False)
         request = Request(plan.writable.item, plan.content)
-        both = "Each of them may hold the new value."
-        query = self._asked(request, may_cancel=False, for_write=both)
+        possible_changes = "Each of them may hold the new value."
+        query = self._query(request, may_cancel=False, for_write=possible_changes)
         written = WriteResult(plan, before, query.answer is not None, None)
         for _ in range(2):
             # An answer on a broadcast id may belong to another node's query before the write.
             request = Request(plan.writable.read_back.item)
-            again = self._asked(request, may_cancel=False)
-            written = replace(written, read_back=again.answer)
+            second_query = self._query(request, may_cancel=False)
+            written = replace(written, read_back=second_query.answer)
             if not written.differences:
                 break
         return written
@@ -332,20 +332,20 @@ class Procedures:
             raise error
         return written
 
-    # -- looking ---------------------------------------------------------------------------------
+    # -- identification ----------------------------------------------------------------------------
 
     def identify(self) -> DeviceInfo:
         """Send all documented queries; only listen if there are none."""
         items = readable(self.target, self.profile.dialect)
-        asked = [entry for entry in items.values() if not entry.field]
+        queried = [entry for entry in items.values() if not entry.field]
         survey = self._survey(
-            [Request(entry.item) for entry in asked],
-            INFO_LISTEN_S if asked else INFO_LISTEN_ONLY_S,
+            [Request(entry.item) for entry in queried],
+            INFO_LISTEN_S if queried else INFO_LISTEN_ONLY_S,
         )
-        if asked:
+        if queried:
             _check_no_other_tool(survey)
-        done = dict(zip((entry.name for entry in asked), survey.queries, strict=False))
-        readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
+        queries = dict(zip((entry.name for entry in queried), survey.queries, strict=False))
+        readings = tuple(_reading(entry, queries.get(entry.name)) for entry in queried)
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
 
     def is_present(self) -> bool:
@@ -360,7 +360,7 @@ class Procedures:
         return heard is not None and bool(heard.messages)
 
     def scan(self) -> Survey:
-        """Listen for a second, then ask the BMS for its version and state."""
+        """Listen for a second, then query version and state of the BMS."""
         items = readable(BMS, self.profile.dialect)
         names = ("version-information", "running-information")
         return self._survey([Request(items[name].item) for name in names], SCAN_LISTEN_S)
@@ -380,17 +380,17 @@ class Procedures:
             raise _interrupted()
         return survey
 
-    def _asked(self, request: Request, *, may_cancel: bool = True, for_write: str = "") -> Query:
-        """Send one request. Raises WrongDeviceError if two devices answer during a write;
-        `for_write` describes what may be written.
+    def _query(self, request: Request, *, may_cancel: bool = True, for_write: str = "") -> Query:
+        """Send a request and return its query. Raises WrongDeviceError if two devices answer during
+        a write; `for_write` describes the possible changes.
         """
-        queries = self._queries([request])
+        queries = self._make_queries([request])
         self.run(queries, may_cancel=may_cancel)
         if for_write and queries.duplicates.evidence:
             raise two_devices_error(self.target, queries.duplicates.evidence, for_write)
         return queries.queries[0]
 
-    def _queries(self, requests: Iterable[Request]) -> Queries:
+    def _make_queries(self, requests: Iterable[Request]) -> Queries:
         return Queries(
             requests,
             bitrate_bps=self.profile.dialect.bitrate_bps,
@@ -425,7 +425,7 @@ class Procedures:
         return verification
 
     def checked(self, check: Runner[Verification]) -> Verification:
-        """Run a check. Raises InterruptedByUserError if it was cancelled."""
+        """Run a verification. Raises InterruptedByUserError if it was cancelled."""
         self.run(check)
         if check.result.verdict is Verdict.INTERRUPTED:
             raise _interrupted()
@@ -438,7 +438,7 @@ class Procedures:
         verify: Level | None,
         identity: Identity | None,
     ) -> Result:
-        """Run one upgrade to its end, good or bad, and verify a good one. Raises ImageError for a
+        """Run an upgrade, return its result, and verify a successful one. Raises ImageError for a
         firmware sample on a physical adapter.
 
         A lost adapter is opened again within the time of the options while an attempt is left.
@@ -528,19 +528,19 @@ class Procedures:
             raise error
 
     def _await_contact(
-        self, session: UpgradeSession, blocked: TransmitBlockedError, told_at: int | None
+        self, session: UpgradeSession, blocked: TransmitBlockedError, reported_at: int | None
     ) -> int:
-        """Continue a session whose frames are not sent, because a device without power acknowledges
-        none. Reported unless nothing arrived since the last report, at `told_at` frames; returns
-        the number of received frames. Raises the error if there is something to lose, or if the
-        overall deadline leaves no time.
+        """Continue a session whose frames are not sent, because a device without power does not
+        acknowledge any. Reports it if frames arrived since the last report, at `reported_at`
+        frames; returns the number of received frames. Raises the error if the device still has an
+        application to lose, or if the overall deadline leaves no time.
         """
         left_s = (session.deadline_at or inf) - self.clock.now()
         if not session.goes_on or left_s <= SEND_LIMIT_S + _REOPEN_PAUSE_S:
             raise blocked
         received = self.link.health().frames_received
-        if received != told_at:
-            self._tell(events.BusBlocked(blocked.what, left_s))
+        if received != reported_at:
+            self._emit(events.BusBlocked(blocked.what, left_s))
         self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
         return received
 
@@ -548,9 +548,9 @@ class Procedures:
         """Wait for a lost adapter while an attempt is left; else raise BusError."""
         if not session.may_begin_again or not wait_s:
             raise lost
-        self._tell(events.AdapterLost(lost.what, wait_s))
+        self._emit(events.AdapterLost(lost.what, wait_s))
         self._reopen(session, lost, wait_s)
-        self._tell(events.AdapterBack())
+        self._emit(events.AdapterBack())
 
     def _reopen(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:
         """Open a lost adapter again as soon as it is back. Raises BusError after the time limit or
@@ -562,8 +562,8 @@ class Procedures:
             if now >= session.deadline_at:
                 raise lost
             give_up_at = min(give_up_at, session.deadline_at)
-        told_s = ceil(wait_s)
-        self._tell(events.AdapterAwaited(told_s))
+        reported_s = ceil(wait_s)
+        self._emit(events.AdapterAwaited(reported_s))
         is_cancelled = self._wait_until(now, _may_end(session))
         while True:
             if is_cancelled:
@@ -586,9 +586,9 @@ class Procedures:
                         error.code = ErrorCode.ADAPTER_LOST
                     raise
                 left_s = ceil(give_up_at - now)
-                if left_s < told_s:
-                    told_s = left_s
-                    self._tell(events.AdapterAwaited(left_s))
+                if left_s < reported_s:
+                    reported_s = left_s
+                    self._emit(events.AdapterAwaited(left_s))
                 until = min(give_up_at, now + _REOPEN_PAUSE_S)
                 is_cancelled = self._wait_until(until, _may_end(session))
             else:
@@ -614,7 +614,7 @@ def check_sample(image: Image, link: Link) -> None:
 
 
 def _may_end(session: UpgradeSession) -> Callable[[], bool]:
-    """Return whether a closed terminal may end a session: before the device erases."""
+    """Return a function that is True until the device erases: a hang-up may end a session."""
     return lambda: not session.has_begun_to_erase
 
 
@@ -639,28 +639,28 @@ def _check_no_other_tool(survey: Survey) -> None:
         )
 
 
-def _no_answer(asked: Query) -> NoAnswerError:
-    item = asked.request.item
+def _no_answer(query: Query) -> NoAnswerError:
+    item = query.request.item
     node = item.receiver.name if item.receiver else "bus"
-    misfit = asked.misformatted
+    misfit = query.misformatted
     if misfit is None:
         cause = "it is off, asleep or not connected, it speaks the other dialect, or it is an older"
-        cause += " device that does not know the question"
+        cause += " device that does not know the query"
     else:
         cause = f"it answers in another form: {misfit.command:04X} with {len(misfit.data)} bytes"
-        cause += f", not {asked.request.answer_item.command:04X}"
+        cause += f", not {query.request.answer_item.command:04X}"
     return NoAnswerError(
         f"The {node} did not answer {item.title!r}.",
-        where=f"message {item.name}, sent {asked.tries} times",
+        where=f"message {item.name}, sent {query.tries} times",
         cause=cause,
         remedy="See who is on the bus with flasher scan; wake the device with its key.",
     )
 
 
-def two_devices_error(target: Target, seen: str, written: str) -> WrongDeviceError:
-    """Create the error for two devices instead of one; `written` describes what may be written."""
+def two_devices_error(target: Target, evidence: str, written: str) -> WrongDeviceError:
+    """Create the error for two devices instead of one; `written` describes possible changes."""
     return WrongDeviceError(
-        f"{target.node.name}: two devices answer on the same id ({seen}).",
+        f"{target.node.name}: two devices answer on the same id ({evidence}).",
         cause=TWO_DEVICES_CAUSE,
         remedy=f"{written} Disconnect one of them.",
         code=ErrorCode.TWO_DEVICES,
@@ -668,7 +668,7 @@ def two_devices_error(target: Target, seen: str, written: str) -> WrongDeviceErr
 
 
 def nothing_received_error(survey: Survey, bitrate_bps: int) -> NoAnswerError:
-    """Create the error for a bus without messages from any documented node."""
+    """Create the error for a bus without messages of any documented node."""
     count = survey.foreign_frames
     foreign = f"{count:,} frame{'' if count == 1 else 's'} under ids of other protocols came"
     return NoAnswerError(
@@ -680,11 +680,11 @@ def nothing_received_error(survey: Survey, bitrate_bps: int) -> NoAnswerError:
     )
 
 
-def _reading(entry: Readable, asked: Query | None) -> ItemReading:
-    if asked is None:
+def _reading(entry: Readable, query: Query | None) -> ItemReading:
+    if query is None:
         return ItemReading(entry.name, entry.item, None, was_asked=False)
     misfit = ""
-    if asked.answer is None and asked.misformatted is not None:
-        came = asked.misformatted
-        misfit = f"{came.command:04X} with {len(came.data)} bytes, mode {came.mode:02X}"
-    return ItemReading(entry.name, entry.item, asked.answer, misfit)
+    if query.answer is None and query.misformatted is not None:
+        answer = query.misformatted
+        misfit = f"{answer.command:04X} with {len(answer.data)} bytes, mode {answer.mode:02X}"
+    return ItemReading(entry.name, entry.item, query.answer, misfit)

@@ -1,4 +1,4 @@
-"""python-can, imported without asammdf: that takes 0.5 s, and only .mf4 files need it."""
+"""python-can without asammdf, whose import takes 0.5 s and is needed for .mf4 files only."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["can", "load_mf4"]
 
 
 def load_mf4() -> None:
-    """Lets python-can read and write .mf4 files, where asammdf is installed."""
+    """Enable .mf4 files in python-can, if asammdf is installed."""
     module: Any = can.io.mf4
     if module.asammdf is None:
         # The classes that python-can has handed out look in their module too.

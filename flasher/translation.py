@@ -1,9 +1,9 @@
-"""Translations of pages and certificates: Babel catalogues in `locale`, by English sentences.
+"""Translation of pages and certificates: Babel catalogues in `locale`, keyed by English sentences.
 
-A `Text` is translated by its template. Errors, stories and records hold plain English made by
+A `Text` is translated by its template. Errors, stories and records contain plain English made by
 f-strings; the catalogue has these with their values in braces ("There is no run {run_id}."), so
-that the entry which matches a sentence gives its translation and its values. A text that joins
-several sentences is translated one by one; what matches no entry stays English.
+that the entry which matches a sentence gives its translation and its values. Sentences joined in a
+text are translated one by one; a text without matching entry stays English.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
 """Native language names by code. English needs no catalogue."""
 _COMMA: Final = str.maketrans(",.", ".,")
 _COMMA_LANGUAGES: Final = frozenset({"de"})
-"""They write 1.234,5."""
+"""Languages that write 1.234,5."""
 _NUMBER: Final = re.compile(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?!\.?\d)")
 _MARKS_MIN: Final = 4
-"""Characters of an entry besides values and spaces: with fewer it would match anything."""
+"""Minimum characters of an entry besides values and spaces; fewer would match anything."""
 _LENGTH_MAX: Final = 1000
 _JOINTS_MAX: Final = 24
-"""Characters and joints of a text that is matched, which takes time that grows with both. Longer
-texts come from files, devices and data bases, and no entry matches them."""
+"""Maximum number of characters and joints in a text that is matched, which takes time that grows
+with both. Longer texts come from files, devices and data bases, and no entry matches them."""
 _JOINT: Final = re.compile(r"[.!?;:] | \(")
 _QUANTITY: Final = re.compile(r"-?[\d,]+(?:\.\d+)? [A-Za-z%\N{MICRO SIGN}]{1,4}")
-"""A number and its unit."""
+"""Number and unit."""
 _LEADING: Final = re.compile(r"(?<![^.!? \N{IDEOGRAPHIC FULL STOP}])\{\w+\} ?")
-"""A value at the beginning of a sentence, in place of another sentence."""
+"""Value at the beginning of a sentence, in place of another sentence."""
 _BETWEEN: Final = re.compile(r"(?<=[.!?]) (?=\S)|(?<=\N{IDEOGRAPHIC FULL STOP})(?=\S)")
-"""Between two sentences."""
+"""Space between two sentences."""
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
 _CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
 _BRACKETS: Final = re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL)
 _COLON: Final = re.compile(r"(.+?)(: )(.+)()", re.DOTALL)
-"""Where a text is joined from several ones."""
+"""Patterns of texts that are joined from several ones."""
 _WHOLE: Final = re.compile(r"(?:(?![.!?] [A-Z]|; ).)*", re.DOTALL)
 """Values that are not joined themselves."""
 _ANY: Final = re.compile(r".*", re.DOTALL)
@@ -50,7 +50,7 @@ _FULL_STOPS: Final = {"zh": "\N{IDEOGRAPHIC FULL STOP}"}
 
 
 class _Entry(NamedTuple):
-    """A sentence with values, and the longest part that each of its texts has."""
+    """Sentence with values, and the longest part that each of its texts has."""
 
     template: str
     pattern: re.Pattern[str]
@@ -58,7 +58,7 @@ class _Entry(NamedTuple):
 
 
 class _Formatted(str):
-    """A value out of an English sentence, formatted there."""
+    """Value from an English sentence, formatted there."""
 
     __slots__ = ()
 
@@ -73,10 +73,10 @@ class Translator(Formatter):
         self._stop = _FULL_STOPS.get(code, ".")
         self._sentences = dict(_sentences(catalogue))
         self._plain = lru_cache(4096)(self._translate_plain)
-        """Translate plain English."""
+        """Translate plain English, cached."""
 
     def __call__(self, sentence: str, **values: object) -> str:
-        """Translate a sentence; `values` fill a page's own ones."""
+        """Translate a sentence; `values` fill the placeholders of a page's own sentence."""
         if isinstance(sentence, Text):
             values |= sentence.values
             sentence = sentence.template
@@ -86,7 +86,7 @@ class Translator(Formatter):
         return self.vformat(template, (), values) if values else template
 
     def numbers(self, text: str) -> str:
-        """Write the numbers of a text, 1,234.5 in English, as the language does."""
+        """Convert the numbers of a text from English, 1,234.5, to the language's format."""
         if self.code not in _COMMA_LANGUAGES:
             return text
         return _NUMBER.sub(lambda number: number[0].translate(_COMMA), text)
@@ -113,14 +113,14 @@ class Translator(Formatter):
         )
 
     def _known(self, sentence: str) -> str:
-        """Translate a whole entry, with or without its full stop; "" if it is none."""
+        """Translate a whole entry, with or without its full stop; "" for an unknown sentence."""
         if sentence in self._sentences:
             return self._sentences[sentence]
         bare = sentence.removesuffix(".")
         return f"{self._sentences[bare]}{self._stop}" if bare in self._sentences else ""
 
     def _labelled(self, sentence: str) -> str:
-        """Translate after a known word and a colon; "" without one."""
+        """Translate a known word, a colon and the text after it; "" for other sentences."""
         label, colon, rest = sentence.partition(": ")
         translated = self._sentences.get(label, "")
         return f"{translated}{colon}{self._plain(rest)}" if rest and translated else ""
@@ -137,7 +137,7 @@ class Translator(Formatter):
         return ""
 
     def _split(self, sentence: str, joint: re.Pattern[str]) -> str:
-        """Translate what is joined; "" if it is not, or nothing of it is known."""
+        """Translate the parts of a joined text; "" if it is not joined, or no part is known."""
         parts = joint.fullmatch(sentence)
         if parts is None:
             return ""
@@ -146,7 +146,7 @@ class Translator(Formatter):
         return joined if joined != sentence else ""
 
     def _without_stop(self, sentence: str) -> str:
-        """Translate what the catalogue has without its full stop; "" otherwise."""
+        """Translate a sentence that the catalogue has without full stop; "" otherwise."""
         bare = sentence.removesuffix(".")
         translated = self._plain(bare) if bare != sentence else bare
         return "" if translated == bare else f"{translated}{self._stop}"
@@ -170,7 +170,7 @@ class Translator(Formatter):
 
 
 def _sentences(catalogue: gettext.NullTranslations) -> Iterator[tuple[str, str]]:
-    """Each sentence of an entry with several; then the entries, which count more."""
+    """Yield each sentence of entries with several; then the entries, which take precedence."""
     entries = {key: text for key, text in getattr(catalogue, "_catalog", {}).items() if key}
     for entry in entries.items():
         english, other = (_BETWEEN.split(_LEADING.sub("", each)) for each in entry)
@@ -195,7 +195,7 @@ def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:
 
 @cache
 def translator(code: str) -> Translator:
-    """The translator for a code. Raises KeyError for an unknown one."""
+    """Return the translator for a language code. Raises KeyError for an unknown one."""
     if code not in NAMES:
         raise KeyError(code)
     if code == "en":
@@ -215,7 +215,7 @@ ENGLISH: Final = translator("en")
 
 
 def chosen(wanted: str | None, accepted: Iterable[str]) -> Translator:
-    """The translator that the address selects, else the browser's first supported language."""
+    """Return the translator selected by the address or by the browser's languages."""
     for code in (wanted or "", *accepted):
         if code.split("-")[0].lower() in NAMES:
             return translator(code.split("-")[0].lower())

@@ -1,5 +1,5 @@
-"""Type annotations that validate: ranges of numbers, parsed texts, enumerations in lower case; and
-the JSON keys of a dataclass.
+"""Type annotations that validate (number ranges, parsed texts, enumerations), and JSON keys of
+dataclasses.
 
 `Annotated[int, NumberRange(ge=1, le=100)]`, `Annotated[str, Parsed("64 hex digits", read_sha256)]`.
 Only modules that read or write files need the validation library.
@@ -19,13 +19,13 @@ _Type = TypeVar("_Type", bound=type)
 
 @dataclass(frozen=True)
 class Parsed:
-    """A value that `read` parses; it raises ValueError or TypeError for any other."""
+    """Value that `read` parses; it raises ValueError or TypeError for an invalid one."""
 
     words: str
-    """Describes the value to people: "64 hex digits"."""
+    """Description of valid values: "64 hex digits"."""
     read: Callable[[Any], object]
     write: Callable[[Any], str] = str
-    """Returns the text of a value for a document."""
+    """Formats a value for a document."""
 
     def __get_pydantic_core_schema__(self, source: object, handler: object) -> CoreSchema:
         from pydantic_core import core_schema  # noqa: PLC0415

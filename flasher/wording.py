@@ -1,7 +1,7 @@
-"""English texts of enumeration members, for people.
+"""English texts of enumeration members for display, by enumeration and word.
 
-Enumerations have stable words as values, used in JSON and records. Their texts are here, by name of
-the enumeration and word, so that they can be translated.
+The values of enumerations are stable words, used in JSON and records. Their texts are here, so that
+they can be translated.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
         f"{_AGAIN} {_RESCUE}",
     ),
     "device_restarted": Explanation(
-        "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
+        "its supply drops, its watchdog resets it, it refuses a packet, or two devices "
         "of the same kind answer",
         f"Check the supply, and that there is one {{node}} only. {_AGAIN} {_RESCUE}",
     ),

@@ -33,7 +33,7 @@ def is_physical(interface: str, channel: str) -> bool:
 def _is_pseudo_terminal(port: str) -> bool:
     """Ask the kernel for the device type of a serial port."""
     try:
-        found = os.stat(port)  # noqa: PTH116  a name that is no path fails here
+        found = os.stat(port)  # noqa: PTH116  a name that is not a path fails here
     except (OSError, ValueError):
         return False
     is_linux = platform.system() == "Linux"

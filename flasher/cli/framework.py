@@ -303,7 +303,7 @@ class CliCommand(_OurCommand):
     def invoke(self, ctx: click.Context) -> Any:
         session = _session(ctx)
         session.begin()
-        assert self.callback is not None  # noqa: S101  a command without a function is no command
+        assert self.callback is not None  # noqa: S101  a command without a function is not a command
         return ctx.invoke(self.callback, session.output, **ctx.params)
 
 

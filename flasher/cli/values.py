@@ -57,7 +57,7 @@ def seconds(text: str) -> float:
         value = float(text)
         if 0 <= value < float("inf"):
             return value
-    raise click.BadParameter(f"{text!r} is no time in seconds")
+    raise click.BadParameter(f"{text!r} is not a time in seconds")
 
 
 def speed(text: str) -> float:

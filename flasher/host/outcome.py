@@ -306,7 +306,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.RESTARTED: _Explanation(
         TransferError,
-        "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
+        "its supply drops, its watchdog resets it, it refuses a packet, or two devices "
         "of the same kind answer",
         "Check the supply, and that there is one {node} only. {again}",
         code=ErrorCode.RESTARTED,

@@ -152,7 +152,7 @@ def _mf4_reader(whole: bytes) -> can.MF4Reader:
         except NotImplementedError:
             raise
         except Exception:  # noqa: BLE001  whatever it meets in a foreign file
-            reason = "it is no measurement file of version 4, or it is cut off"
+            reason = "it is not a measurement file of version 4, or it is cut off"
         gc.collect()
     raise UnfitError(reason)
 
@@ -188,7 +188,7 @@ def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[fl
     with _copied(source, path) as copy, closing(sqlite3.connect(copy)) as connection:
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _VALUE_MAX)
         if connection.execute(_IS_TABLE).fetchone() is None:
-            raise UnfitError("there is no table messages in it")
+            raise UnfitError("it does not contain the table messages")
         left = copy.stat().st_size // _ROW_MIN_SIZE
         for at_s, can_id, extended, remote, error, held in connection.execute(_FRAMES):
             left -= 1

@@ -48,7 +48,7 @@ def test_a_range_is_two_numbers_and_a_colon() -> None:
 def test_a_time_is_a_finite_number_of_seconds(text: str) -> None:
     assert values.seconds("0.25") == 0.25
     assert values.seconds("0") == 0.0
-    with pytest.raises(click.BadParameter, match="is no time"):
+    with pytest.raises(click.BadParameter, match="is not a time"):
         values.seconds(text)
 
 

@@ -192,7 +192,7 @@ def test_faults_and_an_idle_shutdown_can_be_set(flasher: Flasher, serve: Serve) 
     [
         (("--set", "faults"), "write KEY=VALUE"),
         (("--set", "falts=1"), "Did you mean faults"),
-        (("--set", "silent_queries=38G0"), "is no command"),
+        (("--set", "silent_queries=38G0"), "is not a command"),
         (("--set", "dialect=klingon"), "dialect cannot be"),
     ],
 )

@@ -158,7 +158,7 @@ def test_queries_that_the_profile_names_are_not_answered_the_others_are() -> Non
 
 @each("text", ["38G0", "x:3800", ",", "732:"])
 def test_silent_queries_that_are_no_commands_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="is no command"):
+    with pytest.raises(UsageError, match="is not a command"):
         DeviceProfile(silent_queries=text)
 
 

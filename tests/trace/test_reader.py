@@ -211,10 +211,10 @@ def test_a_recording_that_grows_faster_than_it_is_read_has_an_end(tmp_path: Path
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("data", [b"", b"MDF     4.10", b"MDF     4.10    " + bytes(200)])
-def test_a_measurement_file_that_is_none_is_told_in_words(tmp_path: Path, data: bytes) -> None:
+def test_an_invalid_measurement_file_is_refused_with_its_cause(tmp_path: Path, data: bytes) -> None:
     pytest.importorskip("asammdf", reason="needs the extra mf4")
     path = tmp_path / "trace.mf4"
     path.write_bytes(data)
     with pytest.raises(UsageError) as caught:
         list(read_trace(path))
-    assert "no measurement file of version 4" in caught.value.cause
+    assert "not a measurement file of version 4" in caught.value.cause
