@@ -653,7 +653,7 @@ def _no_answer(query: Query) -> NoAnswerError:
         f"The {node} did not answer {item.title!r}.",
         where=f"message {item.name}, sent {query.tries} times",
         cause=cause,
-        remedy="See who is on the bus with flasher scan; wake the device with its key.",
+        remedy="List the devices on the bus with flasher scan; wake the device with its key.",
     )
 
 

@@ -20,7 +20,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "no_boot_version": "no boot version came",
         "no_announcement": "it did not announce itself",
         "no_request": "no request transfer came",
-        "unhearing": "the bootloader announces itself but does not take the update command",
+        "unhearing": "the bootloader announces itself but does not accept the update command",
         "wrong_device": "another device answers",
         "boot_too_old": "its bootloader is older than the image needs",
         "two_devices": "two devices answer on the same id",
@@ -62,10 +62,10 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "packet_unanswered": "the device did not answer {what} in time",
         "packet_given_up": "the device did not take a packet, however often it was sent",
         "request_again": "the device requested the transfer once more",
-        "request_late": "the device requested the transfer anew in the middle of it",
+        "request_late": "the device requested the transfer again in the middle of it",
         "restarted": "the device restarted",
         "boot_given_up": "the device did not announce its bootloader",
-        "boot_silent": "the device answers nothing, as one in an open session, and gets an update "
+        "boot_silent": "the device is silent, like one in an open session, and gets an update "
         "command",
         "request_given_up": "the device did not request the transfer in time",
         "end_refused": "the device refused the {what}",
@@ -97,7 +97,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "nobody_acknowledges": "no node acknowledges on the bus",
         "no_boot_version": "no boot version after the reset",
         "no_request": "no request transfer after the update command",
-        "update_not_taken": "the bootloader does not take the update command",
+        "update_not_taken": "the bootloader does not accept the update command",
         "wrong_device": "another kind of device",
         "two_devices": "two devices on one CAN id",
         "packet_refused": "a packet was refused again and again",
@@ -238,8 +238,8 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     ),
     "unconfirmed": Explanation(
         "the answer was lost, or the device restarted without sending it",
-        "Unconfirmed is not done: see whether the new application runs (flasher info), or flash "
-        "it again.",
+        "Unconfirmed is not complete: check whether the new application runs (flasher info), or "
+        "flash it again.",
     ),
     "complete_too_early": Explanation(
         "the bootloader counts other packets than the tool, or does not follow the protocol",

@@ -233,8 +233,8 @@ _EXPLANATIONS: Final = {
         NoAnswerError,
         "it was not switched off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
-        "{again} Take the device's supply away for some seconds when you are asked to (a battery "
-        "wakes by its key or charger); --wait allows more time.",
+        "{again} Disconnect the device's supply for some seconds when asked (a battery wakes by "
+        "its key or charger); --wait allows more time.",
         code=ErrorCode.NO_ANNOUNCEMENT,
     ),
     Ending.NO_REQUEST: _Explanation(
@@ -274,7 +274,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.UNCHECKED: _Explanation(
         WrongDeviceError,
-        "no application runs on the device, or it has no query for what the manifest rules",
+        "no application runs on the device, or it has no query for a value of the manifest",
         "Look at the device's label, then waive the check; flasher rescue goes on without it.",
         code=ErrorCode.UNCHECKED,
     ),
@@ -325,7 +325,7 @@ _EXPLANATIONS: Final = {
     Ending.UNCONFIRMED: _Explanation(
         UnconfirmedError,
         "the answer was lost, or the device restarted without sending it",
-        "Unconfirmed is not done: see whether the new application runs, or flash again.",
+        "Unconfirmed is not complete: check whether the new application runs, or flash again.",
     ),
     Ending.OTHER_VERSION: _Explanation(
         VerificationError,

@@ -83,7 +83,7 @@ class Verification:
             return InterruptedByUserError(
                 what,
                 where=f"verification by {self.level.value}",
-                remedy=f"See with flasher info what it runs. {_IT_HAS}",
+                remedy=f"Show its version with flasher info. {_IT_HAS}",
             )
         if self.verdict is Verdict.TWO_DEVICES:
             error = WrongDeviceError(

@@ -75,7 +75,7 @@ def silence(found: DeviceInfo) -> NoAnswerError:
         return NoAnswerError(
             f"The {node} answered nothing and sent nothing.",
             cause="it is off, asleep or not connected, or the bit rate or dialect is another",
-            remedy="Wake it with its key; see who is on the bus with flasher scan.",
+            remedy="Wake it with its key; list the devices on the bus with flasher scan.",
             code=ErrorCode.NOBODY_HEARD,
         )
     return NoAnswerError(

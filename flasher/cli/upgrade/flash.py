@@ -65,10 +65,10 @@ examples:
   flasher rescue firmware.hex -t bms -i pcan -c PCAN_USBBUS1 --wait 300
   flasher rescue firmware.hex -t bms --mock             try it without hardware
 
-Start it, then take the device's supply away for some seconds and give it back. It works for a
+Start it, then disconnect the device's supply for some seconds and connect it again. It works for a
 device that announces itself at power-up only as well as for one that announces itself for ever.
 Nothing is sent before the device announces itself, unless an upgrade of it has no end: a device
-that still waits in that is found without a power cycle, which is asked for only after that.
+that is still in its transfer is found without a power cycle, which is requested only after that.
 Hardware and running version cannot be checked, since no application runs.
 """
 _EXIT_CODES: Final = (
