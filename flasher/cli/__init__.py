@@ -1,1 +1,1 @@
-"""The command line: arguments, printing, progress bars, exit codes; nothing else prints."""
+"""Command line: arguments, output, progress bars, exit codes. No other package prints."""

@@ -1,4 +1,4 @@
-"""Detects the adapters of this computer, and chooses one for a command that names none."""
+"""Adapter selection: detects the adapters of this computer, and chooses one if none is named."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from flasher.protocol.spec import Dialect
 from flasher.protocol.text import printable
 
 _NAMES: Final = ("device_name", "description")
-"""Keys under which back ends and serial ports give an adapter's name."""
+"""Keys under which back ends and serial ports report an adapter's name."""
 
 
-def detected_adapters(*, on_network: bool = False) -> DetectionResult:
-    """Detect adapters, including servers on the network if `on_network`. Takes at most 5 s. Raises
+def detect_adapters(*, on_network: bool = False) -> DetectionResult:
+    """Detect adapters, including servers in the network if `on_network`. Takes at most 5 s. Raises
     InterruptedByUserError.
     """
     with stop_on_signal() as stopped:
-        return detected_until(stopped, on_network=on_network)
+        return detect_until(stopped, on_network=on_network)
 
 
-def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> DetectionResult:
-    """Detect adapters until `stopped` returns True."""
+def detect_until(stopped: Callable[[], bool], *, on_network: bool = False) -> DetectionResult:
+    """Detect adapters until `stopped` returns True. Raises InterruptedByUserError then."""
     asked = set(interface_names()) - (frozenset() if on_network else SLOW)
     with Detection(sorted(asked)) as detection:
         found = detection.collect(stopped)
@@ -50,8 +50,8 @@ def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> 
     return found
 
 
-def ports() -> list[DetectedAdapter] | None:
-    """The serial ports, as slcan adapters, which they may be; None where pyserial is missing."""
+def slcan_ports() -> list[DetectedAdapter] | None:
+    """List the serial ports as possible slcan adapters; None if pyserial is missing."""
     try:
         return list(serial_ports("slcan"))
     except ImportError:
@@ -60,22 +60,22 @@ def ports() -> list[DetectedAdapter] | None:
 
 def interface_of(found: DetectedAdapter) -> Interface | None:
     """State of a SocketCAN interface in the kernel; None for any other adapter."""
-    seen = read_interface(found.channel) if found.interface == SOCKETCAN else None
-    return seen if isinstance(seen, Interface) else None
+    state = read_interface(found.channel) if found.interface == SOCKETCAN else None
+    return state if isinstance(state, Interface) else None
 
 
-def described(found: DetectedAdapter, dialect: Dialect) -> str:
-    """Text for an adapter: its state if known, its name, its serial number."""
+def describe_adapter(found: DetectedAdapter, dialect: Dialect) -> str:
+    """Describe an adapter: its state if known, its name, its serial number."""
     words = []
-    seen = interface_of(found)
-    if seen is not None and seen.is_up:
+    state = interface_of(found)
+    if state is not None and state.is_up:
         words.append("up")
-        if seen.kind in VIRTUAL_KINDS:
+        if state.kind in VIRTUAL_KINDS:
             words.append("virtual")
-        if seen.bitrate_bps is not None:
-            words.append(f"{seen.bitrate_bps / 1000:g} kbit/s")
-        words += [seen.state_name.lower()] if seen.state_name else []
-    elif seen is not None:
+        if state.bitrate_bps is not None:
+            words.append(f"{state.bitrate_bps / 1000:g} kbit/s")
+        words += [state.state_name.lower()] if state.state_name else []
+    elif state is not None:
         words.append(f"down, `{start_command(found.channel, dialect.bitrate_bps)}` starts it")
     words += [str(found.details[name]) for name in _NAMES if found.details.get(name)]
     if found.serial_number:
@@ -87,28 +87,28 @@ def described(found: DetectedAdapter, dialect: Dialect) -> str:
 
 
 def choose_adapter(bus: Bus, output: Output) -> Bus:
-    """The bus with an adapter: the only one detected if nothing names one, with a message.
+    """Return the bus; if it names no adapter, with the only one detected, and a message.
 
     Raises UsageError for several adapters, BusError for none.
     """
     if bus.mock or bus.is_named:
         return bus
-    found = [each for each in detected_adapters().found if each.channel]
+    found = [each for each in detect_adapters().found if each.channel]
     if not found:
         raise _none_found()
     if len(found) > 1:
         raise _several_found(found, bus.dialect)
-    return only(found[0], bus, output)
+    return use_only_adapter(found[0], bus, output)
 
 
-def only(found: DetectedAdapter, bus: Bus, output: Output) -> Bus:
-    """The bus with the only detected adapter."""
+def use_only_adapter(found: DetectedAdapter, bus: Bus, output: Output) -> Bus:
+    """Return the bus with the only detected adapter, and print a message."""
     output.progress(f"no adapter is named: using the only one found, {printable(found.arguments)}")
-    return replace(using(found, bus), found=found)
+    return replace(with_adapter(found, bus), found=found)
 
 
-def using(found: DetectedAdapter, bus: Bus) -> Bus:
-    """The bus with this adapter."""
+def with_adapter(found: DetectedAdapter, bus: Bus) -> Bus:
+    """Return the bus with this adapter."""
     kwargs = tuple((key, str(value)) for key, value in found.bus_kwargs.items())
     return replace(
         bus,
@@ -119,9 +119,8 @@ def using(found: DetectedAdapter, bus: Bus) -> Bus:
 
 
 def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOptions]) -> None:
-    """Make sure that the device is on an adapter that was chosen automatically, before changing it.
-
-    Raises NoAnswerError, having sent at most a query for its version.
+    """Check that the device is on an adapter that was chosen automatically, before changing it.
+    Raises NoAnswerError; sends at most a version query.
     """
     if bus.found is None:
         return
@@ -148,7 +147,7 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[CallOp
 def _several_found(found: list[DetectedAdapter], dialect: Dialect) -> UsageError:
     width = max(len(each.arguments) for each in found)
     listed = "".join(
-        f"\n    {printable(each.arguments):<{width}}   {described(each, dialect)}".rstrip()
+        f"\n    {printable(each.arguments):<{width}}   {describe_adapter(each, dialect)}".rstrip()
         for each in found
     )
     return UsageError(
@@ -159,7 +158,7 @@ def _several_found(found: list[DetectedAdapter], dialect: Dialect) -> UsageError
 
 
 def _none_found() -> BusError:
-    maybe = ports()
+    maybe = slcan_ports()
     listed = "".join(f"\n    {printable(each.arguments)}" for each in maybe or ())
     if listed:
         listed = f" One of the serial ports may be an slcan adapter:{listed}"

@@ -11,12 +11,12 @@ from flasher.cli.output import Output
 
 
 class Bar:
-    """Shown only on a terminal, and not after -q. Messages meanwhile are printed above it. A lost
-    terminal ends the bar, and nothing else.
+    """Progress bar, shown only on a terminal, and not with -q. Messages meanwhile are printed above
+    it. A lost terminal ends only the bar.
     """
 
     def __init__(self, output: Output, **look: Any) -> None:
-        """`look` is tqdm's."""
+        """`look` are keywords of tqdm."""
         self._output = output
         self._look = look
         self._is_wanted = sys.stderr.isatty() and output.verbosity >= 0
@@ -45,13 +45,13 @@ class Bar:
         return self._bar is not None
 
     def describe(self, text: str) -> None:
-        """Set the text beside the bar."""
+        """Set the text next to the bar."""
         if self._bar is not None:
             with self._guarded():
                 self._bar.set_description_str(text)
 
     def close(self) -> None:
-        """Leave it on the screen. Another one may begin."""
+        """End the bar and leave it on the screen. Another one may begin."""
         if self._bar is not None:
             with self._guarded():
                 self._bar.close()

@@ -1,10 +1,10 @@
-"""Types of the documents that `--json` prints, and their conversion to JSON.
+"""Documents of `--json`: their types, and conversion of values to JSON.
 
-A type that a command prints is printed as it is, or with the keys that it names
-(`flasher.validation.json_keys`). Only a view that differs from it is a document, a frozen dataclass
-of the command's module. Each module lists what it prints as `DOCUMENTS`, and as `LINES` what it
-prints meanwhile. `flasher.cli.output` puts them into the `Envelope`, `flasher.cli.schema` makes a
-JSON Schema of all of it.
+A type that a command prints is printed as it is, or with the keys of
+`flasher.validation.json_keys`. Only a view that differs from it is a document, a frozen dataclass
+of the command's module. Each module lists the types that it prints as `DOCUMENTS`, and those of
+lines before the document as `LINES`. `flasher.cli.output` puts them into the `Envelope`,
+`flasher.cli.schema` makes a JSON Schema of them.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 SCHEMA_VERSION: Final = 2
-"""Counts up when a field of any document changes its meaning or goes away; not for a new one."""
+"""Incremented when a field of any document changes its meaning or is removed; not for a new one."""
 
 Kind = TypeVar("Kind")
 FieldValue = str | int | list[int] | list[str] | None
-"""A value of a message: bytes are in hexadecimal, flags are a list of names."""
+"""Value of a message field: bytes are in hexadecimal, flags are a list of names."""
 
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """Writes and describes values of a type: enumerations as their words, bytes in hexadecimal. A
+    """Create the pydantic adapter of a type: enumerations as their words, bytes in hexadecimal. A
     field `from_` is the key `from`.
     """
     from pydantic import ConfigDict, TypeAdapter, with_config  # noqa: PLC0415  for JSON only
@@ -51,7 +51,7 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def as_json(document: object) -> Any:
-    """A document, an event or a part of one as plain JSON values."""
+    """Convert a document, an event or a part of one to plain JSON values."""
     kind: Any = type(document)
     return adapter(kind).dump_python(document, mode="json")
 
@@ -63,8 +63,8 @@ def document_of(kind: type[Kind], source: object, /, **others: Any) -> Kind:
 
 
 def content_document(content: Content) -> dict[str, FieldValue]:
-    """A content as JSON: field names with their units, texts escaped, bytes in hexadecimal, flags
-    by name. Reserved bytes are left out, so that the keys do not depend on the answer.
+    """Convert message data to JSON: field names with units, texts escaped, bytes in hexadecimal,
+    flags by name. Reserved bytes are omitted, so that the keys never vary.
     """
     from flasher.host.items import meaningful_fields  # noqa: PLC0415  rarely needed
     from flasher.trace.decoder import content_fields  # noqa: PLC0415
@@ -74,7 +74,7 @@ def content_document(content: Content) -> dict[str, FieldValue]:
 
 
 def to_json(event: object) -> dict[str, Any]:
-    """An event of flasher.events as JSON: the name of its class as `event`, and its fields."""
+    """Convert an event of flasher.events to JSON: its class name as `event`, and its fields."""
     name = type(event).__name__
     if isinstance(event, QueryAnswered):
         event = dataclasses.replace(event, content=content_document(cast("Content", event.content)))
@@ -86,35 +86,33 @@ def to_json(event: object) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Envelope:
-    """Envelope of a command's document, the last line; lines before it have `schema` and
-    `event`.
-    """
+    """Envelope of a command's document, the last line; earlier lines have `schema` and `event`."""
 
     schema: int
     """Version of this schema."""
     command: str | None
-    """The command that ran; null without one."""
+    """Name of the command; null without one."""
     ok: bool
-    """True when the exit code is 0."""
+    """True if the exit code is 0."""
     exit_code: ExitCode
 
 
 @dataclass(frozen=True)
 class ErrorDocument:
-    """An error. Texts may be empty, except for `kind` and `what`."""
+    """Error of a command. Texts may be empty, except for `kind` and `what`."""
 
     kind: str
     """Name of the class in flasher.errors; FlasherError for a bug in flasher."""
     code: ErrorCode
-    """Short code; `flasher help CODE` explains it."""
+    """Error code; `flasher help CODE` explains it."""
     what: str
     where: str
     cause: str
     remedy: str
     command: str
-    """A command that repairs the device."""
+    """Command that repairs the device."""
     faults: tuple[Fault, ...]
-    """Everything that is wrong with a file, where the error is about one."""
+    """All problems of a file."""
 
 
 # -- images and plans ------------------------------------------------------------------------------
@@ -122,7 +120,7 @@ class ErrorDocument:
 
 @dataclass(frozen=True)
 class ImageDocument:
-    """Contents of the file, and the bytes to be sent."""
+    """Contents of an image file, and the bytes to be sent."""
 
     source: str
     format: str
@@ -132,17 +130,17 @@ class ImageDocument:
     segments: tuple[AddressSpan, ...]
     filled_bytes: int
     version: str | None
-    """The firmware version found inside."""
+    """Firmware version inside the image."""
     named_targets: list[str]
-    """The targets that texts inside name."""
+    """Targets named inside the image."""
     sha256: str
-    """Of the bytes to be sent, in hexadecimal."""
+    """SHA-256 of the bytes to be sent, in hexadecimal."""
     vector_table: VectorTable | None
 
 
 @dataclass(frozen=True)
 class PlanDocument:
-    """The bytes to be sent, their target, and the time on the bus."""
+    """Target and bytes of an upgrade, and its time on the bus."""
 
     target: str
     request_id: int
@@ -153,7 +151,7 @@ class PlanDocument:
     bytes_on_wire: int
     wire_s: float
     gaps_s: float
-    """Silence between frames and before packets, on top of `wire_s`."""
+    """Silence between frames and before packets, in addition to `wire_s`."""
 
 
 # -- surveys ---------------------------------------------------------------------------------------
@@ -165,11 +163,11 @@ class HeardDocument:
 
     frames: int
     messages: dict[str, int]
-    """Count of each kind of message."""
+    """Number of messages by title."""
     last: dict[str, dict[str, FieldValue]]
-    """The fields of the latest message of each kind."""
+    """Fields of the latest message by title."""
     damaged: int
-    """Count of byte sequences outside any message."""
+    """Number of damaged stretches of bytes."""
     boot_version: str | None
     not_in_dialect: list[str]
-    """Kinds of message that the document of --dialect does not have."""
+    """Titles of messages that the dialect lacks."""

@@ -1,4 +1,4 @@
-"""Optional packages that only some commands need."""
+"""Optional packages (extras) that only some commands need."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _PACKAGES: Final = {
     "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("itsdangerous", "pygal", "starlette", "uvicorn"),
 }
-"""By extra."""
+"""Python packages of each extra."""
 
 
 def need(what: str, extra: str) -> None:
-    """Raises UsageError without the packages of an extra."""
+    """Raise UsageError if packages of an extra are missing."""
     missing = [name for name in _PACKAGES[extra] if importlib.util.find_spec(name) is None]
     if missing:
         raise UsageError(
@@ -29,6 +29,6 @@ def need(what: str, extra: str) -> None:
 
 
 def how_to_install(extra: str) -> str:
-    """The command that installs the packages of an extra into the running Python."""
+    """Return the command that installs the packages of an extra into the running Python."""
     words = [sys.executable, "-m", "pip", "install", "-c", ".ci/constraints.txt", f".[{extra}]"]
     return f"In the checkout: {shlex.join(words)}"

@@ -1,4 +1,4 @@
-"""Writes files atomically: complete or not at all."""
+"""Output files: written atomically, complete or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flasher.files import make_private
 from flasher.protocol.text import printable
 
 _LINKS_MAX: Final = 40
-"""Limit of chained links, as in the operating system."""
+"""Maximum number of chained links, as in the operating system."""
 
 
 def check_writable(
@@ -24,9 +24,9 @@ def check_writable(
     *,
     is_appended_to: bool = False,
 ) -> None:
-    """Check before the work that the file, if any, can be written, and is none of the `others` (see
-    `check_not_read`). Raises UsageError with the `option` that named the file. Unless it
-    `is_appended_to` it will be replaced: its folder has to be writable.
+    """Check before the work that the file, if any, can be written, and that the command does not
+    read it (`check_not_read`). Raises UsageError with the `option` that named the file. Its folder
+    must be writable, because the file is replaced unless it `is_appended_to`.
     """
     if path is None:
         return
@@ -40,7 +40,7 @@ def check_writable(
 
 
 def check_new(path: Path, option: str, *, force: bool) -> None:
-    """`check_writable` for a file that only `force` may replace. Raises UsageError."""
+    """Check that a file can be written, and is new unless `force` is set. Raises UsageError."""
     check_writable(path, option)
     if path.exists() and not force:
         raise UsageError(
@@ -52,7 +52,7 @@ def check_new(path: Path, option: str, *, force: bool) -> None:
 
 
 def _can_be_replaced(path: Path) -> bool:
-    """False where this user cannot create files in the folder; pipes and devices stay in place."""
+    """False if this user cannot create files in the folder; pipes and devices stay in place."""
     try:
         path = path.resolve(strict=False)
         is_special = path.exists() and not path.is_file()
@@ -62,8 +62,8 @@ def _can_be_replaced(path: Path) -> bool:
 
 
 def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> None:
-    """Raises UsageError when the file to be written is one of the `others`: texts of the command
-    line that may name files which the command reads.
+    """Raise UsageError if the file to be written is one of the `others`: texts of the command line
+    that may name files which the command reads.
     """
     for other in others:
         if not isinstance(other, str | Path):
@@ -101,8 +101,8 @@ def write_whole(path: Path, data: bytes, option: str, *, is_private: bool = Fals
 
 @contextlib.contextmanager
 def writing(path: Path, option: str) -> Iterator[Path]:
-    """A temporary name beside `path`, with its suffixes, for data written in pieces: it replaces
-    `path` when the block succeeds, else it is removed. Only its owner may read it. Raises
+    """Yield a temporary name next to `path`, with its suffixes, for data written in pieces: it
+    replaces `path` when the block succeeds, else it is removed. Only its owner may read it. Raises
     UsageError with the `option` that named the file.
     """
     check_writable(path, option)
@@ -123,7 +123,7 @@ def writing(path: Path, option: str) -> Iterator[Path]:
 
 
 def _check_links(path: Path, option: str) -> None:
-    """Raises UsageError for a link of another user: in a shared folder (/tmp) it could lead to any
+    """Raise UsageError for a link of another user: in a shared folder (/tmp) it could lead to any
     file of this user. Links of the system are followed.
     """
     for _ in range(_LINKS_MAX):

@@ -1,4 +1,4 @@
-"""How commands are declared: `command`, `group`, `option`, `argument` and `option_set`.
+"""Command framework on click: `command`, `group`, `option`, `argument` and `option_set`.
 
     @command(exit_codes=(ExitCode.BUS,), epilog=EXAMPLES)
     @option("--listen", type=seconds, default=1.0, metavar="S", help="...", brief=True)
@@ -29,7 +29,7 @@ from click.core import ParameterSource
 from flasher import __version__
 from flasher.cli.help import BRIEF, HelpedCommand
 from flasher.cli.logs import LOG_FILE, Logs
-from flasher.cli.output import SAID, Output
+from flasher.cli.output import PRINTED, Output
 from flasher.cli.values import FilePath
 from flasher.errors import ExitCode, UsageError, without_password
 from flasher.protocol.text import printable
@@ -41,12 +41,12 @@ Decorator = Callable[[Any], Any]
 
 
 class Session:
-    """One run of the program, with its output options."""
+    """Run of the program, with its output options."""
 
     def __init__(self, output: Output, logs: Logs, words: Sequence[str]) -> None:
         self.output = output
         self.command_line = [without_password(word) for word in words]
-        """As typed, without passwords."""
+        """Arguments as typed, without passwords."""
         self._logs = logs
         self._verbosity = 0
         self._log_file: str | None = None
@@ -77,7 +77,7 @@ class Session:
             )
         self._logs.open(self._verbosity, self._log_file, typed_values(but="log_file"))
         shown = printable(shlex.join(["flasher", *self.command_line]))
-        _LOG.info("flasher %s: %s", __version__, shown, extra=SAID)
+        _LOG.info("flasher %s: %s", __version__, shown, extra=PRINTED)
 
 
 def _session(ctx: click.Context) -> Session:
@@ -91,7 +91,7 @@ def _session(ctx: click.Context) -> Session:
 
 
 class _Parameter(rich_click.RichParameter):
-    """A parameter that records its text as typed."""
+    """Parameter that records its text as typed."""
 
     def consume_value(self, ctx: click.Context, opts: Mapping[str, Any]) -> tuple[Any, Any]:
         value, source = super().consume_value(ctx, opts)
@@ -101,7 +101,7 @@ class _Parameter(rich_click.RichParameter):
 
 
 class Option(_Parameter, rich_click.RichOption):
-    """An option; `brief` ones also appear in the short help."""
+    """Command-line option; `brief` ones also appear in the short help."""
 
     def __init__(self, *args: Any, brief: bool = False, **more: Any) -> None:
         more.setdefault("show_default", more.get("default") is not None)
@@ -110,29 +110,30 @@ class Option(_Parameter, rich_click.RichOption):
         self.brief = brief or self.required
 
     def get_error_hint(self, ctx: click.Context | None) -> str:
-        """The option as users type it."""
+        """Return the option as users type it."""
         return "/".join(self.opts)
 
 
 class Argument(_Parameter, rich_click.RichArgument):
-    """A positional argument."""
+    """Positional argument."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, panel="arguments", **more)
 
 
 def option(*names: str, **more: Any) -> Decorator:
-    """An option of a command; `panel` is its group in the help."""
+    """Declare an option of a command; `panel` is its group in the help."""
     return click.option(*names, cls=Option, **more)
 
 
 def argument(name: str, **more: Any) -> Decorator:
-    """A positional argument of a command."""
+    """Declare a positional argument of a command."""
     return click.argument(name, cls=Argument, **more)
 
 
 def option_set(name: str, gather: type[Any], *options: Decorator) -> Decorator:
-    """Options that belong together: the command receives `gather(...)` of them as one argument.
+    """Declare related options: the command receives `gather(...)` of them as one argument.
+
     `gather` is a dataclass with a field for each of `options`, and for each option in an
     annotation: `limit: Annotated[int, option("--limit", ...)]`.
     """
@@ -157,14 +158,14 @@ def option_set(name: str, gather: type[Any], *options: Decorator) -> Decorator:
 
 
 def command_line() -> list[str]:
-    """The arguments of the running command, without passwords."""
+    """Return the arguments of the running command, without passwords."""
     ctx = click.get_current_context(silent=True)
     return sys.argv[1:] if ctx is None else _session(ctx).command_line
 
 
 def typed_values(*, but: str) -> list[str]:
-    """The typed values of the running command, which may name files: all `but` those of one
-    option.
+    """Return the typed values of the running command, which may name files, except those of the
+    option `but`.
     """
     ctx = click.get_current_context(silent=True)
     found: list[str] = []
@@ -182,8 +183,8 @@ def rebuild_command_line(
     without: Callable[[str], bool] = lambda _option: False,
     replaced: Mapping[str, str] | None = None,
 ) -> list[str]:
-    """A command line that runs `command` with the arguments of the command of `ctx`, passwords
-    hidden.
+    """Build a command line that runs `command` with the arguments of the command of `ctx`,
+    passwords hidden.
 
     `without` selects options to omit, by their long names; `replaced` maps names of arguments to
     other values.
@@ -204,7 +205,7 @@ def rebuild_command_line(
 
 
 def _typed(ctx: click.Context) -> dict[str, Any]:
-    """The values as typed, by the names of the parameters."""
+    """Return the values as typed, by the names of the parameters."""
     found: dict[str, Any] = ctx.meta.get(_TYPED, {}).get(ctx.command_path, {})
     return found
 
@@ -247,7 +248,7 @@ def _output_option(*names: str, callback: Callable[..., None] = _take, **more: A
 
 
 def _output_options() -> list[click.Parameter]:
-    """Options of every command."""
+    """Create the options that every command has."""
     return [
         _output_option(
             "-v", "--verbose", multiple=True,
@@ -276,7 +277,7 @@ def _output_options() -> list[click.Parameter]:
 
 
 class _OurCommand(HelpedCommand):
-    """A command with the output options, whose long options may be abbreviated."""
+    """Command with the output options, whose long options may be abbreviated."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -291,14 +292,14 @@ class _OurCommand(HelpedCommand):
         return {name.lstrip("-") for param in self.params for name in param.opts}
 
     def _whole_name(self, token: str) -> str:
-        """The long option with this unique prefix."""
+        """Return the long option with this unique prefix."""
         matches = [name for name in self._names if name.startswith(token)]
         is_whole = len(token) == 1 or token in self._names
         return token if is_whole or len(matches) != 1 else matches[0]
 
 
 class CliCommand(_OurCommand):
-    """A command whose function takes the output and returns the exit code."""
+    """Command whose function takes the output and returns the exit code."""
 
     def invoke(self, ctx: click.Context) -> Any:
         session = _session(ctx)
@@ -308,10 +309,10 @@ class CliCommand(_OurCommand):
 
 
 class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-click's own bases
-    """A command that has actions (`flasher profile show`)."""
+    """Command that has actions (`flasher profile show`)."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """In the order of declaration, the most used first."""
+        """Return the actions in the order of declaration, the most used first."""
         return list(self.commands)
 
     def action(self, name: str, **more: Any) -> Callable[[Callable[..., int]], CliCommand]:
@@ -334,7 +335,7 @@ def command(**more: Any) -> Callable[[Callable[..., int]], CliCommand]:
 
 def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., Any]], Group]:
     """Make a function a command with actions; its docstring begins the help. With `runs_alone` the
-    function runs when no action is named.
+    function runs if no action is named.
     """
 
     def make(function: Callable[..., Any]) -> Group:
@@ -360,7 +361,7 @@ def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., A
 
 @dataclass(frozen=True)
 class CommandEntry:
-    """A command of the program: its location, and its line in the list of commands."""
+    """Command of the program: its location, and its line in the list of commands."""
 
     place: str
     """Module in flasher.cli, and the name in it: "upgrade.flash:rescue"."""
@@ -409,7 +410,7 @@ class Program(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-
 
 
 def usage_error(wrong: click.UsageError, command: str | None) -> UsageError:
-    """Converts click's error about the command line of `command`."""
+    """Convert click's error about the command line of `command`."""
     ctx = wrong.ctx
     program = ctx.command_path if ctx else " ".join(filter(None, ("flasher", command)))
     close = getattr(wrong, "possibilities", None)

@@ -1,4 +1,4 @@
-"""Help text after the options: examples, exit codes, files and environment."""
+"""Help texts after the options: examples, exit codes, files and environment variables."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ _READ_ALWAYS: Final = """\
 
 
 class HelpedCommand(rich_click.RichCommand):
-    """A command with additional sections in its help; `-h` omits options that are not brief."""
+    """Command with additional sections in its help; `-h` omits options that are not brief."""
 
     def __init__(self, *args: Any, exit_codes: Iterable[ExitCode] = (), **more: Any) -> None:
         """`exit_codes` are added to those of every command: done, wrong usage and a bug."""
@@ -90,7 +90,7 @@ class HelpedCommand(rich_click.RichCommand):
         self.exit_codes = exit_codes
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        """The parameters; in the short help only the most needed."""
+        """Return the parameters; in the short help only the most needed."""
         if ctx.meta.get(BRIEF):
             return [param for param in self.params if getattr(param, "brief", True)]
         return self.params
@@ -99,7 +99,7 @@ class HelpedCommand(rich_click.RichCommand):
         """Replaced by the output options."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Examples; in the full help also exit codes, files and environment."""
+        """Write examples; in the full help also exit codes, files and environment variables."""
         sections = [(self.epilog or "").strip("\n")]
         if ctx.meta.get(BRIEF):
             examples = sections[0].partition("\n\n")[0]
@@ -117,12 +117,12 @@ class HelpedCommand(rich_click.RichCommand):
         assert isinstance(formatter, rich_click.RichHelpFormatter)  # noqa: S101  its own class
         width = formatter.width if sys.stdout.isatty() else _WIDTH
         for section in filter(None, sections):
-            lines = "\n".join(_laid_out(section, width)).replace("\xa0", " ")
+            lines = "\n".join(_wrapped(section, width)).replace("\xa0", " ")
             formatter.write(Text(f"{lines}\n"), soft_wrap=True)
 
 
-def _laid_out(section: str, width: int) -> Iterator[str]:
-    """The lines of a section: indented ones stay as they are if they fit, other text is wrapped."""
+def _wrapped(section: str, width: int) -> Iterator[str]:
+    """Yield the lines of a section: indented ones unchanged if they fit, other text wrapped."""
     for is_prose, group in itertools.groupby(
         section.splitlines(), lambda line: bool(line[:1].strip())
     ):

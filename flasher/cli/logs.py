@@ -1,7 +1,7 @@
 """Log handlers of a command: to stderr for -v and -vv, and into --log-file.
 
-The log file also has the output of the command, which is not repeated on stderr. A log that can no
-longer be written (the disk is full) never disturbs the command; it is reported at the end.
+The log file also contains the output of the command, which is not repeated on stderr. A log that
+can no longer be written (the disk is full) never disturbs the command; it is reported at the end.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
 _ALSO_RAISED: Final = ("was not properly shut down", "Could not access SocketCAN device")
 """Texts that python-can logs about a bus that it cannot open, besides raising an error: a command
-that waits for an adapter tries again.
-"""
+that waits for an adapter tries again."""
 _NOWHERE: Final = logging.NullHandler()
 _NOTHING: Final = logging.CRITICAL + 1
 _ON_STDERR: Final = {
@@ -33,13 +32,13 @@ _ON_STDERR: Final = {
     1: (logging.INFO, logging.WARNING),
     2: (logging.DEBUG, logging.INFO),
 }
-"""Levels of flasher's and of python-can's records on stderr, for each verbosity."""
+"""Levels of flasher's and of python-can's records on stderr, by verbosity."""
 _FILE_CAN_LEVEL: Final = logging.INFO
 """Level of python-can in the log file: at DEBUG it logs every frame, which is slow."""
 
 
 class Logs:
-    """The handlers of one command, removed at its end, with levels restored."""
+    """Log handlers of one command, removed at its end, with levels restored."""
 
     def __init__(self, output: Output) -> None:
         self._output = output
@@ -62,8 +61,8 @@ class Logs:
                 self._output.say(f"warning: {self._file.failure}")
 
     def open(self, verbosity: int, log_file: str | None, others: Iterable[object] = ()) -> None:
-        """Begin. Raises UsageError if the log file cannot be written, or is one of the `others`:
-        arguments that may name an image.
+        """Attach the handlers. Raises UsageError if the log file cannot be written, or is one of
+        the `others`: arguments that may name an image.
         """
         self._attach(_Screen(self._output), *_ON_STDERR[max(-1, min(verbosity, 2))])
         if log_file is not None:
@@ -82,7 +81,7 @@ class Logs:
 
 
 class _Screen(logging.Handler):
-    """Terse lines on stderr, above a progress bar where there is one."""
+    """Prints terse lines on stderr, above a progress bar if there is one."""
 
     def __init__(self, output: Output) -> None:
         super().__init__()
@@ -90,7 +89,7 @@ class _Screen(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         event = getattr(record, "event", None)
-        if getattr(record, "said", False) or self._output.shows(event):
+        if getattr(record, "printed", False) or self._output.shows(event):
             return
         if any(words in str(record.msg) for words in _ALSO_RAISED):
             return
@@ -121,13 +120,13 @@ class _LogFile(logging.FileHandler):
         self.failure = ""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Time with its offset, level, logger, text; lines that follow are indented."""
+        """Format time with UTC offset, level, logger and text; further lines are indented."""
         at = datetime.datetime.fromtimestamp(record.created, datetime.UTC).astimezone()
         head = f"{at.isoformat(timespec='milliseconds')} {record.levelname:<7} {record.name}: "
         return head + "\n    ".join(_lines(record))
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
-        """Skips a record that cannot be written."""
+        """Skip a record that cannot be written."""
         self._fail()
 
     def close(self) -> None:
@@ -141,9 +140,9 @@ class _LogFile(logging.FileHandler):
 
 
 def _lines(record: logging.LogRecord) -> list[str]:
-    """The text of a record. Output of the command was escaped at its source."""
+    """Return the lines of a record. Output of the command was escaped at its source."""
     text = hide_passwords(record.getMessage())
     if record.exc_info:
         text += "\n" + hide_passwords(logging.Formatter().formatException(record.exc_info))
     lines = text.splitlines() or [""]
-    return lines if getattr(record, "said", False) else [printable(line) for line in lines]
+    return lines if getattr(record, "printed", False) else [printable(line) for line in lines]

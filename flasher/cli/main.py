@@ -14,7 +14,7 @@ import click
 from flasher.cli.framework import CommandEntry, Program, Session, usage_error
 from flasher.cli.help import STYLE
 from flasher.cli.logs import Logs
-from flasher.cli.output import SAID, Output
+from flasher.cli.output import PRINTED, Output
 from flasher.cli.terminal import prepare_streams
 from flasher.errors import (
     ExitCode,
@@ -99,7 +99,7 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         ),
     },
 }
-"""The commands, by purpose."""
+"""Commands by purpose."""
 COMMANDS: Final = {name: each for group in PURPOSES.values() for name, each in group.items()}
 _EPILOG: Final = """\
 examples:
@@ -120,7 +120,7 @@ _CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "statio
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; return the exit code."""
     if instruction := os.environ.get(_COMPLETE):
         from click.shell_completion import shell_complete  # noqa: PLC0415  a shell asks for it
 
@@ -131,7 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with Logs(output) as logs:
         session = Session(output, logs, words)
         code = _guarded(lambda: _run(session, words), output)
-        _LOG.info("exit code %d", code, extra=SAID)
+        _LOG.info("exit code %d", code, extra=PRINTED)
     return code
 
 
@@ -171,7 +171,7 @@ def _guarded(run: Callable[[], int], output: Output) -> int:
 
 
 def _unfinished(output: Output) -> str:
-    """Possible state of the device after an immediate end. Read-only commands leave none."""
+    """Describe the device after an immediate end, unless the command only reads."""
     if output.command not in _CHANGING:
         return ""
     return (

@@ -31,7 +31,7 @@ from flasher.settings.profile import FILE_NAME, find_bus
 
 
 def target_option(*, required: bool = True) -> Decorator:
-    """The -t/--target option."""
+    """Declare the option -t/--target."""
     return option(
         "-t", "--target", type=values.target, required=required, brief=True, panel="device",
         metavar="|".join((*TARGETS, *TARGET_ALIASES)),
@@ -55,7 +55,7 @@ profile_option: Final = option(
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """An image file, and the selection of its bytes."""
+    """Image file, and the selection of its bytes."""
 
     image: Annotated[str, argument(
         "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
@@ -84,7 +84,7 @@ class ImageOptions:
     )]  # fmt: skip
 
     def load(self, *, force: bool = False) -> Image:
-        """Load the image. Raises ImageError, UsageError."""
+        """Load the image. Raises ImageError and UsageError."""
         return load(
             self.image,
             format=self.format,
@@ -99,7 +99,7 @@ image_options: Final = option_set("image", ImageOptions)
 
 
 def allow_implausible_option(panel: str | None = None) -> Decorator:
-    """For a command without other --allow-... options."""
+    """Declare --allow-implausible, for a command without other --allow-... options."""
     return option(
         "--allow-implausible",
         is_flag=True,
@@ -126,14 +126,14 @@ def gap_options(function: Callable[..., int]) -> Callable[..., int]:
 # -- the bus ---------------------------------------------------------------------------------------
 
 _KEYWORDS: Final = ("interface", "channel", "bitrate", "fd", "data_bitrate")
-"""Options that have the names of python-can's keywords."""
+"""Options with the names of python-can's keywords."""
 _FILTER: Final = re.compile(r"([0-9A-Fa-f]+)([:~])([0-9A-Fa-f]+)")
 _INVERTED: Final = 0x20000000
-"""python-can's flag for a filter that lets through all others."""
+"""python-can's flag for a filter that accepts all other ids."""
 
 
 def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:
-    """python-can's bit timing. Raises click.BadParameter."""
+    """Create python-can's bit timing. Raises click.BadParameter."""
     from flasher.python_can import can  # noqa: PLC0415  slow
 
     try:
@@ -144,7 +144,7 @@ def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:
 
 
 def can_filter(text: str) -> dict[str, int]:
-    """A filter of python-can: ID:MASK, or ID~MASK for all other ids, in hexadecimal."""
+    """Parse a filter of python-can: ID:MASK, or ID~MASK for all other ids, in hexadecimal."""
     match = _FILTER.fullmatch(text)
     if match is None:
         raise click.BadParameter(f"{text!a} is not ID:MASK in hexadecimal")
@@ -154,7 +154,7 @@ def can_filter(text: str) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Bus:
-    """The bus of a command: an adapter, or a device model in this process."""
+    """Bus of a command: an adapter, or a device model in this process."""
 
     dialect_name: str = WELLING.name
     mock: bool = False
@@ -196,13 +196,13 @@ class Bus:
         help="one more argument for the back end, such as app_name=CANalyzer; may be repeated",
     )] = ()  # fmt: skip
     settings: str | None = None
-    """A file that may name the adapter, as --profile names one."""
+    """File that may name the adapter, from --profile."""
     found: DetectedAdapter | None = None
-    """The only detected adapter, if nothing names one (`flasher.cli.adapters`)."""
+    """The only detected adapter, if none is named (`flasher.cli.adapters`)."""
 
     @property
     def dialect(self) -> Dialect:
-        """The protocol document in use."""
+        """Protocol dialect in use."""
         return as_dialect(self.dialect_name)
 
     @cached_property
@@ -221,23 +221,23 @@ class Bus:
 
     @cached_property
     def fallback(self) -> Fallback | None:
-        """The bus of the settings file. Raises UsageError for an invalid file."""
+        """Adapter of the settings file. Raises UsageError for an invalid file."""
         return None if self.mock else find_bus(self.settings)
 
     @cached_property
     def is_named(self) -> bool:
-        """True when an option, a variable or a file names an adapter. Raises UsageError."""
+        """True if an option, a variable or a file names an adapter. Raises UsageError."""
         from flasher.bus.opening import names_adapter  # noqa: PLC0415  loads python-can
 
         return names_adapter(self.config, self.fallback)
 
     def with_profile(self, file: str | None) -> Bus:
-        """The same, but a table [bus] of the --profile file takes precedence."""
+        """Return the same bus, but a table [bus] of the --profile file takes precedence."""
         return replace(self, settings=file)
 
     @cached_property
     def bit_rate(self) -> BitRate:
-        """Read once, so that plan, messages and records agree. Raises UsageError, BusError."""
+        """Read once, so that plan, messages and records agree. Raises UsageError and BusError."""
         if self.mock:
             return BitRate(self.dialect.bitrate_bps, "the dialect's")
         return settle_bit_rate(self.dialect, fallback=self.fallback, **self.config)
@@ -245,8 +245,8 @@ class Bus:
     def connect(
         self, target: Target, *, asks: bool = True
     ) -> contextlib.AbstractContextManager[Connection]:
-        """An adapter, or a whole bicycle with the model of `target`. With `asks` False nothing will
-        be sent.
+        """Open the adapter, or a whole bicycle with the model of `target`. With `asks` False
+        nothing may be sent.
         """
         if self.mock:
             riding = DeviceProfile(battery_use="riding")  # so that traffic is visible
@@ -263,14 +263,14 @@ class Bus:
 
 
 def holder() -> str:
-    """Name of this command for other programs, while it has the adapter."""
+    """Name of this command for other programs, while it locks the adapter."""
     return " ".join(click.get_current_context().command_path.split()[:2])
 
 
 def mock_options(
     what: str, speed: Callable[[str], float] = values.seconds
 ) -> tuple[Decorator, ...]:
-    """--mock and its speed; `what` describes its use."""
+    """Declare --mock and its speed; `what` describes its use."""
     return (
         option("--mock", is_flag=True, panel="without hardware", brief=True, help=what),
         option(
@@ -281,7 +281,7 @@ def mock_options(
 
 
 adapter_options: Final = option_set("bus", Bus)
-"""The bus of a command that has neither a dialect nor a mock in place of the adapter."""
+"""Bus of a command that has neither a dialect nor a mock."""
 
 
 def bus_options(
@@ -289,6 +289,6 @@ def bus_options(
     mock: str | None = "use a device model in this process",
     speed: Callable[[str], float] = values.seconds,
 ) -> Decorator:
-    """Options of the bus: dialect, adapter, and the mock instead unless that is None."""
+    """Declare the options of the bus: dialect, adapter, and the mock unless that is None."""
     in_its_place = () if mock is None else mock_options(mock, speed)
     return option_set("bus", Bus, dialect_option, *in_its_place)

@@ -1,5 +1,4 @@
-"""Prints all output of flasher: results to stdout, the rest to stderr, or JSON; and all of it to
-the log, for `--log-file` (flasher.cli.logs).
+"""Output of commands: results to stdout, the rest to stderr, or JSON; all of it to the log file.
 
 Device text and file names arrive here escaped (flasher.protocol.text). A closed pipe (`| head`) or
 a lost terminal changes nothing about a running upgrade: output that cannot be printed is dropped,
@@ -32,8 +31,8 @@ if TYPE_CHECKING:
     from flasher.trace.figures import Distribution
 
 _LOG: Final = logging.getLogger("flasher.cli")
-SAID: Final = {"said": True}
-"""Marks log records of what was printed, so that -v does not print it twice."""
+PRINTED: Final = {"printed": True}
+"""Marks log records of printed output, so that -v does not print it twice."""
 
 
 class ClosingLine(NamedTuple):
@@ -51,11 +50,11 @@ class Output:
         self.verbosity = verbosity
         self.json_wanted = json_wanted
         self.events_wanted = False
-        """True when each event is to be a JSON line."""
+        """True if each event is printed as a JSON line."""
         self.command: str | None = None
         """Name of the running command; None before it is known."""
         self.shows: Callable[[object], bool] = lambda _event: False
-        """Whether the command prints an event itself: -v does not log it once more."""
+        """True for an event that the command prints itself, so that -v does not log it again."""
         self.ending: Callable[[FlasherError], ClosingLine] | None = None
         """Formats the last line for an error, in a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
@@ -65,7 +64,7 @@ class Output:
 
     def leave_terminal(self, why: str) -> None:
         """Print nothing more to a terminal; files and pipes still get everything."""
-        _LOG.warning("%s", why, extra=SAID)
+        _LOG.warning("%s", why, extra=PRINTED)
         for stream in self._terminals:
             _give_up(stream)
 
@@ -79,13 +78,13 @@ class Output:
 
     @property
     def colour(self) -> bool:
-        """True where stderr takes colours (NO_COLOR is honoured)."""
+        """True if stderr shows colours (NO_COLOR is honoured)."""
         return takes_colour(sys.stderr)
 
     def result(self, text: str) -> None:
         """Print a line of the result; silent with --json."""
         if not self.json_wanted:
-            _LOG.info("%s", unpainted(text), extra=SAID)
+            _LOG.info("%s", unpainted(text), extra=PRINTED)
             _print_stdout(wrapped(text, sys.stdout))
 
     def results(self, lines: Iterable[str]) -> None:
@@ -114,8 +113,8 @@ class Output:
         exit_code: ExitCode = ExitCode.OK,
         error: ErrorDocument | None = None,
     ) -> ExitCode:
-        """The one JSON document of a command, the last line of its output, in its envelope. Returns
-        the exit code.
+        """Print the JSON document of a command, the last line of its output, in its envelope.
+        Return the exit code.
         """
         if self.json_wanted:
             around = Envelope(SCHEMA_VERSION, self.command, exit_code == ExitCode.OK, exit_code)
@@ -129,7 +128,7 @@ class Output:
         if self.json_wanted:
             fields = line if isinstance(line, Mapping) else as_json(line)
             text = json.dumps({"schema": SCHEMA_VERSION, **fields})
-            _LOG.debug("%s", text, extra=SAID)
+            _LOG.debug("%s", text, extra=PRINTED)
             _print_stdout(text)
 
     def event(self, event: object) -> None:
@@ -139,13 +138,13 @@ class Output:
 
     def progress(self, text: str, *, level: int = 0) -> None:
         """Print a line of progress."""
-        _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=SAID)
+        _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=PRINTED)
         if self.verbosity >= level:
             self.say(text)
 
     def error_line(self, text: str) -> None:
         """Print a line that -q does not silence."""
-        _LOG.error("%s", unpainted(text), extra=SAID)
+        _LOG.error("%s", unpainted(text), extra=PRINTED)
         self.say(text)
 
     def verdict(self, verdict: ClosingLine) -> None:
@@ -159,12 +158,12 @@ class Output:
         say(f"{word}  {verdict.text}")
 
     def failure(self, error: FlasherError, known: object = None) -> ExitCode:
-        """Print an error for a person, and as the JSON document of the command, with the document
-        `known` so far. Returns its exit code.
+        """Print an error as text, and as the JSON document of the command, with the document
+        `known` so far. Return its exit code.
         """
         what, *others = str(error).splitlines()
         text = "\n".join((f"{what} [{error.code}]", *others))
-        _LOG.error("error: %s", text, extra=SAID)
+        _LOG.error("error: %s", text, extra=PRINTED)
         head = painted("error:", "red") if self.colour else "error:"
         self.say(f"{head} {text}")
         if self.ending is not None:
@@ -208,7 +207,7 @@ def _give_up(stream: TextIO) -> None:
 
 
 def counted(count: int, noun: str) -> str:
-    """A count with its noun."""
+    """Format a count with its noun."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
@@ -223,6 +222,6 @@ def duration(seconds: float) -> str:
 
 
 def spread_ms(of: Distribution) -> str:
-    """Times in milliseconds: minimum, median, 95th and 99th percentile, maximum."""
+    """Format times in milliseconds: minimum, median, 95th and 99th percentile, maximum."""
     times_s = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
     return " / ".join(f"{each * 1000:.2f}" for each in times_s)

@@ -1,11 +1,11 @@
-"""Records the frames of a command: into a trace if requested, into a bundle if it fails.
+"""Recording of a command's frames: into a trace file if requested, into a bundle if it fails.
 
     with recording(options, bus, output, target=target) as record:
         with connect(...) as connection:
             record.opened(connection)
             connection.device(target).identify(taps=record.taps)
 
-An error that leaves the `with` block, or is handed to `failed`, makes a bundle. An error here
+An error that leaves the `with` block, or is passed to `failed`, makes a bundle. A failure to record
 changes neither the output of the command nor its exit code.
 """
 
@@ -43,18 +43,18 @@ if TYPE_CHECKING:
     from flasher.trace.recorder import Recorder
 
 BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
-"""The environment variable that names the folder for bundles."""
+"""Environment variable that names the folder for bundles."""
 _WITHOUT_BUNDLE: Final = (
     ExitCode.USAGE, ExitCode.IMAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
 )  # fmt: skip
 """Errors that frames do not help to explain."""
 _BUNDLES_KEPT: Final = 50
-"""Bundles in the default folder; older ones are deleted."""
+"""Maximum number of bundles in the default folder; older ones are deleted."""
 
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Trace and bundle of a command on a bus."""
+    """Options of a command on a bus: trace file and bundle."""
 
     trace_file: Annotated[str | None, option(
         "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
@@ -81,28 +81,28 @@ def bundle_folder(chosen: Path | None = None) -> Path:
 
 
 class Recording:
-    """The frames and facts of one command."""
+    """Frames and facts of one command."""
 
     def __init__(self, target: Target | None, bitrate_bps: int) -> None:
         self.flight = FlightRecorder()
         self.facts: dict[str, Any] = {}
-        """Contents of the bundle's report; any JSON value."""
+        """Contents of the bundle's report, as JSON values."""
         self._connection: Connection | None = None
         self._meter = None if target is None else LinkMeter(target, bitrate_bps)
         self.recorders: list[Tap] = [self.flight]
         if self._meter is not None:
             self.recorders.append(self._meter)
         self.file: Recorder | None = None
-        """The trace file, if requested."""
+        """Trace file, if requested."""
         self.taps: tuple[Tap, ...] = (EchoFilter(lambda: self.recorders),)
-        """For the driver."""
+        """Taps for the driver."""
         self.failure: BaseException | None = None
         self.bundle: Path | None = None
         """Path of the bundle, if any."""
         self.two_devices: str | None = None
         """Evidence of a second device of the kind."""
         self.is_alone = False
-        """The terminal is lost: a bundle stores the verdict, even a good one."""
+        """The terminal is lost: a bundle stores the result, even of a success."""
 
     def warn(self, output: Output, event: object) -> None:
         """Print and record a warning."""
@@ -111,7 +111,7 @@ class Recording:
             output.error_line(f"warning: {warning_text(event)}")
 
     def opened(self, connection: Connection) -> None:
-        """Begin recording this bus."""
+        """Begin to record this bus."""
         self._connection = connection
         self.facts["connection"] = connection.name
         if self.file is not None:
@@ -128,7 +128,7 @@ class Recording:
             output.leave_terminal("the terminal is gone")
 
     def link_report(self) -> LinkReport | None:
-        """Use of the bus by the transfer so far; None before the first packet."""
+        """Bus usage of the transfer so far; None before the first packet."""
         report = None if self._meter is None else self._meter.report()
         if report is None or self._connection is None:
             return report
@@ -173,8 +173,8 @@ def _without_passwords(config: Mapping[str, Any]) -> dict[str, Any]:
 def recorded_connection(
     options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Connection, Recording]]:
-    """The bus of the options, else the only adapter detected, with its recording: for commands with
-    one query.
+    """Open and record the bus of the options, else the only adapter detected, for commands with one
+    query.
     """
     bus = choose_adapter(bus, output)
     with (
@@ -189,7 +189,7 @@ def recorded_connection(
 def recorded_device(
     options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Device, Recording]]:
-    """A device there, with its calls recorded and stopped on request."""
+    """Open a device, with its calls recorded and stopped on request."""
     with (
         recorded_connection(options, bus, output, target) as (connection, record),
         stop_on_signal() as stopped,
@@ -202,7 +202,7 @@ def recorded_device(
 
 @contextmanager
 def _trace_file(options: RecordingOptions, record: Recording, output: Output) -> Iterator[None]:
-    """Records to the trace file, if any."""
+    """Record to the trace file, if any."""
     path = options.trace_file
     if path is None:
         yield
@@ -222,8 +222,8 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
 def _leave_bundle(
     options: RecordingOptions, output: Output, record: Recording, error: BaseException | None
 ) -> None:
-    is_told = isinstance(error, FlasherError) and error.exit_code in _WITHOUT_BUNDLE
-    if (is_told and not record.is_alone) or not record.flight.frames:
+    is_explained = isinstance(error, FlasherError) and error.exit_code in _WITHOUT_BUNDLE
+    if (is_explained and not record.is_alone) or not record.flight.frames:
         return
     from flasher.trace.bundle import keep_last, write_bundle  # noqa: PLC0415  loads python-can
 

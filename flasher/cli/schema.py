@@ -1,5 +1,5 @@
-"""The JSON Schema (draft 2020-12) of everything that `--json` prints, made by pydantic from the
-types of the documents (`DOCUMENTS` and `LINES` of the commands' modules) and of the events.
+"""JSON Schema (draft 2020-12) of the output of `--json`, made by pydantic from the types of the
+documents (`DOCUMENTS` and `LINES` of the commands' modules) and of the events.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class _Generator(GenerateJsonSchema):
 
 
 def build() -> Schema:
-    """The whole schema. `#/$defs/document.NAME` is the document of a command, `#/$defs/line.NAME`
-    an event or another line that a command prints before it.
+    """Create the whole schema. `#/$defs/document.NAME` is the document of a command,
+    `#/$defs/line.NAME` an event or another line that a command prints before it.
     """
     modules = command_modules()
     lines = event_classes()
@@ -113,7 +113,7 @@ def schema_of(kind: Any) -> Schema:
 
 
 def event_classes() -> list[type]:
-    """Every class of events, in the order of flasher.events."""
+    """List the event classes, in the order of flasher.events."""
     return [
         each
         for each in vars(events).values()
@@ -124,12 +124,12 @@ def event_classes() -> list[type]:
 
 
 def command_modules() -> dict[str, ModuleType]:
-    """The module of every command."""
+    """Import the module of every command."""
     return {command: entry.module() for command, entry in COMMANDS.items()}
 
 
 def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:
-    """A line: an event by the name of its class, or a type that has the key `event`."""
+    """Return name and schema of a line: an event, or a type that has the key `event`."""
     properties = {"schema": version, **own["properties"]}
     if "event" not in own["properties"]:
         text = {"type": "string", "description": "The event as text, from commands that have one."}
@@ -140,7 +140,7 @@ def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:
 
 
 def _documents(command: str | None, own: Sequence[Schema], envelope: Schema) -> Iterator[Schema]:
-    """The documents of a command: each of its own, and the document of a failure."""
+    """Yield the documents of a command: each of its own, and the document of a failure."""
     around = {**envelope["properties"], "command": {"const": command}}
     by_key: dict[str, list[Schema]] = {}
     for each in own:
@@ -170,7 +170,7 @@ def _closed(properties: Mapping[str, Any], required: Sequence[str], description:
 
 
 def _tidy(part: Any) -> None:
-    """Makes descriptions paragraphs; removes titles that repeat a name."""
+    """Join lines of descriptions; remove titles that repeat a name."""
     for each in part.values() if isinstance(part, dict) else part:
         if isinstance(each, dict | list):
             _tidy(each)
@@ -181,7 +181,7 @@ def _tidy(part: Any) -> None:
 
 
 def _needed(found: Schema, known: Schema) -> Schema:
-    """The referenced definitions."""
+    """Return the referenced definitions."""
     needed: Schema = {}
     open_ones = _REFERENCE.findall(json.dumps(found))
     while open_ones:

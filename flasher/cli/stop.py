@@ -1,9 +1,8 @@
-"""Ctrl-C, Ctrl-Break, SIGTERM and SIGHUP: the first one asks for a clean end, a second Ctrl-C ends
-at once.
+"""Signals: the first Ctrl-C, Ctrl-Break or SIGTERM requests a clean end, a second one ends at once.
 
 SIGHUP, from a terminal that was closed or a connection that was lost, is a separate request: work
 that must not be interrupted continues without a terminal. Under `nohup` it stays ignored. Windows
-ends the programs of a console that is closed within 5 s: there it asks for a clean end.
+ends the programs of a console that is closed within 5 s: there it requests a clean end.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ class Stop:
         self._on_first = on_first
         self._was_reported = False
         self.is_asked = False
-        """Ctrl-C or SIGTERM came."""
+        """Ctrl-C or SIGTERM was received."""
         self.has_hung_up = False
-        """SIGHUP came."""
+        """SIGHUP was received."""
 
     def __call__(self) -> bool:
         return self.asked() or self.has_hung_up
@@ -54,7 +53,7 @@ class Stop:
 def stop_on_signal(
     on_first: Callable[[], None] | None = None, on_second: Callable[[], None] | None = None
 ) -> Iterator[Stop]:
-    """Gives the stop request. `on_first` is called when it is first read. With `on_second` the
+    """Yield the stop request. `on_first` is called when it is first read. With `on_second` the
     second signal calls it, in the handler, and only a third one ends at once.
     """
     stop = Stop(on_first)

@@ -1,4 +1,4 @@
-"""Properties of terminals and pipes: encoding, width, colours; and yes/no questions."""
+"""Terminal and pipe output: encoding, width, colours, columns; and yes/no questions."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _SUBSTITUTED: Final = "flasher-substitutes"
 _REPLACED_ERRORS: Final = frozenset({"strict", "backslashreplace", "surrogateescape"})
 _COLOUR: Final = re.compile(r"\x1b\[[\d;]+m")
 _PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
-"""A line whose first words, or all, are coloured."""
+"""Matches a line whose first words, or all, are coloured."""
 _COMMAND: Final = re.compile(r"\s*flasher ")
-"""A command line is never wrapped, so that it can be copied."""
+"""Matches a command line, which is never wrapped, so that it can be copied."""
 _ENDS_WITH_COMMAND: Final = re.compile(r"(.*[:|]) (flasher [a-z-]+ .*)")
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
-"""The beginning of a line that its continuations are indented to."""
+"""Matches the beginning of a line to whose width further lines are indented."""
 
 
 def prepare_streams() -> None:
@@ -48,7 +48,7 @@ def prepare_streams() -> None:
 
 
 def _substitute(error: UnicodeError) -> tuple[str, int]:
-    """The error handler for encoding: similar characters, else escapes."""
+    """Error handler for encoding: similar characters, else escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     bad = error.object[error.start : error.end]
@@ -94,12 +94,12 @@ def takes_colour(stream: TextIO) -> bool:
 
 
 def painted(text: str, colour: str) -> str:
-    """Text in a colour of `COLOURS`, bold."""
+    """Format text in a colour of `COLOURS`, bold."""
     return f"\x1b[1;{COLOURS[colour]}m{text}\x1b[0m"
 
 
 def unpainted(text: str) -> str:
-    """Removes colours, for a log."""
+    """Remove colours, for a log."""
     return _COLOUR.sub("", text)
 
 
@@ -144,12 +144,12 @@ def wrap_line(line: str, width: int) -> list[str]:
 
 
 def can_ask() -> bool:
-    """True if a user can answer."""
+    """True if a user can answer a question."""
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def agrees(question: str, *, interrupted: str) -> bool:
-    """Ask; True for yes. Raises InterruptedByUserError with the text `interrupted`, for Ctrl-C."""
+    """Ask a yes-no question. Raises InterruptedByUserError for Ctrl-C."""
     sys.stderr.write(f"{question} [y/N] ")
     sys.stderr.flush()
     try:

@@ -1,4 +1,4 @@
-"""Types of values on the command line, with their shell completion."""
+"""Types of command-line values (numbers, targets, files, ...), with their shell completion."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LINK_TYPE_CAN: Final = "280"
 
 
 def number(text: str) -> int:
-    """A whole number: decimal or 0x, with K or M for 1024 and 1024 * 1024."""
+    """Parse a whole number: decimal or 0x, with K or M for 1024 and 1024 * 1024."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         raise click.BadParameter(f"{text!r} is not a number (decimal, 0x..., K or M suffix)")
@@ -44,7 +44,7 @@ def number(text: str) -> int:
 
 
 def address_range(text: str) -> tuple[int, int]:
-    """START:END, the end exclusive."""
+    """Parse START:END, the end exclusive."""
     start, colon, end = text.partition(":")
     if not colon:
         raise click.BadParameter(f"{text!r} is not a range; write START:END")
@@ -52,7 +52,7 @@ def address_range(text: str) -> tuple[int, int]:
 
 
 def seconds(text: str) -> float:
-    """A time in seconds, zero or more."""
+    """Parse a time in seconds, zero or more."""
     with contextlib.suppress(ValueError):
         value = float(text)
         if 0 <= value < float("inf"):
@@ -61,7 +61,7 @@ def seconds(text: str) -> float:
 
 
 def speed(text: str) -> float:
-    """A factor of a real bus's speed: 0, or a number that is not too small."""
+    """Parse a speed relative to a real bus: 0, or at least `SLOWEST`."""
     value = seconds(text)
     if value and value < SLOWEST:
         raise click.BadParameter(f"must be 0, or {SLOWEST} and more")
@@ -69,7 +69,7 @@ def speed(text: str) -> float:
 
 
 def count(text: str) -> int:
-    """A whole number, at least 1."""
+    """Parse a whole number, at least 1."""
     value = number(text)
     if value < 1:
         raise click.BadParameter("must be 1 or more")
@@ -77,7 +77,7 @@ def count(text: str) -> int:
 
 
 def key_value(text: str) -> tuple[str, str]:
-    """KEY=VALUE."""
+    """Parse KEY=VALUE."""
     match = _KEY_VALUE.fullmatch(text)
     if match is None:
         raise click.BadParameter(f"{text!r} is not KEY=VALUE")
@@ -88,7 +88,7 @@ def key_value(text: str) -> tuple[str, str]:
 
 
 def target(text: str) -> Target:
-    """A target by its name or alias."""
+    """Parse the name or alias of a target."""
     from flasher.api import as_target  # noqa: PLC0415  not needed to show help
 
     try:
@@ -98,7 +98,7 @@ def target(text: str) -> Target:
 
 
 def node(text: str) -> str:
-    """A node of the bus by its name, or a target by an alias."""
+    """Parse the name of a node, or the alias of a target."""
     alias = TARGET_ALIASES.get(text.lower())
     name = text.upper() if alias is None else alias.node.name
     if name not in Node.__members__:
@@ -108,7 +108,7 @@ def node(text: str) -> str:
 
 
 def interface(text: str) -> str:
-    """A back end of python-can."""
+    """Parse the name of a python-can back end."""
     known = interface_names()
     if text not in known:
         hint = did_you_mean(text, known)
@@ -120,7 +120,7 @@ _NODES: Final = (*(each.name.lower() for each in Node), *TARGET_ALIASES)
 
 
 def offers(known: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
-    """For `shell_complete`: words of `known(context)` with the typed prefix."""
+    """Create a function for `shell_complete`: words of `known(context)` with the typed prefix."""
 
     def complete(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
         return [word for word in known(ctx) if word.startswith(incomplete)]
@@ -129,25 +129,25 @@ def offers(known: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
 
 
 def target_names(_ctx: click.Context) -> Iterable[str]:
-    """For --target."""
+    """Words for --target."""
     return (*TARGETS, *TARGET_ALIASES)
 
 
 def node_names(_ctx: click.Context) -> Iterable[str]:
-    """For --node."""
+    """Words for --node."""
     return _NODES
 
 
 def interface_names(_ctx: click.Context | None = None) -> list[str]:
-    """For --interface."""
+    """Words for --interface."""
     from flasher.python_can import can  # noqa: PLC0415  slow
 
     return sorted(can.VALID_INTERFACES)
 
 
 def channels(_ctx: click.Context) -> list[str]:
-    """For --channel: the CAN interfaces of Linux. Other back ends list theirs only after opening
-    them.
+    """Words for --channel: the CAN interfaces of Linux. Other back ends list theirs only after
+    opening them.
     """
     if not _NETWORK.is_dir():
         return []
@@ -163,7 +163,7 @@ def channels(_ctx: click.Context) -> list[str]:
 
 
 class FilePath(click.ParamType[Any]):
-    """The name of a file, as text or as a `Path`. Errors are reported when it is opened.
+    """Type of a file name, as text or as a `Path`. Errors are reported when the file is opened.
 
     A shell completes folders, and the files with one of the `suffixes`.
     """
@@ -200,7 +200,7 @@ class FilePath(click.ParamType[Any]):
 
 
 class FolderPath(click.ParamType[Path]):
-    """The name of a folder."""
+    """Type of a folder name."""
 
     name = "folder"
 

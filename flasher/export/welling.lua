@@ -168,7 +168,7 @@ local function crc_add(register, text)
   return register
 end
 
-local CRC_BEGIN = {}  -- by id: the register behind the header and the id
+local CRC_BEGIN = {}  -- by id: the register after the header and the id
 for id in pairs(T.ids) do
   CRC_BEGIN[id] = crc_add(0xFFFFFFFF, T.header .. string.char(math.floor(id / 256), id % 256))
 end
@@ -451,7 +451,7 @@ local function device_says(u, item)
   end
 end
 
--- What the capture said so far ------------------------------------------------------------------------
+-- State of the capture so far --------------------------------------------------------------------------
 
 local G  -- everything that is known of this capture
 
@@ -782,16 +782,16 @@ function SHOW.bytes(tree, f, range, raw)
 end
 
 local function show_fields(item, tree, tvb)
-  local at, said = 0, {}
+  local at, texts = 0, {}
   for _, f in ipairs(item.of.fields) do
     local raw = item.data:sub(at + 1, at + f.size)
     local text = SHOW[f.kind](tree, f, tvb(HEAD_SIZE + at, f.size), raw)
     if text then
-      said[#said + 1] = f.label .. " " .. text .. (f.unit ~= "" and " " .. f.unit or "")
+      texts[#texts + 1] = f.label .. " " .. text .. (f.unit ~= "" and " " .. f.unit or "")
     end
     at = at + f.size
   end
-  return table.concat(said, ", ")
+  return table.concat(texts, ", ")
 end
 
 local function show_crc(item, tree, tvb)
@@ -848,14 +848,14 @@ local function show_item(item, parent, tvb)
     node:add(F.length, tvb(3, 1))
     node:add(F.command, tvb(4, 2))
     if item.of and item.kind == "message" then
-      local said = show_fields(item, node, tvb)
+      local text = show_fields(item, node, tvb)
       local number = item.of == ROWS[COMMAND.PACKET] and " of " or nil
       if number then
-        said = little_endian(item.data:sub(2, 3)) .. number .. little_endian(item.data:sub(4, 5))
+        text = little_endian(item.data:sub(2, 3)) .. number .. little_endian(item.data:sub(4, 5))
       elseif item.of == ROWS[COMMAND.ACK] or item.of == ROWS[COMMAND.NAK] then
-        said = tostring(little_endian(item.data))
+        text = tostring(little_endian(item.data))
       end
-      if said ~= "" then info = info .. " " .. said end
+      if text ~= "" then info = info .. " " .. text end
     elseif #item.data > 0 then
       node:add(F.data, tvb(HEAD_SIZE, #item.data))
     end
@@ -917,17 +917,17 @@ function welling.dissector(tvb, pinfo, tree)
   pinfo.cols.protocol = "Welling"
   pinfo.cols.src = route.sender
   pinfo.cols.dst = route.receiver
-  local said = {}
+  local texts = {}
   for _, item in ipairs(items or {}) do
-    said[#said + 1] = show_item(item, tree, ByteArray.new(item.wire, true):tvb("Message"))
+    texts[#texts + 1] = show_item(item, tree, ByteArray.new(item.wire, true):tvb("Message"))
   end
-  if part and part.done ~= frame then said[#said + 1] = show_part(part, tree, tvb, frame) end
+  if part and part.done ~= frame then texts[#texts + 1] = show_part(part, tree, tvb, frame) end
   if G.cut_in[key] then
     local text = "A message begins inside another one on the tool's id: a second tool"
     tree:add_proto_expert_info(E.foreign_tool, text)
-    said[#said + 1] = text
+    texts[#texts + 1] = text
   end
-  pinfo.cols.info = table.concat(said, "; ")
+  pinfo.cols.info = table.concat(texts, "; ")
   return size
 end
 

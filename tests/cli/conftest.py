@@ -76,7 +76,7 @@ def flasher(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     """Runs `flasher ...` on a computer without adapters and without python-can's configuration."""
     monkeypatch.setattr("can.util.load_file_config", lambda *_args: {})
     monkeypatch.setattr("can.util.load_environment_config", lambda *_args: {})
-    monkeypatch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: DetectionResult())
+    monkeypatch.setattr("flasher.cli.adapters.detect_adapters", lambda **_: DetectionResult())
 
     def run(*arguments: str | Path) -> Run:
         words: Sequence[str] = [str(argument) for argument in arguments]

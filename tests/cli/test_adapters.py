@@ -65,8 +65,8 @@ class Machine:
 def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
     for place in ("flasher.cli.adapters", "flasher.cli.look.adapters"):
-        monkeypatch.setattr(f"{place}.detected_adapters", machine.look)
-        monkeypatch.setattr(f"{place}.ports", lambda: machine.ports)
+        monkeypatch.setattr(f"{place}.detect_adapters", machine.look)
+        monkeypatch.setattr(f"{place}.slcan_ports", lambda: machine.ports)
     for place in ("flasher.cli.adapters", "flasher.bus.bit_rate"):
         monkeypatch.setattr(f"{place}.read_interface", lambda _name: machine.interface)
     monkeypatch.setattr("flasher.cli.options.connect", machine.open)

@@ -184,7 +184,7 @@ def test_where_it_names_an_adapter_none_is_looked_for(
         yield wire
 
     monkeypatch.setattr("flasher.cli.options.connect", connected)
-    monkeypatch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: 1 / 0)
+    monkeypatch.setattr("flasher.cli.adapters.detect_adapters", lambda **_: 1 / 0)
     assert flasher("read", "history").code == ExitCode.OK
 
 

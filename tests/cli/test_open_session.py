@@ -204,7 +204,7 @@ def test_an_adapter_that_nobody_named_need_not_hear_a_device_that_was_left_there
 ) -> None:
     stage = put(left_in_session())
     detected = DetectionResult([DetectedAdapter("virtual", "x")])
-    monkeypatch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: detected)
+    monkeypatch.setattr("flasher.cli.adapters.detect_adapters", lambda **_: detected)
     assert flasher("flash", image, "-t", "bms").code == ExitCode.NO_ANSWER
     kept()
     run = flasher("flash", image, "-t", "bms")

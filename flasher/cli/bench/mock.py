@@ -30,7 +30,7 @@ from flasher.settings.device_model import describe_options, set_options
 
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
-"""After this silence the tool has finished verifying."""
+"""Silence after which the tool has finished verifying."""
 _EXAMPLES: Final = """\
 examples:
   flasher mock -t bms -i socketcan -c vcan0
@@ -54,7 +54,7 @@ class MockDocument:
     """Upgrades that the device model received."""
 
     images: int
-    """Complete upgrades."""
+    """Number of complete upgrades."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def mock(
     dialect = bus.dialect
     check_writable(save_image, _SAVE_IMAGE)
     profile = set_options(DeviceProfile(), choices).speaking(dialect)
-    engine, device = _served(
+    engine, device = _create_model(
         target, dialect, profile, variant, is_system=system, has_application=not no_app
     )
 
@@ -172,7 +172,7 @@ def mock(
     return output.document(MockDocument(images=watcher.images))
 
 
-def _served(
+def _create_model(
     target: Target,
     dialect: Dialect,
     profile: DeviceProfile,
@@ -181,7 +181,7 @@ def _served(
     is_system: bool,
     has_application: bool,
 ) -> tuple[Engine, MockDevice]:
-    """The models to put on the bus, and the one to watch."""
+    """Create the model to put on the bus, and the device in it to watch."""
     if is_system:
         if variant is not None:
             raise UsageError(

@@ -17,7 +17,7 @@ from flasher.protocol.engine import Engine
 from flasher.wording import wording_of
 
 _REOPEN_S: Final = 0.25
-"""Interval between attempts to reopen a lost adapter."""
+"""Interval between attempts to reopen a lost adapter, in seconds."""
 
 
 class DeviceWatcher:
@@ -28,7 +28,7 @@ class DeviceWatcher:
         self._on_image = on_image
         self.images = 0
         self.applications = 0
-        """How often its application started."""
+        """Number of starts of the application."""
         output.shows = lambda event: type(event) in {*BY_DEVICE, events.BytesDamaged}
 
     def __call__(self, event: object) -> None:
@@ -67,7 +67,7 @@ class DeviceWatcher:
 
 class _OnBus(Protocol):
     def bus_off(self, now: float, off_s: float = ...) -> None:
-        """Leave the bus for so long."""
+        """Leave the bus for `off_s` seconds."""
 
 
 def serve(
@@ -82,8 +82,8 @@ def serve(
     taps: Sequence[Tap] = (),
     crashes: bool = False,
 ) -> None:
-    """Run `engine` until the user stops it or `is_over`. It outlives a lost adapter and, when it
-    `crashes`, its own FlasherErrors, after which it restarts: the same error is reported once.
+    """Run a simulated device until the user stops it or `is_over`. It survives a lost adapter, and
+    with `crashes` its own FlasherErrors, each reported once.
     """
     clock, crash = connection.clock, ""
     while True:
@@ -112,7 +112,7 @@ def serve(
 
 
 def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output) -> bool:
-    """Wait until the adapter opens again; False when the user stops. Reports a reason once."""
+    """Wait until the adapter opens again; False if the user stops. Reports each reason once."""
     reported = ""
     while not stopped():
         try:

@@ -1,4 +1,4 @@
-"""`flasher adapters`: the adapters of this computer, with the arguments that select each."""
+"""`flasher adapters`: list the adapters of this computer, with the arguments that select each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flasher.bus.detect import (
     DetectedAdapter,
     DetectionResult,
 )
-from flasher.cli.adapters import described, detected_adapters, interface_of, ports
+from flasher.cli.adapters import describe_adapter, detect_adapters, interface_of, slcan_ports
 from flasher.cli.framework import command, option
 from flasher.cli.output import Output
 from flasher.cli.values import interface_names
@@ -36,41 +36,41 @@ it by themselves; flash and write do so after receiving the device on it.
 
 @dataclass(frozen=True)
 class FoundAdapter:
-    """An adapter, or a serial port that may be one."""
+    """Adapter, or a serial port that may be one."""
 
     interface: str
     channel: str
-    """Empty where its back end does not report it."""
+    """Empty if its back end does not report it."""
     arguments: list[str]
-    """The options that select it."""
+    """Options that select it."""
     serial_number: str | None
     usb_path: str | None
     is_up: bool | None
-    """Of a SocketCAN interface; null for others."""
+    """State of a SocketCAN interface; null for others."""
     bitrate_bps: int | None
-    """As set in the kernel; null where unknown."""
+    """Bit rate set in the kernel; null if unknown."""
     description: str
 
 
 @dataclass(frozen=True)
 class NotSeen:
-    """A back end that cannot list its adapters."""
+    """Back end that cannot list its adapters."""
 
     interface: str
     why: Literal["package_missing", "not_loaded", "cannot_tell", "no_answer", "failed", "not_asked"]
     """`not_loaded`: its driver is missing, or it is for another operating system."""
     text: str
     fix: str
-    """A command that helps; may be empty."""
+    """Command that helps; may be empty."""
 
 
 @dataclass(frozen=True)
 class AdaptersDocument:
-    """The adapters of this computer, and the back ends that cannot list theirs."""
+    """Adapters of this computer, and back ends that cannot list theirs."""
 
     adapters: list[FoundAdapter]
     serial_ports: list[FoundAdapter] | None
-    """Each may be an slcan adapter; null where the package that lists them is missing."""
+    """Each may be an slcan adapter; null if the package that lists them is missing."""
     not_seen: list[NotSeen]
 
 
@@ -86,9 +86,9 @@ def adapters(output: Output, *, network: bool) -> int:
     """List the adapters of this computer, each with the arguments that select it, and the back ends
     that cannot list theirs.
     """
-    detected = detected_adapters(on_network=network)
-    serial = ports()
-    unseen = list(_unseen(detected, on_network=network, lists_ports=serial is not None))
+    detected = detect_adapters(on_network=network)
+    serial = slcan_ports()
+    unseen = list(_list_unseen(detected, on_network=network, lists_ports=serial is not None))
     if detected.found:
         output.table(_rows(detected.found))
     else:
@@ -116,28 +116,30 @@ def adapters(output: Output, *, network: bool) -> int:
 
 
 def _rows(found: Iterable[DetectedAdapter]) -> list[tuple[str, str]]:
-    return [(printable(each.arguments), described(each, WELLING)) for each in found]
+    return [(printable(each.arguments), describe_adapter(each, WELLING)) for each in found]
 
 
 def _document(found: DetectedAdapter) -> FoundAdapter:
-    seen = interface_of(found)
+    state = interface_of(found)
     return FoundAdapter(
         interface=found.interface,
         channel=found.channel,
         arguments=found.words,
         serial_number=found.serial_number or None,
         usb_path=found.usb_path or None,
-        is_up=None if seen is None else seen.is_up,
-        bitrate_bps=None if seen is None else seen.bitrate_bps,
-        description=described(found, WELLING),
+        is_up=None if state is None else state.is_up,
+        bitrate_bps=None if state is None else state.bitrate_bps,
+        description=describe_adapter(found, WELLING),
     )
 
 
 # -- back ends that list nothing -------------------------------------------------------------------
 
 
-def _unseen(detected: DetectionResult, *, on_network: bool, lists_ports: bool) -> Iterable[NotSeen]:
-    """Back ends that cannot list their adapters, each with the reason."""
+def _list_unseen(
+    detected: DetectionResult, *, on_network: bool, lists_ports: bool
+) -> Iterable[NotSeen]:
+    """Yield the back ends that cannot list their adapters, each with the reason."""
     from flasher.bus.opening import needed_extra  # noqa: PLC0415  loads python-can
 
     found = {each.interface for each in detected.found}

@@ -17,8 +17,8 @@ from flasher.cli import values
 from flasher.cli.documents import as_json
 from flasher.cli.files import check_new, write_whole
 from flasher.cli.framework import command, option
-from flasher.cli.look.info import InfoDocument, info_document, silence
-from flasher.cli.look.memory import intel_hex, read_shown
+from flasher.cli.look.info import InfoDocument, info_document, silence_error
+from flasher.cli.look.memory import intel_hex, read_with_bar
 from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
@@ -34,7 +34,7 @@ from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import load_profile
 
 FORMAT: Final = 1
-"""Of `backup.json`."""
+"""Format version of `backup.json`."""
 _DATA: Final = "backup.json"
 _MEMORY: Final = "memory.hex"
 _OUTPUT: Final = "--output"
@@ -63,9 +63,9 @@ class MemoryInBackup:
     end: int
     sha256: str
     range_from: str
-    """Source of the addresses."""
+    """Source of the address range."""
     names_running_version: bool | None
-    """True when it contains the version that the device answered; null without an answer."""
+    """True if it contains the version that the device answered; null without an answer."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class BackupDocument:
     file: str
     size_bytes: int
     sha256: str
-    """Of the file."""
+    """SHA-256 of the file."""
     taken_at: str
     """Local time with its UTC offset."""
     memory: MemoryInBackup | None
     items: list[str]
-    """Questions that the device answered."""
+    """Queries that the device answered."""
     not_in_it: dict[str, str]
     """Omissions, each with the reason."""
 
@@ -97,7 +97,7 @@ class DataInBackup:
     connection: str
     memory: MemoryInBackup | None
     info: InfoDocument
-    """As `flasher info --json` has it."""
+    """Same as the output of `flasher info --json`."""
 
 
 DOCUMENTS: Final = (BackupDocument,)
@@ -110,7 +110,7 @@ class DeviceBackup:
     document: BackupDocument
     archive: bytes
     running_version: str
-    """As answered; empty without an answer."""
+    """Firmware version of the device; empty without an answer."""
 
 
 DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, text("the device model"))
@@ -158,14 +158,14 @@ def backup(
             remedy="Use -t bms; keep the image file that was flashed.",
         )
     check_new(file, _OUTPUT, force=force)
-    area = None if no_memory else _area(image, profile, target, bus)
+    area = None if no_memory else _address_range(image, profile, target, bus)
     bus = bus.with_profile(profile)
     with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
         data = b""
         if area is not None and found.is_there:
-            data = read_shown(device, area.start, area.end, output, record)
+            data = read_with_bar(device, area.start, area.end, output, record)
         if record.two_devices is not None:
             raise two_devices_error(target, record.two_devices, "No file was written.")
         made = backup_of(found, area, data, device.connection.name, file)
@@ -181,8 +181,8 @@ def backup(
     return output.document(document)
 
 
-def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:
-    """The address range of the application. Raises UsageError where no option or profile gives
+def _address_range(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:
+    """Return the address range of the application. Raises UsageError if no option or profile gives
     it.
     """
     if image is not None:
@@ -200,7 +200,7 @@ def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> A
     if bus.mock:
         return DEVICE_MODEL
     raise UsageError(
-        f"Nobody says where the application of the {target.node.name} lies.",
+        f"The addresses of the {target.node.name}'s application are not known.",
         cause="the documents give no addresses, and a wrong one may crash a device",
         remedy=f"Name an image like the one that runs (--image), or write [{target.name}"
         ".application_area] with start and size_bytes into flasher.toml; --no-memory saves the "
@@ -213,7 +213,7 @@ def backup_of(
 ) -> DeviceBackup:
     """Build the backup. Raises NoAnswerError for a device that did not answer."""
     if not found.is_there:
-        raise silence(found)
+        raise silence_error(found)
     running = "" if found.version is None else printable(str(found.version.firmware_version))
     memory = None
     if area is not None:

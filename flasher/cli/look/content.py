@@ -1,6 +1,6 @@
-"""Formats contents of messages, and the traffic of a node, as text and as JSON.
-`flasher.trace.decoder` formats the values of fields, for a query's answer and for live traffic
-alike.
+"""Texts and JSON of message contents, and of a node's traffic.
+
+Both query answers and live traffic are formatted by `flasher.trace.decoder`.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from flasher.trace.decoder import NOT_IN_DIALECT, content_fields
 LABEL_WIDTH: Final = 33
 """Minimum width of labels, so that the values of several tables are aligned."""
 _SHOWN_AT_MOST: Final = 40
-"""Limit of kinds listed: a babbling node must not fill the screen."""
+"""Maximum number of listed messages: a babbling node must not fill the screen."""
 
 
 def rows_lines(rows: list[tuple[str, str]]) -> list[str]:
-    """Labels with their values."""
+    """Format labels with their values."""
     return columns(rows, indent=2, first=LABEL_WIDTH)
 
 
 def content_rows(content: Content, field: str = "") -> Iterator[tuple[str, str]]:
-    """Label and value with unit of every field, or of one by its name, escaped for a terminal."""
+    """Yield label and value of every field, or of one by its name, escaped for a terminal."""
     for shown in content_fields(content):
         if field in ("", shown.name):
             yield shown.label, f"{shown.text} {shown.unit}".rstrip()
 
 
 def content_lines(content: Content, field: str = "") -> list[str]:
-    """The fields of a content, or one of them, one per line."""
+    """Format the fields of a content, or one of them, one per line."""
     return rows_lines(list(content_rows(content, field)))
 
 
 def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
-    """Traffic of one node, one line per kind of message, optionally with its last content."""
+    """Format the traffic of a node, one line per kind of message, or with its last content."""
     rows = [("bootloader", heard.boot_version)] if heard.boot_version else []
     for title, times in sorted(heard.messages.items())[:_SHOWN_AT_MOST]:
         mark = f" {NOT_IN_DIALECT}" if title in heard.not_in_dialect else ""

@@ -17,7 +17,7 @@ from flasher.bus.detect import SLOW, Detection, DetectionResult
 from flasher.bus.health import ControllerState, HealthKeeper
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
-from flasher.cli.adapters import only
+from flasher.cli.adapters import use_only_adapter
 from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
 from flasher.cli.look import findings
@@ -39,7 +39,7 @@ from flasher.protocol.spec import BMS
 from flasher.protocol.text import printable
 
 LISTEN_S: Final = 1.0
-"""Default of --listen: most nodes of a running system send within it."""
+"""Default of --listen: most nodes of a running system send within this time."""
 
 _EXAMPLES: Final = """\
 examples:
@@ -55,7 +55,7 @@ other bit rates, and cannot detect a device that sends only when asked: flasher 
 
 @dataclass(frozen=True)
 class AdapterDocument:
-    """An adapter that python-can detects."""
+    """Adapter that python-can detects."""
 
     interface: str
     channel: str
@@ -63,14 +63,14 @@ class AdapterDocument:
 
 @dataclass(frozen=True)
 class HealthDocument:
-    """State of the controller, as its adapter reports it."""
+    """State of the CAN controller, as its adapter reports it."""
 
     state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
     error_frames: int
     unreadable: int
-    """Number of unreadable frames from the adapter."""
+    """Number of unreadable inputs from the adapter."""
 
 
 @dataclass(frozen=True)
@@ -79,24 +79,24 @@ class TrafficDocument:
 
     listened_s: float
     listen_only: bool
-    """True when the adapter acknowledged nothing."""
+    """True if the adapter acknowledged no frame."""
     frames: int
     frames_per_s: float
     bus_load: float
-    """0 to 1."""
+    """Bus load, 0 to 1."""
     nodes: list[str]
     foreign_frames: int
 
 
 @dataclass(frozen=True)
 class DoctorDocument:
-    """The findings, and the figures that they follow from."""
+    """Findings, and the figures that they follow from."""
 
     findings: list[Finding]
     adapters: list[AdapterDocument]
     bitrate_bps: int
     health: HealthDocument | None
-    """Null when no adapter was opened, as `traffic`."""
+    """Null if no adapter was opened, like `traffic`."""
     traffic: TrafficDocument | None
 
 
@@ -105,14 +105,14 @@ DOCUMENTS: Final = (DoctorDocument,)
 _OWN_OPTIONS: Final = frozenset(
     {"interface", "channel", "bitrate", "fd", "data_bitrate", "timing", "can_filters"}
 )
-"""Keywords of a bus that have an option of their own."""
+"""Keywords of a bus that have their own option."""
 _WORDS: Final = {
     Severity.OK: ("ok", "green"),
     Severity.NOTE: ("note", "cyan"),
     Severity.WARNING: ("WARNING", "yellow"),
     Severity.PROBLEM: ("PROBLEM", "red"),
 }
-"""Label and colour of each."""
+"""Label and colour of each severity."""
 
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.INTERRUPTED))
@@ -143,7 +143,7 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
 
 
 def lines(findings: Sequence[Finding], *, is_coloured: bool) -> list[str]:
-    """The findings as text, one per line, each followed by its commands."""
+    """Format the findings, one per line, each followed by its commands."""
     shown = []
     for finding in findings:
         name, colour = _WORDS[finding.severity]
@@ -194,10 +194,10 @@ class Diagnostics:
         self.detected = DetectionResult()
         self.listened: ListenResult | None = None
         self.findings: list[Finding] = []
-        """In the order of printing."""
+        """Findings in the order of printing."""
 
     def look_at_mock(self, stopped: Callable[[], bool]) -> None:
-        """Check the built-in bicycle in place of an adapter."""
+        """Check the built-in bicycle instead of an adapter."""
         speed = self._bus.mock_speed
         with api.connect_mock(BMS, self.dialect, speed=speed, system=True) as mock:
             self._note(findings.opened(mock.name, is_silent=False))
@@ -208,7 +208,7 @@ class Diagnostics:
         from flasher.bus.opening import bus_config  # noqa: PLC0415
         from flasher.python_can import can  # noqa: PLC0415  slow, and not needed for a mock
 
-        self._note(*findings.setup(self._bus.fallback))
+        self._note(*findings.python_can_setup(self._bus.fallback))
         config: dict[str, Any] | None = None
         with contextlib.suppress(BusError):  # no adapter is selected
             config = bus_config(self._bus.config, self._bus.fallback)
@@ -226,9 +226,9 @@ class Diagnostics:
         if config is None:
             found = [each for each in self.detected.found if each.channel]
             if len(found) != 1 or self._bus.is_named:
-                self._note(findings.unchosen(self.detected))
+                self._note(findings.no_adapter_selected(self.detected))
                 return
-            self._bus = only(found[0], self._bus, self._output)
+            self._bus = use_only_adapter(found[0], self._bus, self._output)
             self._look_at(bus_config(self._bus.config, self._bus.fallback), stopped)
 
     def _look_at(self, config: dict[str, Any], stopped: Callable[[], bool]) -> None:
@@ -250,22 +250,22 @@ class Diagnostics:
         if "bitrate" in given or "timing" in given:  # opening fails for any other source
             self._note(*findings.bit_rate(self.bitrate_bps, self.dialect))
         if interface == "socketcan" and not channel:
-            self._note(findings.nameless())
+            self._note(findings.no_channel())
             return
         only_listens = False
         if interface == "socketcan":
-            seen = read_interface(channel)
-            only_listens = isinstance(seen, Interface) and seen.only_listens
-            self._note(*findings.interface(seen, channel, self.bitrate_bps))
-            if seen is Unseen.MISSING:
+            state = read_interface(channel)
+            only_listens = isinstance(state, Interface) and state.only_listens
+            self._note(*findings.interface(state, channel, self.bitrate_bps))
+            if state is Unseen.MISSING:
                 return
-            if isinstance(seen, Interface) and (
-                not (seen.is_up and seen.is_can)  # it would open, but transfer nothing
-                or seen.bitrate_bps not in (None, self.bitrate_bps)  # opening it would fail
+            if isinstance(state, Interface) and (
+                not (state.is_up and state.is_can)  # it would open, but transfer nothing
+                or state.bitrate_bps not in (None, self.bitrate_bps)  # opening it would fail
             ):
                 return
-            if isinstance(seen, Interface) and seen.state is ControllerState.BUS_OFF:
-                health = HealthKeeper().health(seen.state, seen.tx_errors, seen.rx_errors)
+            if isinstance(state, Interface) and state.state is ControllerState.BUS_OFF:
+                health = HealthKeeper().health(state.state, state.tx_errors, state.rx_errors)
                 self._note(*findings.health(health, channel, is_socketcan=True))
                 return
         try:
@@ -277,7 +277,7 @@ class Diagnostics:
                 **given,
             )
         except BusError as error:
-            self._note(findings.opening(error))
+            self._note(findings.opening_failed(error))
             return
         try:
             is_silent = can_listen_only(interface) or only_listens
@@ -300,7 +300,7 @@ class Diagnostics:
         channel: str = "",
         is_silent: bool = False,
     ) -> None:
-        """Listen without sending; note the health of the link and the traffic."""
+        """Listen without sending; record the health of the link and the traffic."""
         listen_s = self._listen_s
         survey = Survey(listen_s=listen_s, bitrate_bps=self.bitrate_bps, dialect=self.dialect)
         traffic = TrafficCounter()
@@ -309,7 +309,7 @@ class Diagnostics:
         try:
             drive(survey, link, clock, taps=(traffic,), cancelled=stopped)
         except BusError as error:
-            self._note(findings.opening(error))
+            self._note(findings.opening_failed(error))
         _check_stopped(is_stopped=survey.cancelled)
         health = link.health()
         self._note(*findings.health(health, channel, is_socketcan=interface == "socketcan"))
@@ -324,7 +324,7 @@ class Diagnostics:
 
 
 def bus_words(interface: str, channel: str, given: Mapping[str, Any]) -> str:
-    """The options that select this bus, quoted for a shell."""
+    """Format the options that select this bus, quoted for a shell."""
     words = ["-i", interface, *(["-c", channel] if channel else [])]
     if "bitrate" in given:
         words += ["-b", str(given["bitrate"])]

@@ -16,7 +16,7 @@ from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
 from flasher.cli.terminal import painted, takes_colour
-from flasher.cli.upgrade.history import again, reached
+from flasher.cli.upgrade.history import describe_progress, repeat_command
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.history import MOCK, Flash, FlashHistory
 from flasher.protocol.text import printable
@@ -25,7 +25,7 @@ from flasher.trace.story import Story
 
 @dataclass(frozen=True)
 class ExplainDocument:
-    """The story of a trace. Times in seconds since its first frame."""
+    """Story of a trace. Times in seconds since its first frame."""
 
     story: Story
 
@@ -103,7 +103,7 @@ def explain(
 
 
 def _source(trace: Path | None, *, last: bool) -> Path:
-    """The trace or bundle to read. Raises UsageError unless exactly one is given."""
+    """Return the trace or bundle to read. Raises UsageError unless exactly one is given."""
     from flasher.trace.bundle import bundles  # noqa: PLC0415  loads python-can
 
     if last == (trace is not None):
@@ -127,7 +127,7 @@ def _source(trace: Path | None, *, last: bool) -> Path:
 
 
 def _unfinished(bundle: Path | None) -> UsageError | None:
-    """The error for an upgrade without a recorded end, newer than the latest bundle."""
+    """Return the error for an upgrade without a recorded end, newer than the latest bundle."""
     with suppress(UsageError, ValueError):
         flashes, _ = FlashHistory().flashes()
         latest = flashes[-1] if flashes else None
@@ -145,7 +145,7 @@ def _without_end(flash: Flash) -> UsageError:
         printable(f"{began.command} {began.image} has no end, and left no bundle."),
         where=printable(
             f"{began.target.upper()} on {began.adapter}, begun {began.at.replace('T', ' ')}; "
-            f"{reached(flash)}"
+            f"{describe_progress(flash)}"
         ),
         cause="the program was killed, or the computer lost power",
         remedy="The device model is gone with the program: nothing needs repair.",
@@ -157,5 +157,5 @@ def _without_end(flash: Flash) -> UsageError:
             f"Run the command below{where}: it finds a device that still waits in the upgrade. "
             f"State of the device: {flash.device_left}."
         )
-        error.command = printable(again(began))
+        error.command = printable(repeat_command(began))
     return error

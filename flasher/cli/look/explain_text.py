@@ -1,4 +1,4 @@
-"""Formats a story as the text that `flasher explain` prints, verdict first."""
+"""Text output of `flasher explain`: verdict, phases, steps, packets and bus figures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TALKERS_SHOWN: Final = 12
 
 
 def story_lines(story: Story, *, packets: bool = False) -> Iterator[str]:
-    """The whole story; `packets` adds a line for each packet."""
+    """Format a whole story; `packets` adds a line for each packet."""
     at = ""
     if story.started_at is not None:
         at = time.strftime(", from %Y-%m-%d %H:%M:%S", time.localtime(story.started_at))
@@ -160,8 +160,8 @@ def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
 
 
 def _share(share: float, digits: int) -> str:
-    """A percentage of the line's capacity. Far above 100 %, the trace was not recorded on such a
-    line; slightly above, its time stamps are inaccurate.
+    """Format a share of the line's capacity in percent. Far above 100 %, the trace was not recorded
+    on such a line; slightly above, its time stamps are inaccurate.
     """
     return f"{min(share, 1):.{digits}%}" if share <= 1.02 else "more than all"
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportedFileDocument:
-    """Of `export wireshark` and `export dbc`."""
+    """Result of `export wireshark` and `export dbc`."""
 
     file: str
     size_bytes: int
@@ -29,24 +29,24 @@ class ExportedFileDocument:
 
 @dataclass(frozen=True)
 class ExportedTraceDocument:
-    """Of `export trace`."""
+    """Result of `export trace`."""
 
     file: str
     frames: int
     remarks: int
-    """Frames with a comment."""
+    """Number of frames with a comment."""
     damage: str
-    """Where and why reading stopped; empty when the whole trace was read."""
+    """Place and reason at which reading stopped; empty if the whole trace was read."""
 
 
 @dataclass(frozen=True)
 class ExportedSignalsDocument:
-    """Of `export csv` and `export mf4`."""
+    """Result of `export csv` and `export mf4`."""
 
     file: str
     messages: int
     damage: str
-    """Where and why reading stopped; empty when the whole trace was read."""
+    """Place and reason at which reading stopped; empty if the whole trace was read."""
 
 
 DOCUMENTS: Final = (ExportedFileDocument, ExportedTraceDocument, ExportedSignalsDocument)
@@ -255,7 +255,7 @@ def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -
 
 
 def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[SignalRow], str]:
-    """The messages with one of the words in their titles, and where the trace cannot be read on."""
+    """Return the messages with one of the words in their titles, and where reading stopped."""
     from flasher.cli.look.monitor import check_messages  # noqa: PLC0415  loads python-can
     from flasher.export.signals import rows  # noqa: PLC0415  loads python-can
 
@@ -271,8 +271,8 @@ def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[SignalRow], str]
 
 
 def _warn(output: Output, trace: Path, damage: str, *, made: int) -> None:
-    """Warn about a damaged trace, or one without classic CAN frames. `made`: number of exported
-    frames or messages.
+    """Warn about a damaged trace, or one without classic CAN frames. `made` is the number of
+    exported frames or messages.
     """
     from flasher.trace.source import frames_until_damage, trace_file  # noqa: PLC0415  python-can
 

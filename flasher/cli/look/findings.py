@@ -1,5 +1,5 @@
-"""Rules of `flasher doctor`: findings about python-can, adapters, interfaces, the bus and its
-traffic. They only judge data that was collected before.
+"""Findings of `flasher doctor` about python-can, adapters, interfaces, the bus and its traffic.
+These functions judge data that was collected before.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from flasher.trace.decoder import bits_of
 from flasher.wording import wording
 
 _SHOWN_AT_MOST: Final = 20
-"""Limit of adapters listed."""
+"""Maximum number of listed adapters."""
 _EXAMPLES: Final = (
     "flasher doctor -i socketcan -c can0",
     "flasher doctor -i pcan -c PCAN_USBBUS1",
@@ -48,7 +48,7 @@ _LIST_INTERFACES: Final = "ip -brief link show type can"
 _VARIABLES: Final = ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG")
 _HIGH_LOAD: Final = 0.8
 _MANY_ERRORS: Final = 0.1
-"""Share of error frames from which a bus is called disturbed."""
+"""Share of error frames from which a bus counts as disturbed."""
 
 
 class Severity(Enum):
@@ -62,7 +62,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about what was checked, with commands that repair it."""
+    """Sentence about a check, with commands that repair the problem."""
 
     severity: Severity
     about: str
@@ -77,8 +77,8 @@ _ok, _note, _warning, _problem = (partial(Finding, severity) for severity in Sev
 # -- python-can ------------------------------------------------------------------------------------
 
 
-def setup(fallback: Fallback | None) -> Iterator[Finding]:
-    """The version of python-can, and its configuration outside the command line."""
+def python_can_setup(fallback: Fallback | None) -> Iterator[Finding]:
+    """Report the version of python-can, and its configuration outside the command line."""
     from flasher.python_can import can  # noqa: PLC0415  slow
 
     yield _ok("python-can", f"python-can {can.__version__}")
@@ -98,7 +98,7 @@ def setup(fallback: Fallback | None) -> Iterator[Finding]:
 
 
 def package(interface: str) -> Iterator[Finding]:
-    """Reports a missing Python package of the selected interface."""
+    """Report a missing Python package of the selected interface."""
     needed = needed_extra(interface)
     if needed is not None and importlib.util.find_spec(needed[1]) is None:
         extra, module = needed
@@ -107,7 +107,7 @@ def package(interface: str) -> Iterator[Finding]:
 
 
 def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
-    """Compares the requested bit rate with the one of the dialect."""
+    """Compare the requested bit rate with the dialect's."""
     if bitrate_bps != dialect.bitrate_bps:
         yield _warning(
             "adapter",
@@ -121,7 +121,7 @@ def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
 
 
 def adapter(detected: DetectionResult) -> Iterator[Finding]:
-    """The adapters that python-can detects, and the back ends that did not answer."""
+    """Report the adapters that python-can detects, and the back ends that did not answer."""
     for found in detected.found[:_SHOWN_AT_MOST]:
         details = " ".join(f"{key}={value}" for key, value in found.details.items())
         shown = printable(f"{found.interface} {found.channel} {details}".strip())
@@ -141,20 +141,20 @@ def adapter(detected: DetectionResult) -> Iterator[Finding]:
 
 
 def opened(name: str, *, is_silent: bool) -> Finding:
-    """The adapter was opened."""
+    """Report that the adapter was opened."""
     how = "listens without acknowledging" if is_silent else "acknowledges as usual"
     return _ok("adapter", f"{printable(name)} opens and {how}")
 
 
-def opening(error: BusError) -> Finding:
-    """Explains why opening the adapter failed."""
+def opening_failed(error: BusError) -> Finding:
+    """Explain why opening the adapter failed."""
     cause = f" ({printable(error.cause)})" if error.cause else ""
     what = f"{printable(error.what).rstrip('.')}{cause}"
     return _problem("adapter", what, (printable(error.remedy),))
 
 
-def unchosen(detected: DetectionResult) -> Finding:
-    """Explains how to select an adapter when none is."""
+def no_adapter_selected(detected: DetectionResult) -> Finding:
+    """Explain how to select an adapter if none is selected."""
     ways = [f"flasher doctor {printable(each.arguments)}" for each in detected.found]
     return _problem(
         "adapter",
@@ -164,93 +164,95 @@ def unchosen(detected: DetectionResult) -> Finding:
     )
 
 
-def nameless() -> Finding:
-    """SocketCAN without a channel receives from all interfaces, but cannot send."""
+def no_channel() -> Finding:
+    """Report a missing channel: SocketCAN then receives from all interfaces, but cannot send."""
     what = "no channel is named: without one, SocketCAN can send nothing"
     return _problem("interface", what, (_LIST_INTERFACES, _EXAMPLES[0]))
 
 
-def interface(seen: Interface | Unseen, channel: str, bitrate_bps: int) -> Iterator[Finding]:
-    """Checks a SocketCAN interface for the settings that flasher needs."""
+def interface(state: Interface | Unseen, channel: str, bitrate_bps: int) -> Iterator[Finding]:
+    """Check a SocketCAN interface for the settings that flasher needs."""
     name = printable(channel)
-    if seen is Unseen.CANNOT_TELL:
+    if state is Unseen.CANNOT_TELL:
         yield _note("interface", f"{name}: this system gives no information about it")
-    elif seen is Unseen.MISSING and not kernel_has_can():
+    elif state is Unseen.MISSING and not kernel_has_can():
         what = "this system's kernel has no CAN; an adapter that python-can drives itself (slcan, "
         yield _problem("interface", f"{what}gs_usb, pcan) works without", ("flasher adapters",))
-    elif seen is Unseen.MISSING:
+    elif state is Unseen.MISSING:
         yield _problem("interface", f"no interface {name} exists", find_commands(name))
-    elif isinstance(seen, Interface):
-        yield from _kind(seen, name, bitrate_bps)
+    elif isinstance(state, Interface):
+        yield from _kind(state, name, bitrate_bps)
 
 
-def _kind(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
-    if not seen.is_can:
+def _kind(state: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
+    if not state.is_can:
         yield _problem("interface", f"{name} is not a CAN interface", (_LIST_INTERFACES,))
         return
-    is_virtual = seen.kind in VIRTUAL_KINDS
-    if not seen.is_up:
+    is_virtual = state.kind in VIRTUAL_KINDS
+    if not state.is_up:
         start = f"ip link set {name} up" if is_virtual else start_command(name, bitrate_bps)
         yield _problem("interface", f"{name} is down", (start,))
     else:
         yield _ok("interface", f"{name} is up")
     if is_virtual:
-        what = f"{name} is virtual ({seen.kind}): no wire, no bit rate, no acknowledgement"
+        what = f"{name} is virtual ({state.kind}): no wire, no bit rate, no acknowledgement"
         yield _note("interface", what)
         return
-    yield from _bit_rate(seen, name, bitrate_bps)
-    yield from _modes(seen, name)
-    yield from _queue_and_restart(seen, name)
+    yield from _bit_rate(state, name, bitrate_bps)
+    yield from _modes(state, name)
+    yield from _queue_and_restart(state, name)
 
 
-def _bit_rate(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
+def _bit_rate(state: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
     wanted = f"{bitrate_bps / 1000:g} kbit/s"
-    if seen.bitrate_bps is None:
-        if seen.is_up:
+    if state.bitrate_bps is None:
+        if state.is_up:
             what = f"the bit rate of {name} is not known; {wanted} is needed"
             fix = (f"ip -details link show {name}",)
             yield _note("interface", what, fix)
-    elif seen.bitrate_bps != bitrate_bps:
+    elif state.bitrate_bps != bitrate_bps:
         yield _problem(
             "interface",
-            f"{name} runs at {seen.bitrate_bps / 1000:g} kbit/s, {wanted} is needed",
+            f"{name} runs at {state.bitrate_bps / 1000:g} kbit/s, {wanted} is needed",
             change_commands(name, f"bitrate {bitrate_bps}"),
         )
     else:
         yield _ok("interface", f"{name} runs at {wanted}")
 
 
-def _modes(seen: Interface, name: str) -> Iterator[Finding]:
+def _modes(state: Interface, name: str) -> Iterator[Finding]:
     harm = {
         "LISTEN-ONLY": (Severity.PROBLEM, "nothing can be sent"),
         "LOOPBACK": (Severity.PROBLEM, "it talks to itself only"),
         "ONE-SHOT": (Severity.WARNING, "a frame that meets an error is lost"),
     }
     for mode, (severity, why) in harm.items():
-        if mode in seen.modes:
+        if mode in state.modes:
             what = f"{name} is in {mode.lower()} mode: {why}"
             yield Finding(severity, "interface", what, change_commands(name, f"{mode.lower()} off"))
-    if "FD" in seen.modes:
+    if "FD" in state.modes:
         what = f"{name} takes CAN FD; the protocol is classic CAN, which works there as well"
         yield _note("interface", what)
 
 
-def _queue_and_restart(seen: Interface, name: str) -> Iterator[Finding]:
-    if seen.restart_ms == 0:
+def _queue_and_restart(state: Interface, name: str) -> Iterator[Finding]:
+    if state.restart_ms == 0:
         what = f"{name} stays off the bus after a bus-off"
-        if seen.can_restart:
+        if state.can_restart:
             fix = change_commands(name, "restart-ms 100")
             yield _warning("interface", f"{what} (restart-ms 0)", fix)
         else:
             yield _note("interface", f"{what}, until it is taken down and up again")
-    if seen.queue_frames is not None and seen.queue_frames < FRAMES_PER_PACKET:
-        what = f"the transmit queue of {name} holds {counted(seen.queue_frames, 'frame')}, a packet"
+    if state.queue_frames is not None and state.queue_frames < FRAMES_PER_PACKET:
+        what = (
+            f"the transmit queue of {name} holds {counted(state.queue_frames, 'frame')}, a packet"
+        )
         what += f" has {FRAMES_PER_PACKET}: flasher waits for room, nothing is to be done"
         yield _note("interface", what)
 
 
 def health(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[Finding]:
-    """The state of the controller and its error counters."""
+    """Report the state of the controller and its error counters."""
     counters = ""
     if health.tx_errors is not None:
         counters = f", error counters: transmit {health.tx_errors}, receive {health.rx_errors}"
@@ -283,7 +285,6 @@ class TrafficCounter:
         """Bit times of the frames on the wire."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Count a frame."""
         if frame.is_error:
             self.error_frames += 1
             return
@@ -302,13 +303,13 @@ class ListenResult:
     bitrate_bps: int
     dialect: Dialect
     is_silent: bool
-    """True when the adapter acknowledged nothing (listen-only)."""
+    """True if the adapter acknowledged no frame (listen-only)."""
     bus_arguments: str
-    """The options that select this bus."""
+    """Options that select this bus."""
 
     @property
     def frames_per_s(self) -> float:
-        """Rate of frames on the wire."""
+        """Frames per second on the wire."""
         return self.traffic.frames / self.duration_s if self.duration_s else 0.0
 
     @property
@@ -323,7 +324,7 @@ class ListenResult:
 
 
 def traffic(heard: ListenResult) -> Iterator[Finding]:
-    """Judges the quality of the traffic, and lists the nodes."""
+    """Judge the quality of the traffic, and list the nodes."""
     traffic, unreadable = heard.traffic, heard.health.unreadable
     if unreadable:
         what = f"{counted(unreadable, 'time')} the adapter delivered unreadable frames, "

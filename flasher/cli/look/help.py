@@ -28,7 +28,7 @@ _ALL: Final = "codes"
 
 @dataclass(frozen=True)
 class CodeDocument:
-    """A code with its explanation."""
+    """Error code with its explanation."""
 
     code: str
     title: str
@@ -38,7 +38,7 @@ class CodeDocument:
 
 @dataclass(frozen=True)
 class CodesDocument:
-    """The requested codes."""
+    """Requested codes."""
 
     codes: list[CodeDocument]
 
@@ -47,7 +47,7 @@ DOCUMENTS: Final = (CodesDocument,)
 
 
 def error_codes() -> dict[str, CodeDocument]:
-    """The codes of flasher/error_codes.md with their explanations."""
+    """Read the codes of flasher/error_codes.md with their explanations."""
     page = files("flasher").joinpath("error_codes.md").read_text(encoding="utf-8")
     return {
         code: CodeDocument(code, title, text.strip().replace("**", ""))

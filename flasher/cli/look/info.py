@@ -33,11 +33,11 @@ class InfoDocument:
     target: str
     dialect: str
     can_be_asked: bool
-    """False where the documents give no question to ask it."""
+    """False if the documents have no query for the device."""
     items: dict[str, dict[str, FieldValue] | None]
     """Each item with its fields; null for one that was not answered."""
     unanswered: dict[str, str]
-    """The reason for each null item."""
+    """Reason for each null item."""
     faults: FieldValue
     heard: HeardDocument | None
     two_devices: str | None = None
@@ -59,7 +59,7 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
-        error = None if found.is_there else silence(found)
+        error = None if found.is_there else silence_error(found)
         if error is not None:
             record.failed(error)
     if error is not None:
@@ -68,8 +68,8 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     return output.document(info_document(found))
 
 
-def silence(found: DeviceInfo) -> NoAnswerError:
-    """The error for a device that did not answer."""
+def silence_error(found: DeviceInfo) -> NoAnswerError:
+    """Create the error for a device that did not answer."""
     node = found.target.node.name
     if found.readings:
         return NoAnswerError(

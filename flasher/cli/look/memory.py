@@ -1,4 +1,4 @@
-"""Reads memory with a progress bar, and converts it to Intel HEX."""
+"""Memory reading with a progress bar, and conversion to Intel HEX."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from flasher.protocol.contents import Memory
 MEMORY = "memory"
 
 
-def read_shown(device: Device, start: int, end: int, output: Output, record: Recording) -> bytes:
-    """Read memory with a progress bar. Raises as `Device.read_memory`."""
+def read_with_bar(device: Device, start: int, end: int, output: Output, record: Recording) -> bytes:
+    """Read memory with a progress bar. Raises UsageError and NoAnswerError."""
     done = 0
 
     def show(event: object) -> None:

@@ -25,7 +25,7 @@ from flasher.trace.watcher import Filter, Watcher, replay
 from flasher.wording import wording
 
 REFRESH_S: Final = 0.25
-"""Time between two refreshes of the table: slow enough to read, quick enough to follow."""
+"""Interval of refreshes of the table: slow enough to read, quick enough to follow."""
 _EXAMPLES: Final = """\
 examples:
   flasher monitor -i socketcan -c can0
@@ -41,11 +41,11 @@ per message; `*` marks values that changed since the previous one. Ctrl-C ends i
 
 @dataclass(frozen=True)
 class MonitorDocument:
-    """Counts of frames and messages."""
+    """Numbers of frames and messages."""
 
     frames: int
     messages: int
-    """Shown, after filtering."""
+    """Messages shown, after filtering."""
     troubles: int
 
 
@@ -153,7 +153,7 @@ def monitor(
 
 
 def check_messages(wanted: Iterable[str]) -> None:
-    """Raises UsageError for words that no message title contains."""
+    """Raise UsageError for words that no message title contains."""
     titles = message_titles() + tuple(map(wording, Kind))
     for words in wanted:
         if not any(words.lower() in title.lower() for title in titles):

@@ -1,8 +1,8 @@
-"""Views of `flasher monitor`: lines, JSON lines, or a table of the latest of every message,
-refreshed in place on a terminal.
+"""Views of `flasher monitor`: text lines, JSON lines, or a table of the latest of every message.
 
-Column widths follow from the terminal's width alone, so nothing moves while values change. Text
-from the bus enters the table as `Text`, which is never parsed as markup.
+On a terminal the table is refreshed in place. Column widths follow from the terminal's width alone,
+so nothing moves while values change. Text from the bus enters the table as `Text`, which is never
+parsed as markup.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from flasher.trace.decoder import NOT_IN_DIALECT, BusEvent, Field, Kind
 from flasher.trace.watcher import MessageHistory, MessageTable, Pulse, TimedFrame
 
 _VALUE_WIDTH: Final = 64
-"""Longer values are cut in lines, unless -v is given."""
+"""Characters after which a value is truncated in lines, unless -v is given."""
 WIDE: Final = 116
-"""Below this width the table omits sender, receiver and count."""
+"""Width below which the table omits sender, receiver and count."""
 _CHANGED: Final = "bold yellow"
 _TROUBLE: Final = "red"
 _VALUE_MAX: Final = 160
@@ -36,23 +36,23 @@ _FRAME_LINES: Final = 7
 
 @dataclass(frozen=True)
 class SeenLine:
-    """A message, a damage or a foreign frame, decoded. `from` and `to` are nodes, "all", or empty
-    for an id of no node.
+    """Decoded message, damaged bytes, or foreign frame. `from` and `to` are nodes, "all", or empty
+    for the id of no node.
     """
 
     at_s: float
-    """Since the first of them."""
+    """Seconds since the first event."""
     kind: Kind
     can_id: int
     command: int | None
     from_: str
     to: str
     message: str
-    """Its title in the documents."""
+    """Title in the documents."""
     trouble: bool
     fields: dict[str, FieldValue]
     changed: list[str]
-    """Fields that differ from the same message before."""
+    """Fields that differ from the previous message of this kind."""
     in_dialect: bool
     """False for a message that the document of --dialect does not have."""
     event: Literal["Seen"] = "Seen"
@@ -60,7 +60,7 @@ class SeenLine:
 
 @dataclass(frozen=True)
 class FrameLine:
-    """A CAN frame as received (--raw)."""
+    """CAN frame as received (--raw)."""
 
     at_s: float
     kind: Literal["frame"]
@@ -94,7 +94,6 @@ class MonitorView:
         """Releases nothing here."""
 
     def __call__(self, event: object) -> None:
-        """Show one event."""
         match event:
             case BusEvent():
                 self.messages += 1
@@ -112,7 +111,7 @@ class MonitorView:
         return at - self._origin
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
-        """Show a message, a damage or a foreign frame."""
+        """Show a message, damaged bytes or a foreign frame."""
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
         """Show a frame, if raw frames are shown."""
@@ -122,7 +121,7 @@ class MonitorView:
 
 
 class LineView(MonitorView):
-    """One line, or one JSON document, per event."""
+    """Prints one line, or one JSON document, per event."""
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         # Faults are never cut.
@@ -171,7 +170,7 @@ class LineView(MonitorView):
 
 
 class TableView(MonitorView):
-    """The table: refreshed in place, or printed once at the end."""
+    """Table that is refreshed in place, or printed once at the end."""
 
     def __init__(self, output: Output, *, live: bool) -> None:
         super().__init__(output)
@@ -209,8 +208,8 @@ class TableView(MonitorView):
 
 
 class BoardView:
-    """Draws the board to fit the console: one row per field, or one row per message where that is
-    too long, limited to the height.
+    """Draws a message table to fit the console: one row per field, or one row per message if that
+    is too long, limited to the height.
     """
 
     def __init__(self, console: Console) -> None:
@@ -244,8 +243,8 @@ class BoardView:
 
 
 def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str]:
-    """All active faults over the whole width, since the columns of a table cut them. Faults without
-    room are counted.
+    """Return all active faults over the whole width, since the columns of a table truncate them.
+    Faults without room are counted.
     """
     wrapped = [
         part
@@ -352,7 +351,7 @@ def _tail(line: MessageHistory, now: float, *, wide: bool) -> list[Text]:
 
 
 def _cells(shown: Field, changed: set[str]) -> list[Text]:
-    """Label, value and unit; a mark also shows a change, for screens without colours."""
+    """Return label, value and unit; a mark also shows a change, for screens without colours."""
     text = shown.text
     if len(text) > _VALUE_MAX:  # it wraps: limited to half the screen
         text = f"{text[:_VALUE_MAX].rstrip()} ..."

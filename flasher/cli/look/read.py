@@ -14,7 +14,7 @@ from flasher.cli.documents import FieldValue, content_document
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.content import content_lines
-from flasher.cli.look.memory import MEMORY, intel_hex, read_shown
+from flasher.cli.look.memory import MEMORY, intel_hex, read_with_bar
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
@@ -42,7 +42,7 @@ any other raw binary) or --format. FILE is written whole or not at all.
 
 @dataclass(frozen=True)
 class ItemDocument:
-    """An item that was read."""
+    """Item that was read."""
 
     target: str
     item: str
@@ -66,7 +66,7 @@ class MemoryDocument:
 
 @dataclass(frozen=True)
 class ReadableDocument:
-    """The items that can be read, with the names of their fields."""
+    """Items that can be read, with the names of their fields."""
 
     items: dict[str, list[str]]
 
@@ -75,7 +75,7 @@ DOCUMENTS: Final = (ItemDocument, MemoryDocument, ReadableDocument)
 
 
 def _items(ctx: click.Context) -> list[str]:
-    """Completes the items that can be read, of the target if it is given."""
+    """Complete the items that can be read, of the target if it is given."""
     dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
     return [*readable(ctx.params.get("target") or BMS, dialect), MEMORY]
 
@@ -130,7 +130,7 @@ def read(
         raise UsageError("--format needs --output FILE.")
     check_writable(file, _OUTPUT)
     with recorded_device(recorded, bus, output, BMS) as (device, record):
-        data = read_shown(device, first, stop, output, record)
+        data = read_with_bar(device, first, stop, output, record)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
         write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT, is_private=True)

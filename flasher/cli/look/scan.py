@@ -33,18 +33,18 @@ that is not listed may still be there: most send only now and then.
 
 @dataclass(frozen=True)
 class ScanDocument:
-    """The devices on the bus."""
+    """Devices on the bus."""
 
     bitrate_bps: int
     bitrate_source: str
-    """Source of the dialect."""
+    """Source of the bit rate."""
     bitrate_is_assumed: Literal[True]
-    """Not visible in frames."""
+    """Frames do not show their bit rate."""
     dialect: str | None
     dialect_because: str
     nodes: dict[str, HeardDocument]
     foreign_frames: int
-    """Frames with ids of no documented node."""
+    """Frames with undocumented CAN ids."""
     two_devices: str | None = None
     """Evidence of a second device of one kind, such as an answer that came twice."""
 
@@ -91,7 +91,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
 
 
 def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str]:
-    """The dialect and its evidence: the traffic, or else the bit rate in use."""
+    """Return the dialect and its evidence: the traffic, or else the bit rate in use."""
     guessed, why = survey.guess_dialect()
     if guessed is not None:
         return guessed, why
@@ -106,7 +106,7 @@ def _lines(
     survey: Survey, rate: BitRate, asked: Dialect, guessed: Dialect | None, why: str
 ) -> list[str]:
     lines = [
-        f"bit rate: {rate}; frames do not tell it",
+        f"bit rate: {rate}; not visible in frames",
         f"dialect:  {guessed.name if guessed else 'unknown'} ({why})",
     ]
     if guessed is not None and guessed is not asked:

@@ -42,13 +42,13 @@ class WrittenDocument:
     target: str
     item: str
     confirmed: bool
-    """True when the device acknowledged the write."""
+    """True if the device acknowledged the write."""
     fields: dict[str, FieldChange]
 
 
 @dataclass(frozen=True)
 class NotWrittenDocument:
-    """The user declined the write."""
+    """Result of a write that the user declined."""
 
     written: Literal[False]
 
@@ -63,7 +63,7 @@ class WritableItem:
 
 @dataclass(frozen=True)
 class WritableDocument:
-    """The items that can be written."""
+    """Items that can be written."""
 
     items: dict[str, WritableItem]
 
@@ -72,7 +72,7 @@ DOCUMENTS: Final = (WrittenDocument, NotWrittenDocument, WritableDocument)
 
 
 def _items(ctx: click.Context) -> list[str]:
-    """Completes the items that can be written, of the target if it is given."""
+    """Complete the items that can be written, of the target if it is given."""
     dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
     return list(writable(ctx.params.get("target") or BMS, dialect))
 

@@ -1,6 +1,4 @@
-"""The bench page of `flasher ui`: adapters, recordings and the history for the bench, and its
-server.
-"""
+"""Bench page of `flasher ui`: adapters, virtual bikes, recordings, history, and the server."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ from platformdirs import user_data_path, user_state_path
 from flasher.api import CallOptions, Connection, Job, connect
 from flasher.bus.opening import bus_config
 from flasher.bus.physical import is_physical
-from flasher.cli.adapters import described, detected_until, ports, using
+from flasher.cli.adapters import describe_adapter, detect_until, slcan_ports, with_adapter
 from flasher.cli.files import write_whole
 from flasher.cli.look.backup import DEVICE_MODEL, backup_of
 from flasher.cli.options import Bus, holder
@@ -57,11 +55,11 @@ from flasher.web.virtual_bike import NOTES, BikeFault, VirtualBike
 
 _TURN_S: Final = 0.2
 _MEMORY_MAX: Final = 4096
-"""Limit in bytes of the file with the last adapter."""
+"""Maximum size in bytes of the file with the last choices."""
 
 
 class LastChoices:
-    """The adapter and image folder last chosen on the page."""
+    """Adapter and image folder that were last chosen on the page."""
 
     def __init__(self) -> None:
         self._path = user_state_path("flasher", appauthor=False) / "ui.json"
@@ -74,7 +72,7 @@ class LastChoices:
             return {}
 
     def kept(self, name: str) -> str:
-        """The last choice; empty without one."""
+        """Return the last choice; empty without one."""
         return self._all().get(name, "")
 
     def keep(self, **choices: str) -> None:
@@ -86,7 +84,7 @@ class LastChoices:
 
 @dataclass
 class _Place:
-    """Shared by both kinds of workplace: the record of an upgrade, and product profiles."""
+    """Base of both bench back ends: recording of an upgrade, backups, and profiles."""
 
     _bus: Bus
     _output: Output
@@ -198,7 +196,7 @@ class _Place:
     def _listener(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
     ) -> Callable[[object], None]:
-        """Builds the listener for events of an upgrade that begins."""
+        """Create the listener for events of an upgrade that begins."""
         return on_event
 
 
@@ -217,7 +215,7 @@ def _backup_name(found: DeviceInfo) -> str:
 
 @dataclass
 class Adapters(_Place):
-    """The adapters of this computer."""
+    """Bench back end with the adapters of this computer."""
 
     _buses: dict[str, Bus] = field(default_factory=dict)
 
@@ -229,14 +227,14 @@ class Adapters(_Place):
             name = printable(f"{merged['interface']} {merged.get('channel') or ''}".strip())
             self._buses[name] = self._bus
             notes[name] = text("named on the command line or in the settings")
-        found = [each for each in detected_until(cancelled).found if each.channel]
-        maybe = {each.channel for each in ports() or ()}
-        for each in (*found, *(ports() or ())):
+        found = [each for each in detect_until(cancelled).found if each.channel]
+        maybe = {each.channel for each in slcan_ports() or ()}
+        for each in (*found, *(slcan_ports() or ())):
             name = printable(f"{each.interface} {each.channel}")
             if name not in self._buses:
-                self._buses[name] = using(each, self._bus)
+                self._buses[name] = with_adapter(each, self._bus)
                 is_port = each.channel in maybe and each not in found
-                note = described(each, self.dialect)
+                note = describe_adapter(each, self.dialect)
                 notes[name] = (
                     text("a serial port: perhaps an slcan adapter. {note}", note=note)
                     if is_port
@@ -265,7 +263,7 @@ class Adapters(_Place):
 
 @dataclass
 class VirtualBikes(_Place):
-    """Bikes without hardware."""
+    """Bench back end with virtual bikes, without hardware."""
 
     _bikes: dict[str, VirtualBike] = field(default_factory=dict)
 
@@ -273,7 +271,7 @@ class VirtualBikes(_Place):
         return [Adapter(fault.value, NOTES[fault]) for fault in BikeFault]
 
     def use(self, adapter: Adapter) -> None:
-        """A bike keeps its state, so that it can be rescued."""
+        """Select a bike, which keeps its state, so that it can be rescued."""
         if adapter.name not in self._bikes:
             speed = self._bus.mock_speed
             self._bikes[adapter.name] = VirtualBike(
@@ -291,7 +289,7 @@ class VirtualBikes(_Place):
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> bench.UpgradeEnding:
-        """Shows a bike's fault instead of waiting for it until the overall deadline."""
+        """Limit the attempts, to show a bike's fault before the overall deadline."""
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
 
@@ -353,8 +351,8 @@ def serve(
 
 
 def _folder(images: Path | None, memory: LastChoices) -> Path:
-    """The image folder: the given one, else the last one used, else the working directory. Raises
-    UsageError if it is not a folder.
+    """Return the image folder: the given one, else the last one used, else the working directory.
+    Raises UsageError if it is not a folder.
     """
     if images is not None and not images.expanduser().is_dir():
         raise UsageError(
@@ -367,8 +365,8 @@ def _folder(images: Path | None, memory: LastChoices) -> Path:
 
 
 def _wait(machine: BenchController, worker: threading.Thread, stop: Stop) -> bool:
-    """Wait until the user ends it; True during an upgrade. A lost terminal ends it too, but an
-    upgrade then finishes by itself.
+    """Wait until the user ends the server; True during an upgrade. A lost terminal ends it too, but
+    an upgrade then finishes by itself.
     """
     was_upgrading = False
     while worker.is_alive():

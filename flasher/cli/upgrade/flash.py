@@ -1,4 +1,4 @@
-"""`flasher flash` and `flasher rescue`: one upgrade of a device."""
+"""`flasher flash` and `flasher rescue`: upgrade a device."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class UpgradeChoices:
     )]  # fmt: skip
 
     def allows(self, name: str) -> bool:
-        """True when --allow-NAME or --force was given."""
+        """True if --allow-NAME or --force was given."""
         return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
 
     def waived_checks(self) -> frozenset[IdentityCheck]:
@@ -166,8 +166,8 @@ class UpgradeChoices:
         return frozenset(check for check in WAIVABLE if self.allows(check.value))
 
     def options(self, profile: Profile, wait: float | None) -> UpgradeOptions:
-        """Options of the command line, with the profile as default. Raises UsageError for options
-        that exclude each other.
+        """Return the options of the command line, with the profile as default. Raises UsageError
+        for options that exclude each other.
         """
         names = {each.name for each in (*fields(UpgradeOptions), *fields(Timings))}
         chosen = {name: value for name, value in vars(self).items() if name in names}
@@ -240,7 +240,7 @@ def rescue(
 
 @dataclass
 class _Upgrade:
-    """One upgrade and its output."""
+    """Upgrade by `flash` or `rescue`, and its output."""
 
     output: Output
     target: Target
@@ -256,7 +256,7 @@ class _Upgrade:
         power_up_timeout_s: float | None = None,
         skip_same_version: bool = False,
     ) -> int:
-        """Returns the exit code."""
+        """Prepare and run the upgrade, or show its plan; return the exit code."""
         output, choices = self.output, self.choices
         output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
@@ -341,7 +341,7 @@ class _Upgrade:
     def _watching(
         self, job: api.Job, connection: api.Connection, record: Recording
     ) -> Iterator[api.CallOptions]:
-        """Shows the upgrade on the terminal, and stops it on request."""
+        """Show the upgrade on the terminal, and stop it on request."""
         output = self.output
         output.progress(f"on {connection.name} at {connection.bit_rate}")
         with (
@@ -375,7 +375,7 @@ class _Upgrade:
         return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     def _add_repair(self, error: FlasherError) -> None:
-        """Adds the command that repairs a device left without an application."""
+        """Add the command that repairs a device left without an application."""
         if error.needs_rescue and not self.bus.mock:
             # An image that the device refused repairs nothing.
             is_refused = error.exit_code is ExitCode.REFUSED
@@ -396,8 +396,8 @@ _OF_THE_IMAGE: Final = frozenset(
 
 
 def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
-    """The `flasher rescue` command for the command of `ctx`, quoted for a shell. Options about an
-    image that the device refused are omitted.
+    """Return the `flasher rescue` command for the command of `ctx`, quoted for a shell. Options
+    about an image that the device refused are omitted.
     """
 
     def is_left_out(name: str) -> bool:

@@ -34,11 +34,11 @@ class HistoryDocument:
 
     file: str
     flashes: list[Flash]
-    """The latest first."""
+    """Upgrades, the latest first."""
     total: int
-    """Number of matching entries, shown or not."""
+    """Number of matching upgrades, shown or not."""
     damaged_lines: int
-    """Unreadable lines of the file."""
+    """Number of unreadable lines in the file."""
 
 
 DOCUMENTS: Final = (HistoryDocument,)
@@ -96,7 +96,7 @@ def _lines(flash: Flash, *, is_open: bool) -> Iterator[str]:
         return
     if ended is None:
         yield "  end      began, no end recorded: the program was killed or the computer lost power"
-        yield printable(f"  reached  {reached(flash)}")
+        yield printable(f"  reached  {describe_progress(flash)}")
         if is_open:
             yield printable(f"  device   {flash.device_left}")
             yield from _repair_lines(began)
@@ -116,13 +116,13 @@ def _lines(flash: Flash, *, is_open: bool) -> Iterator[str]:
 
 
 def _repair_lines(began: Began) -> Iterator[str]:
-    yield printable(f"  repair   {again(began)}")
+    yield printable(f"  repair   {repeat_command(began)}")
     if began.folder not in ("", working_folder()):
         yield printable(f"           (in {began.folder})")
 
 
-def reached(flash: Flash) -> str:
-    """Progress of an upgrade without a recorded end."""
+def describe_progress(flash: Flash) -> str:
+    """Describe the progress of an upgrade without a recorded end."""
     found = flash.reached
     if found is None:
         return "nothing that erases, as far as is known"
@@ -130,6 +130,6 @@ def reached(flash: Flash) -> str:
     return f"{wording_of('Phase', found.phase)}{packet}"
 
 
-def again(began: Began) -> str:
-    """The command that repeats an upgrade without a recorded end."""
+def repeat_command(began: Began) -> str:
+    """Return the command that repeats an upgrade without a recorded end."""
     return began.again or "flasher ui"

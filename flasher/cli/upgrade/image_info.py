@@ -37,12 +37,12 @@ examples:
 
 @dataclass(frozen=True)
 class ImageInfoDocument:
-    """Contents of a file, its manifest, and the plan of an upgrade."""
+    """Contents of an image file, its manifest, and the plan of an upgrade."""
 
     image: ImageDocument
     manifest: ManifestBesideDocument
     plan: PlanDocument
-    """For the BMS without a target: others differ only by their ids."""
+    """Plan for the BMS without a target: others differ only by their ids."""
 
 
 DOCUMENTS: Final = (ImageInfoDocument,)

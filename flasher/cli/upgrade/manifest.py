@@ -37,7 +37,7 @@ from flasher.settings.manifest import (
 
 @dataclass(frozen=True)
 class StatementDocument:
-    """One statement of a manifest, compared with the image."""
+    """Value of a manifest key, compared with the image."""
 
     check: str
     result: Literal["agrees", "differs", "unchecked"]
@@ -48,7 +48,7 @@ class StatementDocument:
 
 @dataclass(frozen=True)
 class ManifestCreateDocument:
-    """Of `manifest create`."""
+    """Result of `manifest create`."""
 
     image: str
     manifest: str
@@ -58,7 +58,7 @@ class ManifestCreateDocument:
 
 @dataclass(frozen=True)
 class ManifestCheckDocument:
-    """Of `manifest check`."""
+    """Result of `manifest check`."""
 
     image: str
     manifest: str
@@ -97,7 +97,7 @@ Exit code 3 where the image is not the one of the manifest, or there is no right
 it is for another target.
 """
 _FOR_A_DEVICE: Final = ("hardware_versions", "minimum_boot_version", "previous_from")
-"""Statements that only a device's answers can confirm."""
+"""Keys whose values only a device's answers can confirm."""
 
 
 @group(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE, ExitCode.WRONG_DEVICE))
@@ -108,8 +108,8 @@ def manifest() -> None:
 # -- create ---------------------------------------------------------------------------------------
 
 
-def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Decorator:
-    """Option for a statement of the manifest, parsed as the manifest's key."""
+def _key_option(key: str, metavar: str, text: str, *, is_list: bool = False) -> Decorator:
+    """Declare the option for a key of the manifest, parsed like the key."""
     name = key.removesuffix("s" if is_list else "").replace("_", "-")
 
     def read(value: str) -> str:
@@ -129,12 +129,14 @@ def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Deco
 @image_options
 @target_option()
 @allow_implausible_option()
-@_stated("firmware_version", FIRMWARE_VERSION_FORM, "(default: the one inside)")
-@_stated("minimum_boot_version", BOOT_VERSION_FORM, "the oldest bootloader that may receive it")
-@_stated("previous_from", FIRMWARE_VERSION_FORM, "the oldest running version that it may replace")
-@_stated("notes", "TEXT", "what a person should know")
-@_stated("hardware_versions", "V", "hardware that it fits; * matches any text", is_list=True)
-@_stated("previous_except", "V", "running versions that it must not replace", is_list=True)
+@_key_option("firmware_version", FIRMWARE_VERSION_FORM, "(default: the one inside)")
+@_key_option("minimum_boot_version", BOOT_VERSION_FORM, "the oldest bootloader that may receive it")
+@_key_option(
+    "previous_from", FIRMWARE_VERSION_FORM, "the oldest running version that it may replace"
+)
+@_key_option("notes", "TEXT", "what a person should know")
+@_key_option("hardware_versions", "V", "hardware that it fits; * matches any text", is_list=True)
+@_key_option("previous_except", "V", "running versions that it must not replace", is_list=True)
 @option(
     "-o", "--output", "file", metavar="FILE", type=values.FilePath("toml"), panel="manifest",
     brief=True, help="(default: beside IMAGE, IMAGE.toml)",
@@ -172,7 +174,7 @@ def create(
 
 
 def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
-    """Raises UsageError if the manifest must not or cannot be written."""
+    """Raise UsageError if the manifest must not or cannot be written."""
     check_writable(path, "-o")
     if not path.exists():
         return
@@ -225,7 +227,7 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
 
 
 def stated_rows(release: Release) -> dict[str, str]:
-    """Statements of a manifest as text, escaped for a terminal."""
+    """Format the values of a manifest, escaped for a terminal."""
     rows = {}
     for key in STATEMENTS:
         value: Any = getattr(release, key)
@@ -239,12 +241,14 @@ def stated_rows(release: Release) -> dict[str, str]:
 
 
 def checks_of(release: Release, image: Image, target: Target | None) -> list[StatementDocument]:
-    """Every statement of a manifest, compared with image and target, or why it was not."""
-    checks = [_held(finding, "the image") for finding in release.findings(image)]
+    """Compare every key of a manifest with image and target, or explain why it was not compared."""
+    checks = [_statement(finding, "the image") for finding in release.findings(image)]
     asked = None if target is None else target.node.name
     stated = release.target.node.name
     agrees = None if asked is None else asked == stated
-    checks.append(_held(Comparison("requested_target", stated, asked, agrees), "the command line"))
+    checks.append(
+        _statement(Comparison("requested_target", stated, asked, agrees), "the command line")
+    )
     rows = stated_rows(release)
     for key in (*_FOR_A_DEVICE, "previous_except"):
         if key in rows:
@@ -256,8 +260,8 @@ def checks_of(release: Release, image: Image, target: Target | None) -> list[Sta
     return checks
 
 
-def _held(finding: Comparison, other: str) -> StatementDocument:
-    """A finding; `other` is the thing that the manifest is compared with."""
+def _statement(finding: Comparison, other: str) -> StatementDocument:
+    """Convert a comparison; `other` names the source of the compared value."""
     stated, found = finding.stated, finding.found
     if finding.agrees is None:
         detail = (
@@ -277,7 +281,7 @@ def _held(finding: Comparison, other: str) -> StatementDocument:
 
 @dataclass(frozen=True)
 class ManifestBesideDocument:
-    """The manifest beside an image; `problem` explains why it does not match."""
+    """Manifest next to an image; `problem` explains why it does not match."""
 
     file: str
     found: bool
@@ -289,7 +293,7 @@ class ManifestBesideDocument:
 def manifest_beside(
     path: str | os.PathLike[str], image: Image, target: Target | None
 ) -> ManifestBesideDocument:
-    """Finds the manifest beside an image and compares it with the image and `target`. Errors are
+    """Find the manifest next to an image and compare it with the image and `target`. Errors are
     reported in the result, not raised.
     """
     beside = str(manifest_path(path))
@@ -314,7 +318,7 @@ def manifest_beside(
 
 
 def beside_line(beside: ManifestBesideDocument) -> str:
-    """Its line in `image-info`."""
+    """Format the manifest's line in `image-info`."""
     file, release = printable(beside.file), beside.release
     if not beside.found:
         return f"  release: no manifest beside it ({file})"

@@ -53,7 +53,7 @@ ProfileValue = str | bool | int | float | list[int] | None
 
 @dataclass(frozen=True)
 class SourcedValue:
-    """A setting with its source."""
+    """Setting with its source."""
 
     value: ProfileValue
     source: str
@@ -71,11 +71,11 @@ class ProfileDocument:
 
 @dataclass(frozen=True)
 class CheckedProfileDocument:
-    """A valid profile."""
+    """Valid profile."""
 
     file: str
     targets: list[str]
-    """The targets with tables of their own."""
+    """Targets with their own tables."""
 
 
 DOCUMENTS: Final = (ProfileDocument, CheckedProfileDocument)
@@ -104,7 +104,7 @@ def show(output: Output, target: Target, *, dialect_name: str, profile: str | No
     """Show every setting with its source."""
     holds = load_profile(profile, target, as_dialect(dialect_name))
     output.table(
-        (name, _shown(name, value), printable(holds.sources[name]))
+        (name, _as_in_file(name, value), printable(holds.sources[name]))
         for name, value in holds.values()
     )
     shown = {
@@ -113,8 +113,8 @@ def show(output: Output, target: Target, *, dialect_name: str, profile: str | No
     return output.document(ProfileDocument(holds.target.name, holds.dialect.name, shown))
 
 
-def _shown(name: str, value: object) -> str:
-    """A value in the notation of the file."""
+def _as_in_file(name: str, value: object) -> str:
+    """Format a value in the notation of the file."""
     match value:
         case None:
             return "not set"

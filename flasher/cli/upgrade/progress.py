@@ -68,7 +68,7 @@ class Progress:
 
 
 def _is_shown(event: object) -> bool:
-    """True for an event with a line or bar of its own."""
+    """True for an event with its own line or bar."""
     has_more = isinstance(
         event, events.PacketAcknowledged | events.AdapterAwaited | events.PowerCycleAwaited
     )

@@ -1,4 +1,4 @@
-"""Formats images, plans and upgrades as text and JSON, for `flash`, `rescue` and `image-info`."""
+"""Texts and JSON of images, plans and upgrades, for `flash`, `rescue` and `image-info`."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _NO_QUERY = ": the document gives this target no query for it"
 
 @dataclass(frozen=True)
 class UpgradeDocument:
-    """An upgrade. Transferred, completed and running are three claims: see `outcome` for the first
-    two, `verification` for the third.
+    """Result of an upgrade. Transferred, completed and running are three claims: see `outcome` for
+    the first two, `verification` for the third.
     """
 
     image: ImageDocument
@@ -46,9 +46,9 @@ class UpgradeDocument:
     previous_version: str | None
     """Version before the upgrade; null without an answer."""
     shutdown_heard: bool
-    """The battery sent SHUTDOWN meanwhile."""
+    """The battery sent SHUTDOWN during the upgrade."""
     link: LinkReport | None
-    """Times on the line; null when no packet was answered."""
+    """Bus usage; null if no packet was sent."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class DryRunDocument:
 
 
 def image_lines(image: Image) -> list[str]:
-    """Contents of the file."""
+    """Describe an image file."""
     lines = [f"{printable(image.source)}: {image.format}, {byte_count(image.size_bytes)} to send"]
     if image.base is None:
         lines.append("  address: unknown (a raw binary has none; --base sets it)")
@@ -84,7 +84,7 @@ def image_lines(image: Image) -> list[str]:
 
 
 def vector_lines(table: VectorTable | None) -> list[str]:
-    """Whether it looks like a Cortex-M application."""
+    """Describe the vector table of an image, and whether it is plausible for a Cortex-M."""
     if table is None:
         return ["  start:   too short for a vector table"]
     words = f"stack pointer 0x{table.stack_pointer:08X}, reset vector 0x{table.reset_vector:08X}"
@@ -96,7 +96,7 @@ def vector_lines(table: VectorTable | None) -> list[str]:
 
 
 def plan_lines(plan: Plan, options: UpgradeOptions) -> list[str]:
-    """The bytes to be sent, their target, and the time on the bus, gaps included."""
+    """Describe the plan: bytes to be sent, target, and time on the bus, with gaps."""
     target = plan.target
     ids = f"CAN ids 0x{target.request_id:03X}, 0x{target.answer_id:03X}"
     document_bps = {dialect.bitrate_bps for dialect in DIALECTS.values() if dialect.has_upgrade}
@@ -130,7 +130,7 @@ _LEFT: Final = {
 
 
 def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> ClosingLine:
-    """The last line of an upgrade that completed or was not needed."""
+    """Return the last line of an upgrade."""
     outcome, node = result.outcome, result.outcome.target.node.name
     took = f"  {took_s:.1f} s"
     error = result.error()
@@ -160,11 +160,11 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
 
 
 _LINE_MAX: Final = 120
-"""Limit in characters: a longer text loses its remark in brackets."""
+"""Maximum number of characters: a longer text loses its remark in brackets."""
 
 
 def failed(error: FlasherError, more: str = "") -> ClosingLine:
-    """The last line of an upgrade that failed; the whole error is printed above it."""
+    """Return the last line of an upgrade that failed; the whole error is printed above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
     what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
     if len(what) > _LINE_MAX:
@@ -175,7 +175,7 @@ def failed(error: FlasherError, more: str = "") -> ClosingLine:
 
 
 def summary_lines(result: Result, plan: Plan) -> list[str]:
-    """The final lines of a successful upgrade: three separate claims."""
+    """Return the final lines of a successful upgrade: three separate claims."""
     outcome = result.outcome
     figures = outcome.statistics
     transfer_s = figures.transfer_s or 0.0
@@ -192,7 +192,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
 
 
 def link_lines(report: LinkReport) -> list[str]:
-    """Times of both ends as min / median / p95 / p99 / max."""
+    """Format the times of both ends as min / median / p95 / p99 / max."""
     return [
         f"{end:<13} {spread_ms(figures)} ms {doing}"
         for end, figures, doing in (
@@ -204,13 +204,13 @@ def link_lines(report: LinkReport) -> list[str]:
 
 
 def unreadable_line(count: int) -> str:
-    """An adapter that damages frames slows an upgrade down without stopping it."""
+    """Describe unreadable inputs, which slow an upgrade down without stopping it."""
     times = "once" if count == 1 else f"{count:,} times"
     return f"{times} the adapter delivered unreadable frames; try another cable, port or adapter"
 
 
 def _running(result: Result) -> str:
-    """The application that runs now, and its evidence."""
+    """Describe the application that runs now, and the evidence."""
     verification = result.verification
     if verification.verdict is Verdict.NOT_ASKED:
         no_query = "" if _has_query(result) else _NO_QUERY
@@ -223,7 +223,7 @@ def _has_query(result: Result) -> bool:
 
 
 def _rate(plan: Plan, transfer_s: float) -> str:
-    """Bytes per second, and as a share of the line rate."""
+    """Format bytes per second, and the share of the line rate."""
     if not transfer_s:
         return ""
     share = plan.transfer_wire_s / transfer_s
@@ -265,7 +265,7 @@ def upgrade_document(
     checks: Iterable[CheckMade],
     link: LinkReport | None,
 ) -> UpgradeDocument:
-    """The document of an upgrade, successful or not."""
+    """Create the document of an upgrade, successful or not."""
     return UpgradeDocument(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),

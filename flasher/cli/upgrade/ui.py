@@ -31,7 +31,7 @@ docs/how-to/bench_page.md.
 
 @dataclass(frozen=True)
 class ServingLine:
-    """The page is served."""
+    """The page is being served."""
 
     event: Literal["serving"]
     address: str

@@ -1,5 +1,5 @@
-"""Runs one upgrade and records it: frames, a bundle when it fails, and this computer's history. A
-failure to record changes nothing about the upgrade: it only prints a warning.
+"""Upgrade run with recording: frames, a bundle if it fails, and this computer's history. A failure
+to record does not affect the upgrade: it only prints a warning.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
 Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]]
-"""Entered when the bus is open; gives the listeners of the upgrade."""
+"""Entered when the bus is open; yields the listeners of the upgrade."""
 
 
 @dataclass
 class UpgradeRun:
-    """One upgrade; `write_planned` fills in its facts."""
+    """Upgrade with its recording; `write_planned` fills in its facts."""
 
     job: Job
     bus: Bus
@@ -44,25 +44,25 @@ class UpgradeRun:
     on_failure: Callable[[FlasherError], None] = lambda _error: None
     """Completes an error before it is recorded."""
     again: str = ""
-    """Command that repeats it after this program was killed; empty for the page."""
+    """Command that repeats the upgrade after this program was killed; empty for the page."""
     checks: list[CheckMade] = field(default_factory=list)
     record: Recording | None = None
     document: UpgradeDocument | None = None
     error: FlasherError | None = None
-    """The completed error of a failed upgrade."""
+    """Completed error of a failed upgrade."""
     took_s: float = 0.0
     warning: str = ""
-    """Why it is missing in the history; empty if it is there."""
+    """Reason why the upgrade is missing in the history; empty if it is there."""
     _history: FlashHistory = field(default_factory=FlashHistory)
     _name: str | None = None
-    """In the history; None before the start."""
+    """Name in the history; None before the start."""
     _serial_number: str | None = None
     _result: Result | None = None
 
     def write_planned(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
     ) -> Result:
-        """Returns the result, good or bad. Raises BusError and InterruptedByUserError."""
+        """Run, record and return the upgrade. Raises BusError and InterruptedByUserError."""
         try:
             result = self._recorded(connect, watching)
         except BaseException as failure:
@@ -137,7 +137,7 @@ class UpgradeRun:
     # -- the history -------------------------------------------------------------------------------
 
     def _left_open(self, adapter: str) -> UpgradeLeftOpen | None:
-        """The upgrade that may have left the device on this adapter in its session (R26)."""
+        """Return the upgrade that may have left the device here in its transfer (R26)."""
         if self.bus.mock:
             return None
         target, adapter = self.job.plan.target.name, printable(adapter)
