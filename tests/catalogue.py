@@ -32,8 +32,17 @@ from flasher.protocol.contents import BatteryFault
 from flasher.protocol.fields import flag_names, label
 from flasher.protocol.messages import BootVersion, Packet, UpdateCommand
 from flasher.report.chart import MarkKind
+from flasher.station.records.chain import NAMED, OWN
 from flasher.station.records.errors import NOT_SAVED
-from flasher.station.records.model import RunKind, StepName, StepState, Verified
+from flasher.station.records.model import (
+    AFTER_RESTART,
+    BY_POWER,
+    POWER_CYCLES,
+    RunKind,
+    StepName,
+    StepState,
+    Verified,
+)
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
 from flasher.translation import NAMES
@@ -95,6 +104,8 @@ def sentences() -> Iterator[str]:
         "not answered",
     )
     yield from (NOT_SAVED, "[Errno {number}] {error}")
+    yield from (POWER_CYCLES, AFTER_RESTART, BY_POWER, *NAMED.values(), *OWN.values())
+    yield from ("it was removed", "it was added", "it was changed", "before {measurement}")
     yield from _SYSTEM
     named = ("model", "serial number", "hardware version", "firmware version")
     yield from (f"{{target}} {word}" for word in (*named, *(each.value for each in IdentityCheck)))

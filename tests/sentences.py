@@ -14,14 +14,17 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 _SHOWN: Final = (
-    "procedures", "files", "bus/adapter", "bus/health", "bus/lock", "bus/opening", "bus/simulated",
-    "host/event_text", "host/guard", "host/identity", "host/outcome", "host/query", "host/session",
-    "host/upgrade", "host/verify", "image/load", "image/plausible", "image/records",
-    "image/release", "settings/manifest", "trace/explain", "trace/observed_upgrade",
+    "procedures", "files", "bus/adapter", "bus/bit_rate", "bus/health", "bus/lock", "bus/opening",
+    "bus/simulated", "host/event_text", "host/guard", "host/identity", "host/outcome",
+    "host/query", "host/session", "host/upgrade", "host/verify", "image/cortexm", "image/elf",
+    "image/load", "image/plausible", "image/records", "image/release", "image/segments",
+    "settings/manifest",
+    "trace/blf", "trace/bounds", "trace/explain", "trace/observed_upgrade", "trace/pcapng",
     "trace/reader", "trace/source", "trace/steps", "trace/verdict", "report/base",
     "report/chart", "report/explain_page", "report/sequence", "station/certificate_check",
     "station/continuity", "station/recipe", "station/power", "station/sealed", "station/stories",
-    "station/unit_*", "station/worker", "station/records/errors", "station/records/queries",
+    "station/unit_*", "station/worker", "station/records/errors", "station/records/examination",
+    "station/records/files", "station/records/proof", "station/records/queries",
     "web/archive", "web/bench", "web/supervisor", "cli/upgrade/bench_page",
 )  # fmt: skip
 _NOT_SHOWN: Final = (
@@ -32,7 +35,7 @@ _NOT_SHOWN: Final = (
 _SENTENCE: Final = re.compile(
     r"[A-Za-z]{2,}.* .*[a-z]{2,}|^[A-Za-z]{3,}:? \{|\}[:,;]? [A-Za-z]{3,}"
 )
-_CODE: Final = re.compile(r"SELECT |<|\.\w+ |text/|chmod |cp |\{\w+:%")
+_CODE: Final = re.compile(r"SELECT |PRAGMA |<|\.\w+ |text/|chmod |cp |\{\w+:%")
 
 
 def spoken() -> Iterator[str]:

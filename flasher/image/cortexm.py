@@ -107,10 +107,9 @@ def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
     reach = image.size_bytes if image.base is None else _MEMORY_SIZE
     if max(vectors) - min(vectors) < reach:
         return []
-    return [
-        "its reset, NMI and hard fault vectors lie further apart than the "
-        + ("image is long: it is part of a program" if image.base is None else "memory reaches")
-    ]
+    if image.base is None:
+        return ["its reset, NMI and hard fault vectors are too far apart: it is part of a program"]
+    return ["its reset, NMI and hard fault vectors are further apart than the memory reaches"]
 
 
 def check_starts_inside(image: Image) -> None:

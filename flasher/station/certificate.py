@@ -92,11 +92,14 @@ def proven(store: Store, life: UnitLife) -> Proof:
     if last is None or last.state is RunState.RUNNING:
         return Proof()
     found = store.examine_run(last.run_id)
-    if found.problems:
+    for problem in found.problems:
         raise UnprovenError(
-            f"No certificate for {printable(life.serial)}: its records were changed.",
-            cause=f"{found.problems[0].where}: {found.problems[0].what}",
-            remedy="List all problems with flasher station verify.",
+            text(
+                "No certificate for {serial}: its records were changed.",
+                serial=printable(life.serial),
+            ),
+            cause=text("{where}: {what}", where=problem.where, what=problem.what),
+            remedy=text("List all problems with flasher station verify."),
         )
     head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
     content, row = store.read.content_of(last.run_id)
@@ -125,7 +128,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
     """Values for the template certificate.html. Raises UsageError for a unit without runs."""
     last = life.last
     if last is None:
-        raise UsageError(f"{life.serial} has no run to certify.")
+        raise UsageError(text("{serial} has no run to certify.", serial=life.serial))
     status, word, sentence = UNIT_WORDS[life.state]
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed

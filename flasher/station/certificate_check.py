@@ -118,7 +118,10 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     if head.key != sealed.key:
         problems.append(text("it is not signed with the key that the station had in these records"))
     examined = store.examine_run(run_id)
-    problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
+    problems += [
+        text("{where} in the records: {what}", where=each.where, what=each.what)
+        for each in examined.problems
+    ]
     if problems:
         return problems, ()
     last = store.read.run(run_id)
@@ -174,7 +177,10 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
         if not is_signed(head.hash, head.signature, head.key):
             problems.append(text("the signature in the records is not that of the station's key"))
     examined = store.examine_run(run_id)
-    problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
+    problems += [
+        text("{where} in the records: {what}", where=each.where, what=each.what)
+        for each in examined.problems
+    ]
     run = details.run
     return CheckedCertificate(
         run.serial,

@@ -101,9 +101,9 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
                 raise
             reason = "" if isinstance(error, UnfitError) else f"{type(error).__name__}: "
             remedy = error.remedy if isinstance(error, UnfitError) else ""
-            wrong = "is not a trace of the format that its suffix says"
+            wrong = f"{shown} is not a trace of the format that its suffix says."
             raise UsageError(
-                f"{shown} {'is not a trace of one CAN bus' if remedy else wrong}.",
+                f"{shown} is not a trace of one CAN bus." if remedy else wrong,
                 where=f"after frame {bounds.frames:,}" if bounds.frames else "at its beginning",
                 cause=printable(f"{reason}{error!s:.100}"),
                 remedy=remedy or "Record it again, or rename it to the suffix of its format.",

@@ -122,7 +122,7 @@ def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_told() 
     assert near is not None
     assert far is not None
     assert not near.problems
-    assert "further apart" in far.problems[0]
+    assert "too far apart" in far.problems[0]
 
 
 @each("apart, is_near", [((1 << 24) - 2, True), (1 << 24, False)])
@@ -133,7 +133,7 @@ def test_vectors_of_one_program_lie_within_16_mib(apart: int, *, is_near: bool) 
     assert table.problems == (
         ()
         if is_near
-        else ("its reset, NMI and hard fault vectors lie further apart than the memory reaches",)
+        else ("its reset, NMI and hard fault vectors are further apart than the memory reaches",)
     )
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import asyncio
 import html
 import re
+import struct
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,14 +18,17 @@ from typing import Any
 import pytest
 from sqlalchemy import event
 
+from flasher.bus.bit_rate import bit_rate
 from flasher.bus.opening import open_bus
 from flasher.cli.upgrade.bench_page import backup_folder
 from flasher.protocol.spec import BMS
 from flasher.station.board import Board
+from flasher.station.certificate import proven, render_certificate
 from flasher.station.health import HealthWatch
 from flasher.station.label_printer import LabelPrinter, send_tcp
 from flasher.station.messages import JournalWrite
-from flasher.station.shift_counts import ShiftCounts
+from flasher.station.records.model import RunState
+from flasher.station.shift_counts import DEFAULT_SHIFTS, ShiftCounts
 from flasher.station.socket import Source
 from flasher.translation import NAMES, translator
 from flasher.web.archive import Archive
@@ -32,11 +39,13 @@ from flasher.web.operator import CurrentLot, Screen
 from flasher.web.operator import _messages as messages
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Question
+from flasher.web.supervisor import open_supervisor
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.loops import each
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench
+from tests.station.records.test_forgeries import Forger
 from tests.station.test_exchanges import lose_power_once
 from tests.station.test_labels import template
 from tests.station.unit_bench import NEW_UNIT, UnitBench
@@ -134,6 +143,58 @@ def test_a_wrong_image_and_a_damaged_file(place: BenchPlace) -> None:
     pages = _bench_pages(place, state)
     _check(pages, shows="is a damaged Intel HEX file")
     _check(pages, shows="the image names the OBC inside")
+
+
+def test_other_bit_rates(place: BenchPlace) -> None:
+    usb = {"interface": "slcan", "channel": "usb"}
+    for bus, shows in (
+        ({"bitrate": "fast"}, "is not a bit rate"),
+        ({"bitrate": 500_000}, "The bit rate would be"),
+    ):
+        state = place.do(partial(_bit_rate, usb | bus))
+        _check(_bench_pages(place, state), shows=shows)
+
+
+def _bit_rate(merged: Mapping[str, Any], _bench: BikeBench) -> object:
+    return bit_rate(250_000, {}, merged)
+
+
+@each(
+    "name, data, shows",
+    [
+        ("cut.elf", b"\x7fELF", "its header is truncated"),
+        ("new.elf", b"\x7fELF\x01\x01" + bytes(60), "is a damaged ELF file"),
+        (
+            "gap.hex",
+            b":0400000000000000FC\n:0410000000000000EC\n:00000001FF\n",
+            "is not a stack pointer",
+        ),
+    ],
+)
+def test_an_image_that_cannot_be_read(
+    place: BenchPlace, name: str, data: bytes, shows: str
+) -> None:
+    (place.shelf.folder / name).write_bytes(data)
+    state = place.do(_use(BikeFault.NONE), order(BikeBench.choose_target, BMS.name))
+    _check(_bench_pages(place, state), shows=shows)
+
+
+@each(
+    "name, data, shows",
+    [
+        ("a.blf", bytes(200), "it has no header of this format"),
+        ("b.blf", b"LOGG" + struct.pack("<I", 144) + bytes(136) + b"LOBJ", "within an object"),
+        ("c.pcapng", b"none", "it does not begin as a capture of Wireshark does"),
+        ("d.pcapng", b"\n\r\r\n" + struct.pack("<II", 28, 0x1A2B3C4D), "within a block"),
+        ("e.log", b"(0.0) can0 1#\x00", "it holds NUL bytes"),
+    ],
+)
+def test_a_trace_that_cannot_be_read(place: BenchPlace, name: str, data: bytes, shows: str) -> None:
+    (place.shelf.traces / name).write_bytes(data)
+    archive = Archive(place.shelf.folder, backup_folder(), place.shelf.traces)
+    asked = [Question("/kept/story", {"trace": name}, language=each) for each in NAMES]
+    pages = {each.language: archive.answer(each).body.decode() for each in asked}
+    _check(pages, shows=shows)
 
 
 @each("fault", [BikeFault.POWER, BikeFault.PULLED, BikeFault.SECOND_TOOL, BikeFault.REFUSES])
@@ -295,3 +356,41 @@ def test_a_failed_run_in_the_records(
         assert {answer.status_code for answer in answers.values()} == {200}
         pages = {language: answer.text for language, answer in answers.items()}
         _check(pages, shows=shows if path.startswith("/units") else "How to read this page")
+
+
+@each(
+    "statement, shows",
+    [
+        ("UPDATE step SET duration_s = 1 WHERE run_id = 1", "its steps"),
+        ("UPDATE run SET state = 'FAIL' WHERE id = 1", "the run itself"),
+        ("UPDATE unit SET part = 'BAT-48' WHERE id = 1", "serial number or part"),
+        ("DELETE FROM audit WHERE run_id = 1 AND event = 'claimed'", "the previous row is missing"),
+        ("UPDATE audit SET signature = '' WHERE run_id = 1", "not signed with the key"),
+        ("UPDATE audit SET at = '' WHERE run_id = 1", "changed after it was written"),
+        ("DELETE FROM attachment WHERE run_id = 1", "its attachments"),
+        ("", "it was removed"),
+    ],
+)
+def test_records_that_were_changed(tmp_path: Path, statement: str, shows: str) -> None:
+    bench = Bench(Path(tempfile.mkdtemp(dir=tmp_path)))
+    bench.make(RunState.PASS, SERIAL)
+    made = render_certificate(
+        bench.store.read.unit(SERIAL),
+        datetime.now(UTC),
+        proven(bench.store, bench.store.read.unit(SERIAL)),
+    )
+    bench.store.close()
+    forger = Forger(bench.path)
+    if statement:
+        forger(statement)
+    else:
+        del forger.rules["run_update"]
+    forger.put_back()
+    files = bench.path.with_name(f"{bench.path.name}.files")
+    supervisor = open_supervisor(str(bench.path), files, bench.key_locations, DEFAULT_SHIFTS)
+    for path in ("/units/certificate", "/certificate"):
+        fields, body = {"serial": SERIAL}, made.encode()
+        asked = [Question(path, fields, language=each, body=body) for each in NAMES]
+        pages = {each.language: supervisor.answer(each).body.decode() for each in asked}
+        _check(pages, shows=shows)
+    supervisor.store.close()

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, func, or_, select
 
 from flasher.errors import FlasherError, UsageError
+from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import NAMED, OWN, contents_of
@@ -193,7 +194,11 @@ class Examiner:
         if since is not None:
             gone = gone.where(audit.run_id > since.run)
         for run_id in connection.execute(gone).scalars():
-            yield Problem(f"run {run_id}", "it is missing, but the audit trail has it", (run_id,))
+            yield Problem(
+                text("run {run_id}", run_id=run_id),
+                "it is missing, but the audit trail has it",
+                (run_id,),
+            )
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
         for some in batches(chosen):
             stated, contents = _run_digests(connection, some), contents_of(connection, some)
@@ -460,7 +465,7 @@ class Examiner:
         changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
         """Compare a run with its digests in the audit trail. `changed` collects shared rows."""
-        where = f"run {run_id}"
+        where = text("run {run_id}", run_id=run_id)
         if not stated.is_known:
             yield Problem(where, "the audit trail does not have it", (run_id,))
         wrong = {
@@ -493,7 +498,9 @@ class Examiner:
             except ValidationError as error:
                 (first, *_) = error.errors()
                 value = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
-                yield Problem(f"run {run_id}", f"it cannot be read: {value}", (run_id,))
+                yield Problem(
+                    text("run {run_id}", run_id=run_id), f"it cannot be read: {value}", (run_id,)
+                )
                 continue
             self._add_progress(1)
             is_over = details.run.state is not RunState.RUNNING
@@ -501,7 +508,7 @@ class Examiner:
                 what = "it is finished, but active in the audit trail"
                 if not is_over:
                     what = "it is active, but finished in the audit trail"
-                yield Problem(f"run {run_id}", what, (run_id,))
+                yield Problem(text("run {run_id}", run_id=run_id), what, (run_id,))
             yield from self._attachments(details)
 
     def _attachments(self, details: RunDetails) -> Iterator[Problem]:
@@ -716,14 +723,14 @@ def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[P
         yield Problem(
             where,
             f"it ends at row {trail.end}, but row {last.number} of {last.at} is"
-            f" kept in {place}: its end was cut off, or this is an older copy",
+            f" stored in {place}: its end was cut off, or this is an older copy",
         )
     if other:
         first = min(other, key=lambda head: head.number)
         yield Problem(
             where,
             f"row {first.number} of {first.at} is not the one that is stored in {place}: the"
-            " chain was made anew",
+            " chain was replaced",
         )
 
 

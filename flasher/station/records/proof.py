@@ -313,4 +313,4 @@ def _image(target: TargetRecord, trace: TraceOfTarget) -> Iterator[str]:
     elif trace.sent_sha256 != target.image_sha256:
         yield f"it holds another image for the {target.target}, of SHA-256 {trace.sent_sha256}"
     elif not (trace.is_complete or (target.version and trace.names(target.version))):
-        yield f"the {target.target} neither says complete nor names its version"
+        yield f"the {target.target} neither confirms the image nor reports its version"

@@ -219,7 +219,7 @@ def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_told(
 
     problems = examined(plant, tmp_path, forge)
     assert told(problems, "audit row 8 of line-2", "not signed with the key of the station")
-    assert told(problems, "audit trail of line-2", "the chain was made anew")
+    assert told(problems, "audit trail of line-2", "the chain was replaced")
     assert told(problems, f"run 3, PASS of {FAILED}", f"it is the trace of {OTHER}")
     assert told(problems, "runs 2, 3", "the same trace")
 
@@ -239,7 +239,7 @@ def test_a_chain_signed_anew_with_another_key_is_told_by_the_kept_heads(
     (problem,) = examined(plant, tmp_path, forge)
     assert problem.where == "audit trail of line-2"
     assert "row 1 of 2026-05-17" in problem.what
-    assert "made anew" in problem.what
+    assert "replaced" in problem.what
 
 
 def test_rules_taken_away_or_made_weaker_are_told(plant: Bench, tmp_path: Path) -> None:

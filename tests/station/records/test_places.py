@@ -139,7 +139,7 @@ def make_anew(bench: Bench) -> None:
 
 FORGERIES: dict[Callable[[Bench], None], str] = {
     cut_tail: "its end was cut off",
-    make_anew: "the chain was made anew",
+    make_anew: "the chain was replaced",
 }
 
 
