@@ -103,11 +103,16 @@ def run(
     Raises UsageError for an unknown case, group or deviation. A failing adapter ends the run and is
     in the report.
     """
-    selection.check()
-    check_deviations(profile, known_cases())
+    check_selection(selection, profile)
     return SuiteRun(subject, profile, options, observer or RunObserver(), stopped).run_all(
         selection.chosen()
     )
+
+
+def check_selection(selection: Selection, profile: ConformanceProfile) -> None:
+    """Raises UsageError for an unknown case, group or deviation."""
+    selection.check()
+    check_deviations(profile, known_cases())
 
 
 class CaseEnd(NamedTuple):

@@ -112,17 +112,8 @@ _FAILED: Final = frozenset(
 """Verdicts of the cases that --rerun-failed selects."""
 _RUN_OPTIONS: Final = frozenset(
     {
-        *(
-            "--list",
-            "--case",
-            "--group",
-            "--exclude",
-            "--rerun-failed",
-            "--quick",
-            "--seed",
-            "--repeat",
-            "--timeout",
-        ),
+        *("--list", "--case", "--group", "--exclude", "--rerun-failed", "--quick"),
+        *("--seed", "--repeat", "--jobs", "--timeout"),
         *_FILES.values(),
         _TRACE_DIR,
         *OUTPUT_OPTIONS,
@@ -228,6 +219,10 @@ class Choices:
     repeat: Annotated[int, _what(
         "--repeat", type=values.count, default="1", metavar="N", help="run every case N times",
     )]  # fmt: skip
+    jobs: Annotated[int, _what(
+        "--jobs", type=values.count, default="1", metavar="N",
+        help="run cases on N processes side by side, with --mock or --subject",
+    )]  # fmt: skip
     timeout: Annotated[float | None, _what(
         "--timeout", type=values.seconds, metavar="SECONDS",
         help="end the run after this time (default: every case has its own limit)",
@@ -292,6 +287,11 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     from flasher.conformance.runner import SuiteOptions, run  # noqa: PLC0415
 
     bench = described(bench, bus)
+    if chosen.jobs > 1 and not bench.is_simulated:
+        raise UsageError(
+            "--jobs works with --mock or --subject only.",
+            cause="there is one device on a bus",
+        )
     _check_files(chosen)
     if chosen.rerun_failed is not None:
         chosen = _only_failed(chosen, chosen.rerun_failed)
@@ -307,16 +307,31 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
         missing = bench_gaps(missing_requirements(subject, profile), chosen.selection.chosen())
         for line in gap_lines("this bench", missing) if missing else ():
             output.progress(line)
-        report = run(
-            subject,
-            profile,
-            selection=chosen.selection,
-            options=SuiteOptions(
-                chosen.seed, chosen.repeat, chosen.timeout, chosen.strict, chosen.upgrades
-            ),
-            observer=observer,
-            stopped=stopped,
+        suite = SuiteOptions(
+            chosen.seed, chosen.repeat, chosen.timeout, chosen.strict, chosen.upgrades
         )
+        if chosen.jobs > 1:
+            from flasher.conformance.parallel import run_in_processes  # noqa: PLC0415  only here
+
+            report = run_in_processes(
+                bench,
+                subject,
+                profile,
+                jobs=chosen.jobs,
+                selection=chosen.selection,
+                suite=suite,
+                observer=observer,
+                stopped=stopped,
+            )
+        else:
+            report = run(
+                subject,
+                profile,
+                selection=chosen.selection,
+                options=suite,
+                observer=observer,
+                stopped=stopped,
+            )
         was_stopped = stopped()
     code = exit_code(report, was_stopped=was_stopped)
     _tell(report, chosen, output, started_at, code)
