@@ -13,6 +13,7 @@ SOURCE = Path(__file__).parents[2] / "examples" / "bootloader_c"
 PROFILE = SOURCE / "profile.toml"
 _PACKAGES = {
     "make": "make",
+    "patch": "patch",
     "gcc": "gcc libc6-dev",
     "arm-none-eabi-gcc": "gcc-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",

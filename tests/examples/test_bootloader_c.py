@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.campaigns.planted_bugs import plant, read_bugs
 from tests.cli.conftest import Flasher
 from tests.examples.bootloader import PROFILE, emulated, make, missing
 
@@ -59,6 +60,15 @@ def test_what_the_suite_reached_can_be_measured(flasher: Flasher, tmp_path: Path
     assert share is not None
     assert 70 < float(share[1]) < 100
     assert re.search(r"^ +\d+\*?: +\d+:", (tmp_path / "boot.c.gcov").read_text(), re.MULTILINE)
+
+
+def test_every_planted_bug_applies(tmp_path: Path) -> None:
+    """`python -m tests.campaigns.planted_bugs` builds them and runs the suite on them."""
+    _need("patch")
+    bugs = read_bugs()
+    assert [int(bug.name[:2]) for bug in bugs] == list(range(1, 91))
+    for bug in bugs:
+        plant(bug, tmp_path)
 
 
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:
