@@ -79,7 +79,7 @@ class Row:
     code: str = ""
     """Code of the last run, while its unit is in the socket without a PASS."""
     is_virtual: bool = False
-    """Its units are virtual: it makes no products."""
+    """The socket has virtual units, which are not products."""
     virtual_label: str = ""
     """Label of the virtual unit in the socket, which a trainee has to type."""
 
@@ -165,7 +165,7 @@ class Board:
 
     @property
     def is_refusal(self) -> bool:
-        """True if `last_reply` is a refusal."""
+        """True if the last scan outside pages was refused."""
         return self.replies.to_all.is_refusal
 
     def apply(self, event: StationEvent) -> None:

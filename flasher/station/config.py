@@ -227,7 +227,7 @@ CONFIG: Final = Reader(StationConfig, "station file")
 
 
 def no_two(which: str, what: str, values: list[str]) -> None:
-    """Raises ValueError if a value occurs twice."""
+    """Check that no value occurs twice. Raises ValueError."""
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
         raise ValueError(f"two {which} have the same {what} {twice[0]!a:.60}")

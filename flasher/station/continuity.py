@@ -86,8 +86,8 @@ class Continuity:
         )
         """Unobserved time in which a unit could have been exchanged, as a sentence, or ""."""
         self.is_running = False
-        """Its application has answered since the last restart."""
-        self.is_told_to_update = False
+        """The application has answered since the last restart."""
+        self.has_update_command = False
         """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
         self._goes_on, self._was_silent = goes_on, was_silent and not goes_on
@@ -150,7 +150,7 @@ class Continuity:
 
     @property
     def has_answered(self) -> bool:
-        """True if it has sent a version answer, before the run or in it."""
+        """True if the unit has sent a version answer, before the run or in it."""
         return bool(self._known)
 
     def _stay(self) -> None:
@@ -161,14 +161,14 @@ class Continuity:
 
     def settle(self) -> None:
         """Note that its application has answered the run, so it has started again."""
-        self.is_running, self.is_told_to_update = True, False
+        self.is_running, self.has_update_command = True, False
         self._awaits_confirmation = self._awaits_complete = False
         self._requested_s = None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
         """Note a complete image on a target without a version query, which may now start."""
-        self.is_told_to_update = False
+        self.has_update_command = False
         if self._awaits_application:
             self._burst_until = self._now + self._timings.application_start_timeout_s
 
@@ -227,14 +227,14 @@ class Continuity:
         if watcher.power_ups > power_ups and (was_heard or self._was_silent):
             self._take_power_up(now, was_heard=was_heard)
         missed_unheard_s = self._missed_unheard_s
-        has_returned = watcher.heard_at == now and self._returns()
+        has_returned = watcher.received_at == now and self._returns()
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
         if watcher.confirmations > confirmations and (self._announced_s or 0.0) <= self._reset_s:
             # Its application runs: the burst before the reset is over.
             self._announced_s = None
         self._awaits_complete = self._awaits_complete and watcher.completions == completions
-        if watcher.transfer_requests > requests and self.is_told_to_update:
+        if watcher.transfer_requests > requests and self.has_update_command:
             self._requested_s, self._burst_until = self._listened_s, -inf
         if watcher.application_frames > application_frames and self._awaits_application:
             # The new application runs: the burst after the end of the transfer is over.
@@ -291,7 +291,7 @@ class Continuity:
                 if not self._is_identified:
                     self._stay()
                 self.is_running = self._awaits_confirmation = self._awaits_complete = False
-                self.is_told_to_update, self._awaits_application = True, False
+                self.has_update_command, self._awaits_application = True, False
                 # A burst that an earlier reset has caused may still come.
                 self._requested_s = None
             elif message.command == Command.END_OF_TRANSFER:
@@ -299,7 +299,7 @@ class Continuity:
 
     @property
     def is_announcing(self) -> bool:
-        """True while its bootloader announces itself, at its own pace."""
+        """True while the bootloader announces itself, at its own pace."""
         return self._pause_s < self._gap_s
 
     @property
@@ -383,7 +383,7 @@ class Continuity:
         """Check whether a unit may have been exchanged during unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
-            was_sent = self._announced_on < _ANNOUNCED_ON or self.is_told_to_update
+            was_sent = self._announced_on < _ANNOUNCED_ON or self.has_update_command
             could_be_other = was_sent and not goes_on and missed_s >= _EXCHANGE_S
         else:
             could_be_other = goes_on and missed_s > 0.0 and since_s + missed_s >= self._gap_s

@@ -25,7 +25,7 @@ class SocketState(LowerCaseInJson, StrEnum):
     """State of a socket, as screens show it."""
 
     STARTING = "STARTING"
-    """Its process is opening the adapter."""
+    """The process of the socket is opening the adapter."""
     EMPTY = "EMPTY"
     """No unit, and no label that waits for one."""
     SILENT = "SILENT"
@@ -294,7 +294,7 @@ class WorkerFailed(Timed):
     socket: str
     reason: str
     restart_in_s: float | None
-    """None: the process starts again only with the station."""
+    """Seconds until the process is restarted; None: not before the station is."""
 
 
 @dataclass(frozen=True)

@@ -502,7 +502,7 @@ class Line:
             self._refuse(HIDDEN, Refused("NO_PIN", reason, remedy), source=source)
 
     def pin_checked(self, now: float, *, is_right: bool) -> None:
-        """Result of `CheckPin`."""
+        """Process the result of `CheckPin`."""
         crew = self._crew
         asked, source, self._pin_from = crew.asked, self._pin_from, None
         if asked is None or source is None:
@@ -619,7 +619,7 @@ class Line:
             raise Refused("LINE_STOPPED", reason, remedy)
 
     def _check_label(self, serial: str) -> None:
-        """Raises Refused for a label of another recipe, or of a unit that cannot be run now."""
+        """Check that a label is of this recipe and its unit can be run now. Raises Refused."""
         self._check_line()
         try:
             self._check_serial(serial)
@@ -679,7 +679,7 @@ class Line:
 
     @staticmethod
     def _check_takes(socket: Socket) -> None:
-        """Raises Refused for a socket that cannot take a unit now."""
+        """Check that a socket can take a unit now. Raises Refused."""
         check_free(socket)
         check_service(socket)
         last = socket.holds
@@ -724,7 +724,7 @@ class Line:
             self._reasons.pop(socket.release_label(), None)
 
     def _check_waits_nowhere(self, bound: list[Socket]) -> None:
-        """Raises Refused for a CANCEL if scans wait at another source."""
+        """Check that a CANCEL does not mean scans of another source. Raises Refused."""
         waits: list[tuple[str, Source, str]] = [
             (
                 each.label,
@@ -764,7 +764,7 @@ class Line:
         self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
 
     def reprinted(self, serial: str, refused: Refused | None) -> None:
-        """Result of `Reprint`."""
+        """Process the result of `Reprint`."""
         text = printable(f"{Word.REPRINT.value} {serial}")[:80]
         if refused is None:
             self._emit(ScanAccepted(text, _REPRINT))
@@ -779,7 +779,7 @@ class Line:
         self._effects.append(SaveAgain(tuple(unsaved)))
 
     def resumed(self, now: float, *, all_saved: bool) -> None:
-        """Result of `SaveAgain`: the line resumes, or stays stopped."""
+        """Process the result of `SaveAgain`: the line resumes, or stays stopped."""
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None

@@ -169,7 +169,7 @@ class Crew:
         return self.has_pins and pins.is_form(text)
 
     def check_assigned(self) -> None:
-        """Raises Refused before the first badge."""
+        """Check that a badge was scanned. Raises Refused."""
         if self.has_badges and self.person is None:
             raise Refused(
                 "NOBODY", text("No badge has been scanned yet."), text("Scan your badge first.")

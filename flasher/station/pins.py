@@ -49,7 +49,7 @@ def is_right(pin: Pin, pin_hash: str) -> bool:
 
 
 def check_hash(pin_hash: str) -> None:
-    """Raises ValueError for a text that is not the hash of a PIN; the message hides the text."""
+    """Check that a text is the hash of a PIN. Raises ValueError, without the text."""
     try:
         parameters = extract_parameters(pin_hash)
     except InvalidHashError:

@@ -30,7 +30,7 @@ class PowerControl(Protocol):
         """Start a power cycle and return at once. Raises BusError if the previous one failed."""
 
     def check(self) -> None:
-        """Raises BusError if a power cycle failed."""
+        """Raises BusError if the last power cycle failed."""
 
 
 class PowerCommand:

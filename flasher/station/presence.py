@@ -69,7 +69,7 @@ class TargetWatcher:
         self._boot = Reassembler(loaded.target.answer_id, limit_s)
         self._own_ids = frozenset(sent_ids(loaded.target))
         self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
-        """Its version request; None if unknown."""
+        """Version request for this target; None if unknown."""
         item = None if self.request is None else self.request.answer_item
         self._item = item
         self._answers = None if item is None else Reassembler(item.can_id, limit_s)
@@ -77,7 +77,7 @@ class TargetWatcher:
         """Numbers of announcements of its bootloader: complete ones, and first frames."""
         self.version = ""
         """The last announced boot version, escaped."""
-        self.heard_at: float | None = None
+        self.received_at: float | None = None
         """Time of the last frame of the device."""
         self.has_sent_message = False
         """A complete message of its bootloader, or any frame of its application, was received."""
@@ -120,7 +120,7 @@ class TargetWatcher:
         if sent or not frame.is_payload:
             return
         if frame.can_id in self._own_ids:
-            self.heard_at = now
+            self.received_at = now
             if frame.can_id != self._boot.can_id:
                 self._process_application()
                 self.has_sent_message = True
@@ -136,12 +136,12 @@ class TargetWatcher:
 
     @property
     def is_in_bootloader(self) -> bool:
-        """True if it has sent only announcements since the first one."""
+        """True if the device has sent only announcements since the first one."""
         return self.announcements > 0 and not self.has_application
 
     @property
     def is_known(self) -> bool:
-        """True if it has announced itself or its application has sent a frame."""
+        """True if the device has announced itself or its application has sent a frame."""
         return self.announcements > 0 or self.has_application
 
     def _process_bootloader(self, message: Message, now: float) -> None:
@@ -167,8 +167,8 @@ class TargetWatcher:
         """Add unobserved time: it counts neither as a pause of the device nor as silence."""
         self._missed_s += missed_s
         self._paused_at += missed_s
-        if self.heard_at is not None:
-            self.heard_at += missed_s
+        if self.received_at is not None:
+            self.received_at += missed_s
 
     def _announced(self, now: float) -> None:
         pause_s = float("inf")
@@ -252,16 +252,16 @@ class Presence:
         return all(
             watcher.is_in_bootloader
             for watcher in self.watchers
-            if watcher.heard_at is not None and now - watcher.heard_at < SILENCE_S
+            if watcher.received_at is not None and now - watcher.received_at < SILENCE_S
         )
 
     def begin(self) -> None:
         """Reset after a run or unobserved time, when everything may have changed."""
         self.is_there: bool | None = None
         """None while unknown."""
-        self._heard_at: float | None = None
+        self._received_at: float | None = None
         self._began_at: float | None = None
-        self._told_in_bootloader = False
+        self._reported_in_bootloader = False
         self.exchanged_number = self.missed_number = 0
         """Number of the last change after which another unit may be present, and of the last
         change after unobserved time."""
@@ -270,8 +270,8 @@ class Presence:
     def _forget_unit(self) -> None:
         self.watchers = [TargetWatcher(each) for each in self._targets]
         """A watcher for each target of the present unit."""
-        self._told_serial: str | None = None
-        self._told_power_ups = 0
+        self._reported_serial: str | None = None
+        self._reported_power_ups = 0
         self._was_missed = False
         """Another unit may have been put in during unobserved time."""
         self._resumed_at = float("-inf")
@@ -282,8 +282,8 @@ class Presence:
         for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
             # The rest of an announcement that began earlier does not count.
-            if watcher.heard_at == now and watcher.has_sent_message:
-                self._heard_at = now
+            if watcher.received_at == now and watcher.has_sent_message:
+                self._received_at = now
 
     def miss(self, missed_s: float, now: float) -> None:
         """Add unobserved time, up to now."""
@@ -291,8 +291,8 @@ class Presence:
             self._resumed_at = now
         for watcher in self.watchers:
             watcher.miss(missed_s)
-        if self._heard_at is not None:
-            self._heard_at += missed_s
+        if self._received_at is not None:
+            self._received_at += missed_s
 
     def probe(self, now: float) -> list[Frame]:
         """Frames to send now: a version request to each target that has one, when due."""
@@ -309,35 +309,35 @@ class Presence:
         """Change since the last call; None without one."""
         if self._began_at is None:
             self._began_at = now
-        heard = self._heard_at is not None and now - self._heard_at < SILENCE_S
-        in_bootloader = heard and self._is_in_bootloader(now)
+        is_present = self._received_at is not None and now - self._received_at < SILENCE_S
+        in_bootloader = is_present and self._is_in_bootloader(now)
         if now - self._resumed_at <= BACKLOG_S:
             self._was_missed |= in_bootloader
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
-        if is_soon and not heard:
+        if is_soon and not is_present:
             return None
-        is_power_up = heard and self._power_ups > self._told_power_ups
+        is_power_up = is_present and self._power_ups > self._reported_power_ups
         # The serial number that the unit reports; None before its first answer.
         serials = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, serials), "") if serials else None
-        reported = (self.is_there, self._told_serial, self._told_in_bootloader)
+        reported = (self.is_there, self._reported_serial, self._reported_in_bootloader)
         # The unit itself is reported first; that it may be another one, in the next call.
-        was_missed = heard and self._was_missed and self.is_there is True
-        self._was_missed &= heard and not was_missed
-        if (heard, serial, in_bootloader) == reported and not (is_power_up or was_missed):
+        was_missed = is_present and self._was_missed and self.is_there is True
+        self._was_missed &= is_present and not was_missed
+        if (is_present, serial, in_bootloader) == reported and not (is_power_up or was_missed):
             return None
         self._number += 1
-        is_other = None not in (self._told_serial, serial) and self._told_serial != serial
-        if self.is_there and (is_power_up or is_other or not heard):
+        is_other = None not in (self._reported_serial, serial) and self._reported_serial != serial
+        if self.is_there and (is_power_up or is_other or not is_present):
             self.exchanged_number = self._number
         if was_missed:
             self.missed_number = self._number
-        self.is_there, self._told_in_bootloader = heard, in_bootloader
-        self._told_power_ups = self._power_ups
-        if not heard:
+        self.is_there, self._reported_in_bootloader = is_present, in_bootloader
+        self._reported_power_ups = self._power_ups
+        if not is_present:
             self._forget_unit()
             return PresenceChanged(is_there=False, number=self._number)
-        self._told_serial = serial
+        self._reported_serial = serial
         return PresenceChanged(
             is_there=True,
             how="boot version" if is_power_up or in_bootloader else "traffic",

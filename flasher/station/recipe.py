@@ -58,7 +58,7 @@ class TargetTable(TomlTable):
     """Base of tables that name a target."""
 
     target: Annotated[str, AfterValidator(_target_name)]
-    """The device."""
+    """Name of the device, for example "bms"."""
 
     @property
     def device(self) -> Target:
@@ -66,7 +66,7 @@ class TargetTable(TomlTable):
 
 
 class SerialNumberRule(TomlTable):
-    """The form of the product's serial numbers."""
+    """Rules for the product's serial numbers."""
 
     pattern: str
     """Pattern of serial numbers, with named groups (see `flasher.station.pattern`)."""
@@ -337,7 +337,7 @@ def fill(template: str, scan: Scan) -> str:
 
 
 def check_template(template: str, groups: Collection[str]) -> None:
-    """Raises ValueError for a template with placeholders other than these groups."""
+    """Check that a template has only known placeholders. Raises ValueError."""
     fill(template, Scan("", date(2000, 1, 1), "", dict.fromkeys(groups, "")))
 
 

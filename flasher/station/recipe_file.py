@@ -90,7 +90,7 @@ class LoadedRecipe:
         return min(target.required for target in self.targets)
 
     def is_unchanged(self) -> bool:
-        """True if its files on disk still have the loaded content."""
+        """True if the recipe's files on disk still have the loaded content."""
         try:
             return all(_sha256(path) == sha256 for path, sha256 in self.files.items())
         except FlasherError:

@@ -217,7 +217,7 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
 
 
 def check_free(socket: Socket) -> None:
-    """Raises Refused while a run of the socket is active or not saved."""
+    """Check that the socket has no active or unsaved run. Raises Refused."""
     if socket.phase is not SocketPhase.REST:
         serial = printable(socket.serial)
         reason = text("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
@@ -225,7 +225,7 @@ def check_free(socket: Socket) -> None:
 
 
 def check_service(socket: Socket) -> None:
-    """Raises Refused for a socket that is out of service, but not for one that is starting."""
+    """Check that the socket is in service, or starting. Raises Refused."""
     if socket.out_of_service:
         reason = text(
             "Socket {socket} is out of service: {why}",
@@ -236,7 +236,7 @@ def check_service(socket: Socket) -> None:
 
 
 def check_known(sockets: Sockets, serial: str) -> None:
-    """Raises Refused for the label of a unit that is running or has just passed."""
+    """Check that the unit is not running and has not just passed. Raises Refused."""
     for each in sockets.values():
         if each.phase is not SocketPhase.REST and each.serial == serial:
             reason = text("It runs in socket {socket}.", socket=each.name)
@@ -248,8 +248,8 @@ def check_known(sockets: Sockets, serial: str) -> None:
 
 
 def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
-    """Raises Refused for a label that was already scanned, or while another one waits. `waiting`:
-    the waiting scan of the same source.
+    """Check that no other label waits, and this one was not scanned already. Raises Refused.
+    `waiting`: the waiting scan of the same source.
     """
     for each in sockets.values():
         if each.label == serial:
@@ -270,7 +270,7 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
 
 
 def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
-    """Raises Refused for a label if another unit is known to be in the socket."""
+    """Check that no other unit is known to be in the socket. Raises Refused."""
     last = socket.holds
     if last is not None and last.serial != serial:
         raise still_there(socket, last)
@@ -295,7 +295,7 @@ def _report_of(socket: Socket) -> str:
 
 
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Source) -> None:
-    """Raises Refused for a label that was already assigned to another socket by its card."""
+    """Check that the label was not assigned to another socket by its card. Raises Refused."""
     for each in sockets.values():
         if each is not socket and each.label == serial and each.binding is not Binding.PROMPTED:
             reason = text("It was scanned for socket {socket}.", socket=each.name)

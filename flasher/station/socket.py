@@ -133,14 +133,14 @@ class Socket:
     arrived_at_s: float = 0.0
     """Time at which its unit was detected."""
     is_in_bootloader: bool = False
-    """It sends only bootloader announcements, so it cannot report its serial number."""
+    """The unit sends only bootloader announcements, so it cannot report its serial number."""
     serial: str = ""
     """Serial number of the active run."""
     last: LastRun | None = None
     is_last_there: bool = False
     """The unit of the last run may still be there: no frame suggests another one."""
     is_chosen: bool = False
-    """Its card was scanned, and the label must follow."""
+    """The card of the socket was scanned, and the label must follow."""
     interrupted: str = ""
     """Serial number of a run in this socket that was interrupted by the end of the station."""
     note: str = ""
@@ -154,7 +154,7 @@ class Socket:
 
     @property
     def can_work(self) -> bool:
-        """True if its process runs and its adapter is open."""
+        """True if the process of the socket runs and its adapter is open."""
         return self.out_of_service is None
 
     @property
@@ -198,7 +198,7 @@ class Socket:
 
     @property
     def is_starting(self) -> bool:
-        """True while it is unknown whether a unit is in it."""
+        """True while it is unknown whether a unit is in the socket."""
         if self.phase is not SocketPhase.REST or self.verdict is not None:
             return False
         is_listening = self.sees_units and self.occupancy is Occupancy.UNKNOWN

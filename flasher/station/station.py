@@ -92,7 +92,7 @@ class StationOptions:
     """Options of a station; the defaults are for a line with people."""
 
     arrival_limit_s: float = ARRIVAL_LIMIT_S
-    """See `Line`."""
+    """Time that a label waits for its unit, as for `Line`."""
     end_limit_s: float = 30.0
     """Time limit for runs to end when the station closes."""
     scans_labels: bool = False
@@ -377,7 +377,7 @@ class Station:
                 self.supervisor.send(socket.name, Abort())
 
     def _pin_checked(self, checked: Future[bool]) -> None:
-        """Called in the thread of the PIN check."""
+        """Put the result of a PIN check into the queue; called in the checker's thread."""
         self._checked.append(checked.exception() is None and checked.result())
         self._wake()
 

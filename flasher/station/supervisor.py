@@ -17,7 +17,7 @@ HANG_S: Final = 10.0
 """Silence after which a process counts as hung: it sends a heartbeat every half second, and a call
 of an adapter takes at most some seconds."""
 START_S: Final = 60.0
-"""The same for a starting process, which loads the driver of its adapter."""
+"""Silence after which a starting process counts as hung; it loads the driver of its adapter."""
 RESTART_MIN_S: Final = 1.0
 RESTART_MAX_S: Final = 30.0
 _QUIT_S: Final = 5.0
@@ -104,7 +104,7 @@ class _Slot:
     def __init__(self, setup: WorkerSetup) -> None:
         self.setup = setup
         self.port: WorkerPort | None = None
-        self.heard_at = 0.0
+        self.received_at = 0.0
         self.is_new = True
         self.start_at: float | None = 0.0
         """Time of its next start; None if it is not due to start."""
@@ -153,7 +153,7 @@ class WorkerSupervisor:
             if slot.port is None:
                 if slot.start_at is not None and self._now() >= slot.start_at:
                     slot.port = self._launch(slot.setup)
-                    slot.heard_at = self._now()
+                    slot.received_at = self._now()
                     slot.is_new, slot.start_at, slot.reason = True, None, ""
                 continue
             messages, is_gone = self._receive(slot)
@@ -163,7 +163,7 @@ class WorkerSupervisor:
             limit_s = START_S if slot.is_new else HANG_S
             if is_gone:
                 news.append((name, self._lose(slot, "its process ended", hung=False)))
-            elif self._now() - slot.heard_at > limit_s:
+            elif self._now() - slot.received_at > limit_s:
                 slot.port.kill()
                 reason = f"its process sent nothing for {limit_s:g} s, and was killed"
                 news.append((name, self._lose(slot, reason, hung=True)))
@@ -198,7 +198,7 @@ class WorkerSupervisor:
             return messages, True
         finally:
             if messages:
-                slot.heard_at = self._now()
+                slot.received_at = self._now()
                 slot.is_new = False
         return messages, False
 

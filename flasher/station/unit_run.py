@@ -117,7 +117,7 @@ class UnitRun:
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")
         self._step_began_at = 0.0
         self._step_ends_at: float | None = None
-        self._told_at = float("-inf")
+        self._progress_at = float("-inf")
         self._hear_waiting: Callable[[], None] = lambda: None
 
     def listen_meanwhile(self) -> None:
@@ -201,7 +201,7 @@ class UnitRun:
     ) -> StepFailedError | None:
         step, target = self._step
         began_at = self._step_began_at = self._clock.now()
-        self._told_at = float("-inf")
+        self._progress_at = float("-inf")
         self._step_ends_at = None if limit_s is None else began_at + limit_s
         self._send_progress(StepStarted("", self._claim.serial, step, try_number, target))
         measured: list[Measurement] = []
@@ -302,9 +302,9 @@ class UnitRun:
 
     def _progress(self, share: float) -> None:
         now = self._clock.now()
-        if now - self._told_at < _PROGRESS_S and share < 1:
+        if now - self._progress_at < _PROGRESS_S and share < 1:
             return
-        self._told_at = now
+        self._progress_at = now
         passed_s = now - self._step_began_at
         left_s = passed_s / share * (1 - share) if share > 0 else None
         step, target = self._step

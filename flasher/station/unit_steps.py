@@ -120,7 +120,7 @@ class UnitSteps:
         """True if a device got an update command and has run no application since: it cannot
         identify itself, so no step may be tried again.
         """
-        return any(each.continuity.is_told_to_update and not each.goes_on for each in self.targets)
+        return any(each.continuity.has_update_command and not each.goes_on for each in self.targets)
 
     def wait(self, limit_s: float) -> None:
         """Wait between two tries, and request the versions of running applications. Raises

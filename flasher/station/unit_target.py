@@ -106,7 +106,7 @@ class UnitTarget:
             identity=loaded.profile.identity(release=loaded.release, reports_unchecked=True),
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
-        """Its version request; None if unknown."""
+        """Version request for this target; None if unknown."""
         self._cancelled = cancelled
 
     # -- requests ---------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ class UnitTarget:
         return Identified(asked.answers, announced, asked.two_devices)
 
     def is_silent(self, identified: Identified) -> bool:
-        """True if it did not answer a version request."""
+        """True if the target did not answer a version request."""
         asked = self.version_request is not None
         return asked and identified.seen.version is None and not identified.is_in_bootloader
 
@@ -164,8 +164,8 @@ class UnitTarget:
         """
         timings = self.loaded.profile.timings
         tried_s = timings.packet_tries * timings.ack_timeout_s
-        heard_at, silence_s = self.watcher.heard_at, min(SILENCE_S, _SHARE_OF_TRIES * tried_s)
-        is_silent = heard_at is None or self.clock.now() - heard_at >= silence_s
+        received_at, silence_s = self.watcher.received_at, min(SILENCE_S, _SHARE_OF_TRIES * tried_s)
+        is_silent = received_at is None or self.clock.now() - received_at >= silence_s
         if self.version_request is None:
             self.listen(timings.boot_version_timeout_s if is_silent else 0.0)
         elif is_silent:
@@ -238,7 +238,7 @@ class UnitTarget:
     # -- engines ----------------------------------------------------------------------------------
 
     def check_cancelled(self) -> None:
-        """Raises InterruptedByUserError if the run must end."""
+        """Check whether the run must end. Raises InterruptedByUserError."""
         if self._cancelled():
             raise InterruptedByUserError("The run has to end.")
 

@@ -72,10 +72,10 @@ class Channel(Protocol):
     """Pipe to the station, for example a `multiprocessing.connection.Connection`."""
 
     def send(self, obj: Any, /) -> None:
-        """Raises OSError if the station has ended."""
+        """Send a message. Raises OSError if the station has ended."""
 
     def recv(self) -> Any:
-        """Raises EOFError if the station has ended."""
+        """Receive a message. Raises EOFError if the station has ended."""
 
     def poll(self, timeout: float = 0.0) -> bool:
         """True if a message waits or the station has ended."""
@@ -197,7 +197,7 @@ class StationPipe:
 
 
 class Worker:
-    """The loop of the process on an open connection."""
+    """Main loop of a socket's process, on an open connection."""
 
     def __init__(
         self,
@@ -215,9 +215,9 @@ class Worker:
         self._presence = Presence(recipe.targets)
         self._listened_at = connection.clock.now()
         self._is_down = False
-        """The adapter has failed."""
+        """True while the adapter has failed."""
         self._is_blocked = False
-        """Its transmit queue is full."""
+        """True while the adapter's transmit queue is full."""
         self._reopen_at = 0.0
 
     def work(self) -> None:
@@ -244,14 +244,14 @@ class Worker:
         link, clock = self._connection.link, self._connection.clock
         try:
             if self._virtual is None:
-                for frame in self._presence.probe(clock.now()):
-                    link.send(frame)
+                for request in self._presence.probe(clock.now()):
+                    link.send(request)
             until = clock.now() + IDLE_S
-            heard = link.receive(until)
-            while heard is not None:
+            frame = link.receive(until)
+            while frame is not None:
                 self._listened()
-                self._presence(heard, sent=False, now=clock.now())
-                heard = link.receive(until) if clock.now() < until else None
+                self._presence(frame, sent=False, now=clock.now())
+                frame = link.receive(until) if clock.now() < until else None
         except TransmitBlockedError:
             # No unit acknowledges: queued frames must not reach the next one.
             self._is_blocked = True
@@ -265,7 +265,7 @@ class Worker:
         if change is not None:
             self._pipe.send(change)
 
-    def _watch_anew(self) -> None:
+    def _restart_watching(self) -> None:
         self._presence.begin()
         self._listened_at = self._connection.clock.now()
 
@@ -289,7 +289,7 @@ class Worker:
         self._is_blocked = False
         if self._is_down:
             self._is_down = False
-            self._watch_anew()
+            self._restart_watching()
             self._pipe.send(AdapterReady(self._connection.name, self._presence.sees_units))
 
     # -- a run ------------------------------------------------------------------------------------
@@ -345,7 +345,7 @@ class Worker:
         # Queued frames date from the run and do not show which unit is there now.
         with suppress(BusError):
             self._connection.link.drain()
-        self._watch_anew()
+        self._restart_watching()
 
 
 def pack(path: Path) -> str:

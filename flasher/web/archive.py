@@ -170,7 +170,7 @@ def _bundle(path: Path) -> ArchivedFile:
 
 
 def _known(found: Mapping[str, Path], name: str) -> Path:
-    """Raises UsageError for an unlisted name, so that no other file is read."""
+    """Look up a listed name, so that no other file is read. Raises UsageError."""
     path = found.get(name)
     if path is None:
         raise UsageError(f"{printable(name)} no longer exists.", remedy="Reload the previous page.")

@@ -126,13 +126,13 @@ class BenchController:
 
     def __init__(
         self,
-        workplace: BenchBackend,
+        backend: BenchBackend,
         now: Callable[[], float],
         date: Callable[[], datetime] = lambda: datetime.now().astimezone(),
     ) -> None:
         self.feed = Feed(now, silence_limit_s=SILENCE_LIMIT_S)
         self.state = BenchState()
-        self._place = workplace
+        self._backend = backend
         self._now = now
         self._date = date
         self._lock = threading.Lock()
@@ -182,10 +182,10 @@ class BenchController:
                 if not self._has_new_files.is_set() or not self.order(BenchController.take_files):
                     continue
                 order = self._orders.get()
-            self.write_planned(order)
+            self.execute(order)
 
-    def write_planned(self, order: Order) -> None:
-        """Write to a device and show the progress."""
+    def execute(self, order: Order) -> None:
+        """Execute an order; an error becomes the `trouble` of the state."""
         self._set(trouble=None)
         try:
             order(self)
@@ -234,12 +234,12 @@ class BenchController:
 
     def find_adapters(self) -> None:
         self._set(doing=Activity.ADAPTERS)
-        self._set(adapters=tuple(self._place.adapters(self._cancelled)), was_looked_for=True)
+        self._set(adapters=tuple(self._backend.adapters(self._cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
         """Open an adapter and look for devices."""
         adapter = _known({each.name: each for each in self.state.adapters}, name)
-        self._place.use(adapter)
+        self._backend.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
         self._set(
             adapter=adapter, adapters=marked, bike=None, target=None, offers=(), offer=None,
@@ -255,11 +255,11 @@ class BenchController:
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
         if not bike.survey.heard:
-            raise nothing_received_error(bike.survey, self._place.bitrate_bps(self._adapter()))
+            raise nothing_received_error(bike.survey, self._backend.bitrate_bps(self._adapter()))
 
     def _seen(self, adapter: Adapter, target: Target) -> DeviceInfo:
-        with self._place.connect(adapter) as connection:
-            device = connection.device(target, dialect=self._place.dialect)
+        with self._backend.connect(adapter) as connection:
+            device = connection.device(target, dialect=self._backend.dialect)
             return device.identify(cancelled=self._cancelled)
 
     def choose_target(self, name: str) -> None:
@@ -280,7 +280,7 @@ class BenchController:
         self._set(offer=_known(fitting, name), done=None)
 
     def use_folder(self, path: str) -> None:
-        self._place.use_folder(path)
+        self._backend.use_folder(path)
         self.judge()
 
     def judge(self) -> None:
@@ -288,7 +288,7 @@ class BenchController:
         self._set(doing=Activity.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
-        for path in self._place.images():
+        for path in self._backend.images():
             if self._cancelled():
                 break
             offers.append(self._judged(path))
@@ -298,7 +298,7 @@ class BenchController:
     def take_files(self) -> None:
         """Check files dropped on the page."""
         self._has_new_files.clear()
-        self._set(dropped=tuple(self._place.dropped()))
+        self._set(dropped=tuple(self._backend.dropped()))
         if self.state.target is not None and self.state.offer is None:
             self.judge()
 
@@ -341,8 +341,8 @@ class BenchController:
                 self._set(watched=BusWatch(self._now() - since_s, messages, troubles, rows))
 
         self._set(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
-        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._place.dialect)
-        with self._place.connect(self._adapter(), asks=False) as connection:
+        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._backend.dialect)
+        with self._backend.connect(self._adapter(), asks=False) as connection:
             drive(
                 watcher, connection.link, connection.clock,
                 on_event=happened, cancelled=self._cancelled,
@@ -354,8 +354,8 @@ class BenchController:
         """
         self._adapter()
         self._set(doing=Activity.JUDGING, areas=None)
-        found = [area_of_profile(self._place.profile(BMS)) or self._place.model_area()]
-        for path in self._place.images():
+        found = [area_of_profile(self._backend.profile(BMS)) or self._backend.model_area()]
+        for path in self._backend.images():
             if self._cancelled():
                 return
             with suppress(FlasherError):
@@ -377,7 +377,7 @@ class BenchController:
 
         self._set(doing=Activity.SAVING, saved=None, saved_bytes=0)
         self._set(
-            saved=self._place.back_up(
+            saved=self._backend.back_up(
                 self._adapter(), area, on_event=happened, cancelled=self._cancelled
             ),
             areas=None,
@@ -405,8 +405,8 @@ class BenchController:
     def _job(self, path: Path, target: Target | None) -> Job:
         if target is None:
             raise UsageError("No device is chosen.", remedy="Choose the one to upgrade.")
-        profile = self._place.profile(target)
-        rate = self._place.bitrate_bps(self._adapter())
+        profile = self._backend.profile(target)
+        rate = self._backend.bitrate_bps(self._adapter())
         name = visible(path.name)
         return prepare(
             path,
@@ -417,14 +417,14 @@ class BenchController:
         ).checked()
 
     def _check_sample(self, image: Image) -> None:
-        """Raises ImageError for a firmware sample on a real bus; the upgrade checks again."""
+        """Refuse a firmware sample on a real bus; the upgrade checks again. Raises ImageError."""
         adapter = self._adapter()
-        if is_sample(image) and self._place.is_physical(adapter):
+        if is_sample(image) and self._backend.is_physical(adapter):
             raise sample_error(image, adapter.name)
 
     def _check_device(self, job: Job) -> None:
-        """Raises WrongDeviceError for an image of another device than the one that answered; the
-        upgrade asks again.
+        """Refuse an image of another device than the one that answered; the upgrade asks again.
+        Raises WrongDeviceError.
         """
         bike = self.state.bike
         if bike is None or self.state.is_rescue or job.plan.target is not bike.target:
@@ -459,7 +459,7 @@ class BenchController:
                 f"{printable(offer.name)} has changed since it was chosen; nothing was sent.",
                 remedy="Choose the image again.",
             )
-        carried = self._place.upgrade(
+        carried = self._backend.upgrade(
             adapter, job, on_event=self._happened, cancelled=self._cancelled
         )
         if carried.error is not None:

@@ -180,7 +180,7 @@ class BenchState:
     repetitions: int = 0
     transfer_began_s: float | None = None
     now_s: float = 0.0
-    """Time of the bench's clock, like `transfer_began_s`."""
+    """Present time of the bench in monotonic seconds."""
     power_cycle_s: float | None = None
     """Seconds in which the user has to switch the device off and on; None: not needed."""
     power_cycle_since_s: float = 0.0

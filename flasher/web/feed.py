@@ -37,21 +37,21 @@ class _Follower:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.changes: deque[_Change] = deque()
         self.last: dict[str, _Change] = {}
-        self.is_behind = True
-        """The page needs all states."""
+        self.needs_all = True
+        """True if the page needs all states."""
         self.woken = asyncio.Event()
         self._loop = loop
 
     def put(self, change: _Change) -> None:
         """Queue a change. Call with the feed's lock held."""
-        if self.is_behind:
+        if self.needs_all:
             return
         last = self.last.get(change.subject)
         if last is not None and last.word == change.word:
             last.state = change.state
             return
         if len(self.changes) >= PENDING_MAX:
-            self.is_behind = True
+            self.needs_all = True
             return
         self.last[change.subject] = change
         self.changes.append(change)
@@ -140,7 +140,7 @@ class Feed:
 
     def _take(self, follower: _Follower) -> Batch:
         with self._lock:
-            is_all, follower.is_behind = follower.is_behind, False
+            is_all, follower.needs_all = follower.needs_all, False
             changes = tuple(self._states.values() if is_all else follower.changes)
             follower.changes.clear()
             follower.last.clear()

@@ -44,7 +44,7 @@ FORMS: Final = (LOGIN, SIGN_OUT, _END)
 _WAITING_MAX: Final = 4
 """Maximum number of PINs that are checked or wait."""
 _WAITING_OF_ONE_MAX: Final = 2
-"""The same for one address, so that one client cannot use all of them."""
+"""Maximum number for one address, so that one client cannot use all of them."""
 _QUERY_MAX: Final = 1000
 """Maximum length of a page's query that is stored during sign-in."""
 _BADGE_MAX: Final = 300
@@ -257,7 +257,7 @@ class Login:
         return _RefusedError(text("The badge, PIN or password is wrong."))
 
     def _check_supervisor(self, address: str, person: Person) -> None:
-        """Raises _RefusedError for a badge with another role."""
+        """Check that a badge is a supervisor's. Raises _RefusedError."""
         if person.role is not Role.SUPERVISOR:
             data = {"name": person.name, "address": address, "why": "no supervisor"}
             self._note(AuditEvent.SIGN_IN_REFUSED, data)

@@ -126,7 +126,7 @@ _answering: Answering | None = None
 
 
 def _begin(make: Callable[[], Answering]) -> None:
-    """Called once in each process. It must not fail, or another process would start at once."""
+    """Initialize a process. It must not fail, or another process would start at once."""
     global _make  # noqa: PLW0603  a process has one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()

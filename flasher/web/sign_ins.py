@@ -78,7 +78,7 @@ class SignIns:
         self._clock = clock
         self._note = note
         self._known: dict[str, SignIn] = {}
-        """By key, oldest first."""
+        """Active sign-ins by key, oldest first."""
         self._count = 0
 
     def begin(self, person: Person | None, address: str, keys: Iterable[str] = ()) -> list[str]:

@@ -235,7 +235,7 @@ def test_an_ack_of_a_device_that_seems_to_have_restarted_is_another_devices(
     assert "yet packet 6 was acknowledged" in check_two(bench)
 
 
-def test_a_device_that_has_restarted_is_told_to_update_after_a_moment() -> None:
+def test_a_device_that_has_restarted_has_update_command_after_a_moment() -> None:
     bench = in_transfer(5)
     bench.wait(0.07)
     bench.say(Ack(5))

@@ -145,7 +145,7 @@ def test_an_update_command_goes_into_the_silence_again_after_each_erase_limit() 
     assert bench.on_to_packet(2, first=1)
 
 
-def test_a_bootloader_that_confirms_the_reset_and_stays_in_its_session_is_told_to_update() -> None:
+def test_a_bootloader_that_confirms_the_reset_and_stays_in_its_session_has_update_command() -> None:
     """R15: to the letter it confirms every write, the reset too, that it ignores (R18)."""
     bench = Bench(options=PATIENT)
     bench.to_transfer()

@@ -104,9 +104,9 @@ class Floor:
                 if change is not None:
                     self.line.feed(name, change, self.now)
             self.line.tick(self.now)
-            self.write_planned()
+            self.perform_effects()
 
-    def write_planned(self) -> None:
+    def perform_effects(self) -> None:
         while effects := self.line.take():
             for effect in effects:
                 if isinstance(effect, Order):
@@ -125,7 +125,7 @@ class Floor:
         self.presences[name].begin()
         self.line.feed(name, RESULT, self.now)
         self.line.feed(name, saved(name, outcome, "Take it out."), self.now)
-        self.write_planned()
+        self.perform_effects()
 
     def fail(self, name: str, outage_s: float) -> None:
         """The process of a socket ends, and another one begins."""
@@ -136,7 +136,7 @@ class Floor:
 
     def scan(self, text: str, source: Source = ONE) -> None:
         self.line.scan(text, self.now, source)
-        self.write_planned()
+        self.perform_effects()
         self.go_on(0.2)
 
     def put(self, unit: Unit, name: str) -> None:
@@ -412,7 +412,7 @@ def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> No
     floor.go_on(3.0)
     assert floor.state("A") is SocketState.EMPTY
     floor.line.feed("A", AdapterDown("its process ended"), floor.now)
-    floor.write_planned()
+    floor.perform_effects()
     assert floor.state("A") is SocketState.ERROR
     floor.presences["A"].begin()
     floor.line.feed("A", AdapterReady("a bus", sees_units=True), floor.now)

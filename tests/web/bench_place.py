@@ -84,7 +84,7 @@ class BenchPlace:
     def do(self, *orders: Order) -> BenchState:
         """Carry out orders; the state then."""
         for order in orders:
-            self.bench.write_planned(order)
+            self.bench.execute(order)
         return self.bench.state
 
     @contextmanager

@@ -159,7 +159,7 @@ class Claiming:
     # -- the rules --------------------------------------------------------------------------------
 
     def _check_clock(self) -> None:
-        """Raises ClaimRefusedError if recorded runs are later than the clock."""
+        """Check that no recorded run is later than the clock. Raises ClaimRefusedError."""
         last = chain.latest(self._connection, self._trail.station)
         if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
             raise ClaimRefusedError(
@@ -213,8 +213,8 @@ class Claiming:
             )
 
     def _check_unit_kind(self) -> None:
-        """Raises ClaimRefusedError for a real unit recorded as virtual, or the reverse: a PASS of
-        one proves nothing about the other.
+        """Refuse a real unit recorded as virtual, or the reverse: a PASS of one proves nothing
+        about the other. Raises ClaimRefusedError.
         """
         is_virtual = self._order.is_virtual
         others = select(run.c.id).where(

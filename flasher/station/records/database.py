@@ -181,8 +181,9 @@ class Database:
                 yield connection
 
     def _check_place(self, connection: Connection, *, has_log: bool = False) -> None:
-        """Raises RecordsMovedError for a moved or deleted file: SQLite would go on writing to
-        it.
+        """Check that the file was not moved or deleted, as SQLite would go on writing to it.
+
+        Raises RecordsMovedError.
         """
         file = self.location.file
         if file is None:
@@ -242,7 +243,7 @@ class Database:
             "busy_timeout": self._lock_timeout_ms,
             "journal_mode": "memory" if self.location.file is None else "wal",
             "synchronous": _SYNCHRONOUS_FULL,
-            # Alembic changes a table by making it anew: others name rows of it meanwhile.
+            # Alembic replaces a table to change it, while other rows refer to its rows.
             "foreign_keys": 0 if self._changes_schema else 1,
             # Or REPLACE would delete without the triggers.
             "recursive_triggers": 1,
@@ -268,7 +269,7 @@ class StationLock:
         self._lock = FileLock(self._path, timeout=0, thread_local=False)
 
     def acquire(self) -> None:
-        """Raises StationBusyError while another process holds the lock, RecordError."""
+        """Acquire the lock. Raises StationBusyError while another process holds it, RecordError."""
         if self._lock.is_locked:
             return
         shown = printable(str(self._path))
@@ -355,7 +356,7 @@ def open_database(
 
 
 def check_schema(database: Database, now: datetime, *, create: bool) -> None:
-    """Raises OldSchemaError for records that can be upgraded, SchemaVersionError, RecordError."""
+    """Check the schema. Raises OldSchemaError if it can be upgraded, SchemaVersionError."""
     where = database.location.shown
     with database.reading() as connection:
         has_tables = inspect(connection).get_table_names()

@@ -132,7 +132,7 @@ class Examiner:
         self._since = since
         self._trails_found: list[_Trail] = []
         self.examined: Examined | None = None
-        """For the next examination; None until this one is done, or if it found a problem."""
+        """State for the next examination; None until this one is done, or if it found a problem."""
         self._traces = 0
         self._nameless = 0
 
@@ -537,7 +537,7 @@ class Examiner:
             return
         try:
             with self._files.temporary_copy(traces[0]) as path:
-                heard = traces_of_targets(
+                traces_by_target = traces_of_targets(
                     (target.target for target in details.targets), read_trace(path)
                 )
         except (UsageError, RecordError) as error:
@@ -545,8 +545,8 @@ class Examiner:
             yield Problem(where, what, (run.run_id,))
             return
         self._traces += 1
-        self._nameless += not any(each.serial for each in heard.values())
-        for what in contradictions(details, heard):
+        self._nameless += not any(each.serial for each in traces_by_target.values())
+        for what in contradictions(details, traces_by_target):
             yield Problem(where, f"its trace contradicts it: {what}", (run.run_id,))
 
 

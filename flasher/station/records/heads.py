@@ -322,7 +322,7 @@ def _parsed(line: bytes) -> ChainHead | Checkpoint | None:
 
 
 def _head(found: Any) -> ChainHead:
-    """Raises TypeError, ValueError for an invalid head."""
+    """Parse a head. Raises TypeError, ValueError."""
     head = ChainHead(**found)
     if type(head.number) is not int:
         raise ValueError("the number of a head is not a number")

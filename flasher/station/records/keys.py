@@ -64,7 +64,7 @@ class KeyLocations:
         return note, note.with_suffix(".verifier")
 
     def check(self, location: Location) -> None:
-        """Raises UsageError for heads in the same database as the records."""
+        """Check that no heads are stored in the database of the records. Raises UsageError."""
         for each in self.elsewhere:
             if each.holds(location):
                 raise UsageError(

@@ -467,7 +467,7 @@ class KeptHeads:
 
     @property
     def is_whole(self) -> bool:
-        """True if it covers every audit row."""
+        """True if the heads cover every audit row."""
         return self.first == 1 and self.last >= self.rows
 
 

@@ -30,7 +30,7 @@ _FORBIDDEN: Final = ("DELETE", "TRUNCATE", "TRIGGER")
 
 
 def check_roles(location: Location, station: str, reader: str) -> None:
-    """Raises UsageError for records in a file, or the same role for both."""
+    """Check the roles. Raises UsageError for records in a file, or two equal roles."""
     if location.url.get_backend_name() != "postgresql":
         raise UsageError(
             "Only records on a PostgreSQL server have roles.",
@@ -115,7 +115,7 @@ def _make(connection: Connection, role: str) -> bool:
 
 
 def _check(connection: Connection, role: str) -> None:
-    """Raises UsageError for a role with rights by another way: as superuser, owner, or member."""
+    """Check that a role has no further rights, as superuser, owner or member. Raises UsageError."""
     rights = " OR ".join(f"has_table_privilege(:role, oid, '{right}')" for right in _FORBIDDEN)
     query = text(
         f"SELECT has_schema_privilege(:role, current_schema(), 'CREATE') OR EXISTS (SELECT 1"

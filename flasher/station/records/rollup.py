@@ -103,7 +103,7 @@ class Day(NamedTuple):
 StepTimes = dict[str, Counter[float]]
 """Number of each duration in seconds, by step name."""
 _Times = dict[str, Counter[str]]
-"""The same with durations as text, for JSON."""
+"""Number of each duration, as text for JSON, by step name."""
 _ALL: Final = (0, 0)
 """Recipe and socket 0: the times of all."""
 
@@ -191,7 +191,7 @@ class Rollup:
             with self._database.reading() as connection:
                 begun = _last_added(sums, connection)
                 if begun is None:
-                    _begin_anew(sums)
+                    _recreate(sums)
                     begun = 0
                 last = _last_to_add(connection, begun, now)
                 if last > begun:
@@ -289,7 +289,7 @@ def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
     return int(found["run"])
 
 
-def _begin_anew(sums: sqlite3.Connection) -> None:
+def _recreate(sums: sqlite3.Connection) -> None:
     for (name,) in sums.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
         sums.execute(f"DROP TABLE {name}")
     for statement in _TABLES.split(";"):
@@ -546,7 +546,7 @@ class Rolled:
         return Rest(chosen, [schema.run.c.id > self.run, *within])
 
     def _cut(self, whole: Collection[Day]) -> Iterator[Rest]:
-        """Runs of days that are partly in the period, or cut."""
+        """Runs of days that lie only partly in the period or in a span."""
         kept = {day.number for day in whole}
         condition = beside_index(schema.run.c.id) <= self.run
         for day in self._days:
@@ -573,7 +573,7 @@ class Rolled:
         )
 
     def _periods(self, whole: Sequence[Day]) -> Iterator[str]:
-        """Months and days that make up whole days."""
+        """Keys of the sums that cover these days: whole months, and the other days."""
         in_all = Counter(day.month for day in self._days)
         months = {
             month for month, days in Counter(day.month for day in whole).items()

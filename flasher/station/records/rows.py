@@ -67,7 +67,7 @@ def grouped(
     found = defaultdict(list)
     for some in batches(keys):
         rows = connection.execute(query, {KEYS.key: some})
-        names = list(rows.keys())  # once: each row of a result would look them up anew
+        names = list(rows.keys())  # once: each row of a result would look them up again
         for row in rows:
             each = dict(zip(names, row, strict=True))
             found[each[column]].append(each)

@@ -91,8 +91,8 @@ class ServerLock:
         self._key = int.from_bytes(digest[:8], "big", signed=True)
 
     def acquire(self) -> None:
-        """Raises StationBusyError while another process holds the lock, RecordError. Waits for a
-        process that was just killed, up to the lock timeout.
+        """Acquire the lock; waits for a process that was just killed, up to the lock timeout.
+        Raises StationBusyError while another process holds it, RecordError.
         """
         with self._mutex, mapped(self._where, writes=True):
             if not self.is_held:

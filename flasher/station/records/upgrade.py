@@ -54,7 +54,7 @@ NEWEST: Final = str(schema.SCHEMA_VERSION)
 
 @dataclass(frozen=True)
 class Upgraded:
-    """Result of an upgrade."""
+    """Result of a schema upgrade."""
 
     before: str
     """Schema version before the upgrade."""
