@@ -72,7 +72,7 @@ class Continuity:
         watcher: TargetWatcher,
         *,
         blind_s: float,
-        goes_on: bool = False,
+        may_restart: bool = False,
         was_exchanged: bool = False,
         was_missed: bool = False,
         was_silent: bool = False,
@@ -82,7 +82,7 @@ class Continuity:
         self.lost = ""
         """Evidence of an exchange, as a sentence; "" without any."""
         self.unobserved = (
-            _UNOBSERVED.format("before the run began") if was_missed and not goes_on else ""
+            _UNOBSERVED.format("before the run began") if was_missed and not may_restart else ""
         )
         """Unobserved time in which a unit could have been exchanged, as a sentence, or ""."""
         self.is_running = False
@@ -90,7 +90,7 @@ class Continuity:
         self.has_update_command = False
         """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
-        self._goes_on, self._was_silent = goes_on, was_silent and not goes_on
+        self._may_restart, self._was_silent = may_restart, was_silent and not may_restart
         """A restart is not evidence; a start is, because the run began with silence."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
@@ -113,7 +113,7 @@ class Continuity:
         """Observed time up to the last announcement of the current burst; None: no burst."""
         self._burst_until = -inf
         """Time until which a burst may begin that the run has caused."""
-        self._heard_s, self._missed_unheard_s, self._resumed_s = 0.0, 0.0, -inf
+        self._received_s, self._missed_silent_s, self._resumed_s = 0.0, 0.0, -inf
         """Observed time up to the last frame of the unit; unobserved time since then (frames
         that had waited to be read do not end it); observed time up to its end.
         """
@@ -208,7 +208,7 @@ class Continuity:
 
     def _miss(self, missed_s: float) -> None:
         self._missed_s += missed_s
-        self._missed_unheard_s += missed_s
+        self._missed_silent_s += missed_s
         self._resumed_s = self._listened_s
         self.watcher.miss(missed_s)
 
@@ -226,7 +226,7 @@ class Continuity:
         watcher(frame, sent=False, now=now)
         if watcher.power_ups > power_ups and (was_heard or self._was_silent):
             self._take_power_up(now, was_heard=was_heard)
-        missed_unheard_s = self._missed_unheard_s
+        missed_unheard_s = self._missed_silent_s
         has_returned = watcher.received_at == now and self._returns()
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
@@ -247,15 +247,15 @@ class Continuity:
         if watcher.announcements > announcements and self._is_identified:
             self._compare_boot_version()
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
-            if self._requested_s is not None and not self._goes_on:
+            if self._requested_s is not None and not self._may_restart:
                 self._lose("runs an application in the middle of its transfer")
             self._compare(watcher.answer)
 
     def _returns(self) -> bool:
         """Process a frame of the unit. Returns True after a silence that allows an exchange."""
-        before, self._heard_s = self._heard_s, self._listened_s
+        before, self._received_s = self._received_s, self._listened_s
         if self._listened_s - self._resumed_s > BACKLOG_S:
-            self._missed_unheard_s = 0.0
+            self._missed_silent_s = 0.0
         return self._listened_s - before > _EXCHANGE_S
 
     def _note_sent(self, frame: Frame, now: float) -> None:
@@ -327,7 +327,7 @@ class Continuity:
         if self._has_acted or now <= self._supplied_until:
             return
         # A socket holds its unit from the identification on; before, another one may be put in.
-        if self._goes_on and (self._is_identified or self.watcher.request is None):
+        if self._may_restart and (self._is_identified or self.watcher.request is None):
             return
         if not was_heard:
             self._lose("was silent when the run began, and announces its bootloader now")
@@ -339,21 +339,21 @@ class Continuity:
     def _take_announcement(self, now: float, *, has_returned: bool) -> None:
         """Check an announcement; `has_returned`: it follows a silence that allows an exchange."""
         since_s = self._pause_s
-        goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
-        self._judge_missed(since_s, goes_on=goes_on, is_caused=now <= self._burst_until)
+        in_burst, self._announced_s = since_s < self._gap_s, self._listened_s
+        self._judge_missed(since_s, in_burst=in_burst, is_caused=now <= self._burst_until)
         if not self._is_identified:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
             if self.watcher.request is None:
                 # It has to stay from the update command on; the reset caused this announcement.
-                self._count_caused(goes_on=goes_on)
+                self._count_caused(in_burst=in_burst)
             return
         if self._requested_s is not None:
             if self._listened_s - self._requested_s > self._timings.leftover_boot_version_s:
                 self._lose_by_restart("in the middle of the transfer")
             return
-        is_caused = self._count_caused(goes_on=goes_on)
-        if goes_on:
+        is_caused = self._count_caused(in_burst=in_burst)
+        if in_burst:
             return
         if is_caused:
             if (self._awaits_confirmation or self._awaits_complete) and has_returned:
@@ -368,31 +368,31 @@ class Continuity:
         if version and version != self._boot_version:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
 
-    def _count_caused(self, *, goes_on: bool) -> bool:
+    def _count_caused(self, *, in_burst: bool) -> bool:
         """Count an announcement. Returns True for the first one of a burst that the run has caused;
         no further burst is expected then.
         """
         is_caused = self._now <= self._burst_until
-        if goes_on:
+        if in_burst:
             self._announced_on += 1
-        if not goes_on or self._announced_on == _ANNOUNCED_ON:
+        if not in_burst or self._announced_on == _ANNOUNCED_ON:
             self._burst_until = -inf
-        return is_caused and not goes_on
+        return is_caused and not in_burst
 
-    def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
+    def _judge_missed(self, since_s: float, *, in_burst: bool, is_caused: bool) -> None:
         """Check whether a unit may have been exchanged during unobserved time."""
         missed_s, self._missed_s = self._missed_s, 0.0
         if is_caused:
             was_sent = self._announced_on < _ANNOUNCED_ON or self.has_update_command
-            could_be_other = was_sent and not goes_on and missed_s >= _EXCHANGE_S
+            could_be_other = was_sent and not in_burst and missed_s >= _EXCHANGE_S
         else:
-            could_be_other = goes_on and missed_s > 0.0 and since_s + missed_s >= self._gap_s
-        if could_be_other and not self._goes_on and not self.unobserved:
+            could_be_other = in_burst and missed_s > 0.0 and since_s + missed_s >= self._gap_s
+        if could_be_other and not self._may_restart and not self.unobserved:
             self.unobserved = _UNOBSERVED.format(f"to the {self._name} for {missed_s:.1f} s")
 
     def _lose_by_restart(self, when: str) -> None:
         self.is_running = False
-        if not self._goes_on:
+        if not self._may_restart:
             self._lose(f"announced its bootloader {when}")
 
     def _compare(self, content: Content) -> None:

@@ -242,9 +242,9 @@ class Socket:
             self.last = replace(last, has_sent=True, has_answered=True, has_reported_serial=True)
             self.is_last_there = True
             return False
-        says_other = self.own is not None and (last.has_reported_serial or self.is_own_known)
-        if says_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
-            # Another unit; or one that was silent for a while, and does not say who it is.
+        reports_other = self.own is not None and (last.has_reported_serial or self.is_own_known)
+        if reports_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
+            # Another unit; or one that was silent for a while, and has not identified itself.
             was_last, self.is_last_there = self.is_last_there, False
             return was_last or before is not Occupancy.THERE
         has_answered = last.has_answered or self.own is not None

@@ -95,7 +95,7 @@ class UnitRun:
         self._taps = taps
         self._send_progress = send_progress
         self._cancelled = cancelled
-        goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
+        may_restart = recipe.recipe.after_restart is AfterRestart.CONTINUE
         blind_s = BLIND_S * connection.clock.speed
         watchers = watchers or [TargetWatcher(each) for each in recipe.targets]
         self._continuity = {
@@ -103,7 +103,7 @@ class UnitRun:
                 each,
                 watcher,
                 blind_s=blind_s,
-                goes_on=goes_on,
+                may_restart=may_restart,
                 was_exchanged=was_exchanged,
                 was_missed=was_missed,
                 was_silent=was_silent,
@@ -112,18 +112,18 @@ class UnitRun:
         }
         for each in self._continuity.values():
             each.listened(self._clock.now())
-        self._goes_on = goes_on
+        self._may_restart = may_restart
         self._power = None if power is None else _NotedPower(power, self._continuity.values())
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")
         self._step_began_at = 0.0
         self._step_ends_at: float | None = None
         self._progress_at = float("-inf")
-        self._hear_waiting: Callable[[], None] = lambda: None
+        self._process_queued: Callable[[], None] = lambda: None
 
     def listen_meanwhile(self) -> None:
         """Read the bus while the station saves a record, so that the time counts as observed."""
         with suppress(BusError):  # the next use of the adapter raises it again
-            self._hear_waiting()
+            self._process_queued()
 
     def run(self) -> RunResult:
         """Run all steps and return the result. Any exception is a bug."""
@@ -155,11 +155,11 @@ class UnitRun:
                     taps,
                     self._is_over,
                     self._is_lost,
-                    goes_on=self._goes_on,
+                    may_restart=self._may_restart,
                 )
                 for each in self._recipe.targets
             ]
-            self._hear_waiting = targets[0].process_queued_frames
+            self._process_queued = targets[0].process_queued_frames
             return UnitSteps(
                 self._claim,
                 self._recipe,

@@ -120,7 +120,9 @@ class UnitSteps:
         """True if a device got an update command and has run no application since: it cannot
         identify itself, so no step may be tried again.
         """
-        return any(each.continuity.has_update_command and not each.goes_on for each in self.targets)
+        return any(
+            each.continuity.has_update_command and not each.may_restart for each in self.targets
+        )
 
     def wait(self, limit_s: float) -> None:
         """Wait between two tries, and request the versions of running applications. Raises
@@ -156,10 +158,10 @@ class UnitSteps:
                     codes.TWO_DEVICES,
                     f"Two devices answer as {target.name}: {identified.two_devices}.",
                 )
-            is_known = target.continuity.has_answered and not target.goes_on
+            is_known = target.continuity.has_answered and not target.may_restart
             if is_known and identified.seen.version is None:
                 raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
-            may_await_power = self._power is not None or target.goes_on
+            may_await_power = self._power is not None or target.may_restart
             is_rescue = self._claim.kind is RunKind.RECHECK and may_await_power
             if target.is_silent(identified) and not is_rescue:
                 raise StepFailedError(
@@ -172,7 +174,7 @@ class UnitSteps:
             target.check_cancelled()
             measured += identity_measurements(target, identified)
             states.append(f"{target.name}: {state_text(target, identified)}")
-        if self.targets[0].goes_on:
+        if self.targets[0].may_restart:
             measured.append(Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value))
         self._check_label()
         measured += self._reads.limits(StepName.IDENTIFY)
@@ -323,7 +325,7 @@ class UnitSteps:
         self.device_state = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()
         if result.ok:
-            if target.watcher.completions == completions_when_lost and not target.goes_on:
+            if target.watcher.completions == completions_when_lost and not target.may_restart:
                 raise self._of_lost_adapter(target, result)
             return result
         code = _OF_VERDICT.get(result.verification.verdict)
@@ -375,7 +377,7 @@ class UnitSteps:
 
     def _await(self, target: UnitTarget) -> Content:
         """Wait for a version answer of the application. Raises StepFailedError."""
-        was_running = target.continuity.is_running and not target.goes_on
+        was_running = target.continuity.is_running and not target.may_restart
         answer = target.await_application()
         if answer is None and was_running:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
@@ -444,7 +446,7 @@ class UnitSteps:
     def _continuity(self) -> Iterator[Measurement]:
         """Measurements that record whether each target was observed without a gap."""
         for target in self.targets:
-            is_watched = target.continuity.is_running and not target.goes_on
+            is_watched = target.continuity.is_running and not target.may_restart
             words = "observed" if is_watched else "not observed"
             yield Measurement(f"{target.name} continuity", text=words)
         cycles = self.targets[0].continuity.power_cycles

@@ -72,14 +72,14 @@ class UnitTarget:
         cancelled: Callable[[], bool],
         is_lost: Callable[[], bool],
         *,
-        goes_on: bool = False,
+        may_restart: bool = False,
     ) -> None:
         self.loaded = loaded
         self.name = loaded.name
         self.clock = connection.clock
         self.continuity = continuity
         self.watcher = continuity.watcher
-        self.goes_on = goes_on
+        self.may_restart = may_restart
         """The recipe allows the target to restart by itself (`AfterRestart.CONTINUE`)."""
         self._taps = taps
         # No other program uses this adapter, and each flash listens for other tools itself.
@@ -95,12 +95,12 @@ class UnitTarget:
             loaded.image,
             loaded.profile,
             bitrate_bps=None if rate is None else rate.bps,
-            # A unit fails that does not take its image in one session (`goes_on`: in some
+            # A unit fails that does not take its image in one session (`may_restart`: in some
             # attempts); another tool is a fault of the station.
             options=loaded.profile.upgrade_options(
                 attempts=loaded.profile.attempts,
                 waits_for_other_tool=False,
-                single_session=not goes_on,
+                single_session=not may_restart,
             ),
             # Units without an application are flashed too.
             identity=loaded.profile.identity(release=loaded.release, reports_unchecked=True),
@@ -144,7 +144,7 @@ class UnitTarget:
         """Request the version until the application answers. None if it does not start in time or
         no longer answers.
         """
-        may_start = self.goes_on or not self.continuity.is_running
+        may_start = self.may_restart or not self.continuity.is_running
         start_s = self.loaded.profile.timings.application_start_timeout_s
         give_up_at = self.clock.now() + (start_s if may_start else SILENCE_S)
         while True:
@@ -183,7 +183,7 @@ class UnitTarget:
         self.check_cancelled()
         if not self.continuity.is_running or self.await_application() is not None:
             return
-        if not self.goes_on:
+        if not self.may_restart:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} stopped answering.")
 
     def process_queued_frames(self) -> None:

@@ -248,7 +248,7 @@ class Login:
             raise _RefusedError(trouble, 429, wait_s=wait_s)
 
     def _wrong(self, address: str, badge: str, why: str, name: str = "") -> _RefusedError:
-        # Without the text: somebody may have typed a PIN where the badge belongs.
+        # Without the text: a person may have typed a PIN where the badge belongs.
         data = {"name": name, "address": address, "why": why}
         pause_s = self._attempts.pause_s(address, badge, self._clock.monotonic_s())
         if pause_s:

@@ -124,10 +124,10 @@ def measure(folder: Path, runs: int) -> None:
         timed("one unit", lambda: as_json(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
-        for goes_on in (False, True):
+        for incremental in (False, True):
             began = time.perf_counter()
-            problems = store.examine(incremental=goes_on).problems
-            what = "verify, again" if goes_on else "verify --all"
+            problems = store.examine(incremental=incremental).problems
+            what = "verify, again" if incremental else "verify --all"
             print(f"  {what}: {len(problems)} problems, {time.perf_counter() - began:.1f} s")
         print(f"  figures: {records.figures()}")
     size_bytes = (folder / "backup.sqlite").stat().st_size

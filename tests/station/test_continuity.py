@@ -235,19 +235,19 @@ def test_a_silent_unit_may_be_reset_without_an_answer(tmp_path: Path) -> None:
 
 
 def test_a_held_unit_may_be_switched_on_after_its_run_began(tmp_path: Path) -> None:
-    run = Watched(tmp_path, was_silent=True, goes_on=True)
+    run = Watched(tmp_path, was_silent=True, may_restart=True)
     run.announce(1.5)
     assert not run.continuity.lost
 
 
-@each("goes_on", [False, True])
+@each("may_restart", [False, True])
 def test_a_unit_that_restarts_before_it_is_identified_may_be_another_one(
-    tmp_path: Path, goes_on: bool
+    tmp_path: Path, may_restart: bool
 ) -> None:
     """Another one was put in just before the label was scanned, even into a fixture that holds it
     then.
     """
-    run = Watched(tmp_path, goes_on=goes_on)
+    run = Watched(tmp_path, may_restart=may_restart)
     for now in (1.0, 1.05):
         run.announce(now, 1)
     assert not run.continuity.lost
@@ -256,7 +256,7 @@ def test_a_unit_that_restarts_before_it_is_identified_may_be_another_one(
 
 
 def test_a_fixture_may_restart_the_unit_that_it_holds(tmp_path: Path) -> None:
-    run = Watched(tmp_path, goes_on=True)
+    run = Watched(tmp_path, may_restart=True)
     run.identify()
     run.announce(1.7)
     assert not run.continuity.lost

@@ -69,7 +69,7 @@ def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
     if found.problems:
         output.result(counted(len(found.problems), "problem"))
     else:
-        _say_what_was_checked(found, output)
+        _print_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
     return output.document(found, exit_code=code)
 
@@ -108,7 +108,7 @@ def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
     yield from others
 
 
-def _say_what_was_checked(found: Examination, output: Output) -> None:
+def _print_checked(found: Examination, output: Output) -> None:
     since = ""
     if found.since is not None:
         since = f" since the examination of {found.since[:16].replace('T', ' ')} UTC"

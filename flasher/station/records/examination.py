@@ -377,7 +377,7 @@ class Examiner:
             trail.add(before)
             self._add_progress(1)
             if not is_whole:
-                continue  # what it says counts for nothing
+                continue  # its content is not trusted
             if _table(data.get("schema")):
                 trail.stated = data.get("version"), _table(data.get("schema"))
             if row["event"] == chain.RESTORED:
@@ -492,7 +492,7 @@ class Examiner:
             yield from self._digests(run_id, digests, stated[run_id], changed)
         for run_id, content in contents.items():
             if not is_whole(content):
-                continue  # its digests tell
+                continue  # its digests already differ
             try:
                 details = details_of_content(content, content["recipe"])
             except ValidationError as error:

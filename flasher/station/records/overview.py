@@ -281,7 +281,7 @@ class Overview:
 
     def _units(self, chosen: RunFilter, spans: Sequence[Span]) -> dict[int, Units]:
         run = schema.run.c
-        # The id counts first, its last digit tells PASS: so the least is that of the first run.
+        # Run id times two, plus one for PASS: the least value is that of the first run.
         ranked = run.id * 2 + case((run.state == RunState.PASS.value, 1), else_=0)
         found: dict[int, Units] = {}
         for begin in range(0, len(spans), _SPANS_AT_ONCE):

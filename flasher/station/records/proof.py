@@ -95,8 +95,8 @@ class Restarts:
             return
         since_s = inf if self._announced_at is None else at_s - self._announced_at
         self._announced_at = at_s
-        goes_on_s = _BURST_QUIET_S if self._is_running else _STALL_S
-        is_new = since_s >= goes_on_s
+        burst_gap_s = _BURST_QUIET_S if self._is_running else _STALL_S
+        is_new = since_s >= burst_gap_s
         self._is_running = False
         self._is_noted = self._is_noted and not is_new
         if self._requested_at is not None:
@@ -157,7 +157,7 @@ class TraceOfTarget:
             watcher.miss(gap_s)
         was_known, power_ups = watcher.is_known, watcher.power_ups
         watcher(frame, sent=False, now=at_s)
-        # How long a bootloader announces itself before its application starts, the profile says.
+        # The profile has the duration of announcements before an application starts.
         is_power_up = watcher.power_ups > power_ups and watcher.is_in_bootloader
         if was_known and is_power_up:
             self.restarts.powered_up(at_s)

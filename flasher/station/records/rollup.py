@@ -311,8 +311,8 @@ def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
     running = select(func.min(beside_index(run.id))).where(
         run.state == RunState.RUNNING.value, run.id > begun
     )
-    goes_on = connection.execute(running).scalar_one_or_none()
-    return min(last, begun + _RUNS_AT_ONCE, last if goes_on is None else goes_on - 1)
+    first_running = connection.execute(running).scalar_one_or_none()
+    return min(last, begun + _RUNS_AT_ONCE, last if first_running is None else first_running - 1)
 
 
 class _Addition:

@@ -1,6 +1,5 @@
-"""The changes of the schema, for Alembic: one module each in `versions`, run by `upgrade`.
+"""Schema migrations for Alembic: one module each in `versions`, run by `upgrade`.
 
-A change is a new module there, the same change in `schema`, and the next `SCHEMA_VERSION`. It says
-what it does itself and imports nothing of the records, which go on to change. Triggers are not its
-matter: they are all created again after the last change.
+A change needs a new module, the same change in `schema`, and the next `SCHEMA_VERSION`. The module
+imports nothing from the records, which change later. All triggers are created again at the end.
 """

@@ -1,4 +1,4 @@
-"""Alembic's environment: runs the changes on the connection, in the transaction, of `upgrade`."""
+"""Alembic environment: runs migrations on the connection and in the transaction of `upgrade`."""
 
 from alembic import context
 

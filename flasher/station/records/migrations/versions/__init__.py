@@ -1,1 +1,1 @@
-"""The changes of the schema, in order."""
+"""Schema migrations in order."""

@@ -1,8 +1,8 @@
-"""The schema before Alembic: records of it have no revision, and are taken over as they are."""
+"""Schema 2, before Alembic: such records have no revision, and need no change."""
 
 revision = "2"
 down_revision = None
 
 
 def upgrade() -> None:
-    """Nothing: these tables are there."""
+    """Do nothing: the tables exist."""

@@ -1,4 +1,4 @@
-"""Indexes that lead to the newest rows of pages, and to the rules of a claim, in a million runs."""
+"""Indexes for the newest rows of pages and the rules of a claim, in a million runs."""
 
 from alembic import op
 
