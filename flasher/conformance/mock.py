@@ -77,8 +77,12 @@ class MockSubject(SimulatedSubject[MockDevice]):
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         self._injector.set(PowerCut(off_s), InOperation(operation, share))
 
+    @property
+    def is_cut_pending(self) -> bool:
+        return self._injector.is_set
+
     def take_cut(self) -> bool:
-        happened = not self._injector.is_set
+        happened = not self.is_cut_pending
         self._injector.clear()
         return happened
 

@@ -141,6 +141,10 @@ class RealSubject:
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         raise Unsupported("the start of a flash operation is not visible from outside")
 
+    @property
+    def is_cut_pending(self) -> bool:
+        return False
+
     def take_cut(self) -> bool:
         return False
 

@@ -81,6 +81,10 @@ class Subject(Protocol):
         `operation` (counted from now, from 0) is done. Only one cut can be pending.
         """
 
+    @property
+    def is_cut_pending(self) -> bool:
+        """True until the cut has happened or is cancelled."""
+
     def take_cut(self) -> bool:
         """True when the cut has happened; otherwise cancels it."""
 

@@ -43,6 +43,11 @@ class Waits:
         return (count - 1) * spacing_s + window_s
 
     @property
+    def restart_s(self) -> float:
+        """Longest time from a restart, through the bootloader, to an application that answers."""
+        return self._limit("first_version_s") + self.burst_s + self._limit("start_s")
+
+    @property
     def stall_s(self) -> float:
         """Shortest pause of this program that can make a device miss a message, or look late."""
         limit = self._limit

@@ -3,14 +3,14 @@ until it is complete.
 
 `SwapsBanks` runs the image from the bank that was recorded last. `CopiesImage` copies it into the
 application area in the restart after complete, page by page, and goes on with that after a power
-cut.
+cut. `KeepsJournal` names the bank that runs in a journal.
 """
 
 from __future__ import annotations
 
 import zlib
 from struct import Struct
-from typing import Final
+from typing import ClassVar, Final
 
 from flasher.mock.memory import Operation
 from flasher.mock.model import MockDevice
@@ -171,3 +171,86 @@ class CopiesImage(SwapsBanks):
             return True
         self._is_copying = False
         return False
+
+
+class JournalStore(DualBankStore):
+    """Which bank is the application is the last entry of a journal: two pages after the banks, of
+    which one is erased when the other one is full.
+    """
+
+    pages: ClassVar[int] = 2
+
+    def __init__(self, profile: DeviceProfile) -> None:
+        super().__init__(profile)
+        self._journal = AREA_START + 2 * self._bank_bytes
+        self._page_bytes = profile.page_size_bytes
+        self._entry_bytes = len(self._units(bytes(_RECORD.size)))
+        self.flash = self.flash_type(
+            AREA_START,
+            2 * self._bank_bytes + self.pages * self._page_bytes,
+            page_size_bytes=profile.page_size_bytes,
+            program_unit_bytes=profile.program_unit_bytes,
+        )
+
+    def _record(self, bank: int) -> tuple[int, int, int, bytes]:
+        """The newest entry of this bank; its number is odd for bank 1."""
+        entries = [one for _, one in self._entries() if one[3] == _MAGIC and one[2] % 2 == bank]
+        return max(entries, key=lambda one: one[2], default=(0, 0, 0, b""))
+
+    def _entries(self) -> list[tuple[int, tuple[int, int, int, bytes]]]:
+        """Address and contents of every place for an entry."""
+        found = []
+        for page in range(
+            self._journal, self._journal + self.pages * self._page_bytes, self._page_bytes
+        ):
+            for at in range(
+                page, page + self._page_bytes - self._entry_bytes + 1, self._entry_bytes
+            ):
+                size_bytes, crc, number, magic = _RECORD.unpack(self.flash.read(at, _RECORD.size))
+                found.append((at, (size_bytes, crc, number, magic)))
+        return found
+
+    def erasing_bank(self, bank: int, size_bytes: int) -> list[Operation]:
+        return super().erasing_bank(bank, size_bytes)[1:]  # no record is in the bank
+
+    def recording_in(self, bank: int, image: bytes, number: int) -> Operation:
+        return self.entering(bank, image, number)[-1]
+
+    def entering(self, bank: int, image: bytes, number: int) -> list[Operation]:
+        """Operations that append an entry, after erasing a page for it where none is free."""
+        number += (number + bank) % 2
+        record = self._units(_RECORD.pack(len(image), zlib.crc32(image), number, _MAGIC))
+        entries = self._entries()
+        used = [at for at, one in entries if one[0] != 0xFFFF_FFFF]
+        newest = max((one[2], at) for at, one in entries if one[3] == _MAGIC)[1] if used else 0
+        free = [at for at, one in entries if one[0] == 0xFFFF_FFFF]
+        if free:
+            return [Operation(free[0], record)]
+        pages = [self._journal + page * self._page_bytes for page in range(self.pages)]
+        page = next((one for one in pages if not one <= newest < one + self._page_bytes), pages[0])
+        return [Operation(page), Operation(page, record)]
+
+    def load(self, image: bytes) -> None:
+        for bank in (0, 1):
+            self.flash.erase_page(self.bank(bank))
+        for page in range(self.pages):
+            self.flash.erase_page(self._journal + page * self._page_bytes)
+        for operation in self.erasing_bank(0, len(image)):
+            self.flash.erase_page(operation.address)
+        self.flash.program(self.bank(0), self._units(image))
+        self.flash.execute(self.recording_in(0, image, 2))
+        self.flash.program_count = self.flash.erase_count = 0
+
+
+class KeepsJournal(SwapsBanks):
+    """Swaps banks by an entry in a journal."""
+
+    store_type = JournalStore
+    store: JournalStore
+
+    def _record(self, now: float) -> str:
+        store = self.store
+        bank, image = 1 - store.active, store.staged(self._transfer.size_bytes)
+        number = max(store._number(0), store._number(1)) + 1
+        self._work(store.entering(bank, image, number), now)
+        return f"{len(image)} bytes"

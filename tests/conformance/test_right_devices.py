@@ -18,11 +18,18 @@ from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
+from flasher.mock.memory import Operation
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants.ending import RecordErasedLast
 from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
-from tests.campaigns.dual_bank import CopiesImage, SwapsBanks
+from tests.campaigns.dual_bank import (
+    CopiesImage,
+    CopyingStore,
+    JournalStore,
+    KeepsJournal,
+    SwapsBanks,
+)
 from tests.campaigns.right_devices import (
     HELD,
     AsksBeyondTheEnd,
@@ -227,12 +234,61 @@ def test_a_dual_bank_device_may_keep_its_old_application(
 
 
 @pytest.mark.slow
-@each("kind", (SwapsBanks, CopiesImage))
+@each("kind", (SwapsBanks, CopiesImage, KeepsJournal))
 def test_power_cuts_leave_a_dual_bank_device_its_old_or_new_application(
     kind: type[MockDevice],
 ) -> None:
-    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts")
+    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts", page_size_bytes=1024)
     assert blamed("PW-01", "PW-02", kind=kind, device=device, given=_KEPT) == []
+
+
+class _ForgetsCopy(CopiesImage):
+    """Erases the record of the image that waits before it is copied."""
+
+    class _Store(CopyingStore):
+        def copying(self, image: bytes) -> list[Operation]:
+            *first, done = super().copying(image)
+            return [done, *first]
+
+    store_type = _Store
+
+
+class _TriesOnce(CopiesImage):
+    """Gives up an image whose copying was interrupted twice."""
+
+    _tries = 0
+    in_ram = ("_is_copying",)
+
+    def _copies(self, now: float) -> bool:
+        if not self._is_copying and self.store.waiting is not None:
+            self._tries += 1
+            if self._tries > 2:
+                self.store.flash.erase_page(
+                    self.store.bank(1) + self.profile.application_area_bytes
+                )
+        is_left = super()._copies(now)
+        if not is_left:
+            self._tries = 0
+        return is_left
+
+
+class _ErasesJournal(KeepsJournal):
+    """Erases its only page of journal before it writes the entry of a new image."""
+
+    class _Store(JournalStore):
+        pages = 1
+
+    store_type = _Store
+
+
+@pytest.mark.slow
+@each("kind", (_ForgetsCopy, _TriesOnce, _ErasesJournal))
+def test_a_device_that_loses_an_image_to_a_power_cut_after_complete_fails(
+    kind: type[MockDevice],
+) -> None:
+    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts", page_size_bytes=1024)
+    (found,) = blamed("PW-01", kind=kind, device=device, given=_KEPT)
+    assert "flash operation" in found
 
 
 class _StartsRefused(MockDevice):

@@ -28,6 +28,9 @@ _FAR_PACKET: Final = 64
 _FEW_FRAMES: Final = (1, 9, 17, 18)
 _OFF_S: Final = 0.3
 _ERASE_SHARES: Final = (0.1, 0.3, 0.5, 0.7, 0.9)
+_JOURNAL_UPGRADES: Final = 130
+"""More than the records that fill one page, which a device then erases (2 KiB, 16 bytes each)."""
+_CUTS_IN_A_ROW: Final = 3
 _SHARES: Final = (0.0, 0.5, 1.0)
 """Before, halfway through and after a flash operation."""
 _OPERATIONS_MAX: Final = 24
@@ -55,6 +58,9 @@ class _InterruptedUpgrade:
     runs: bool = True
     """True while an application runs, so that a reset enters the bootloader."""
 
+    operations: int = _OPERATIONS_MAX
+    """About as many flash operations has an upgrade up to complete."""
+
     def swap(self) -> None:
         """Swap the images after the new one was installed."""
         self.old, self.new = self.new, self.old
@@ -65,12 +71,14 @@ class _InterruptedUpgrade:
     "power cuts in an upgrade",
     clause="R14; R19",
     stimulus="power cut at the frames of reset, update command, packets and end of transfer; while "
-    "it erases, just after complete; before, in and after every flash operation",
+    "it erases, just after complete; before, in and after every flash operation, also of those "
+    f"after complete, once and three times in a row; in {_JOURNAL_UPGRADES} upgrades, each flash "
+    "operation that the others do not have",
     expectation="the device announces itself again, starts only complete images, and can be "
-    "upgraded; acknowledged packets are stored",
+    "upgraded; acknowledged packets are stored, and a completed image runs",
     requires={DESTRUCTIVE, POWER, LONG},
-    choices=("rs_03",),
-    upgrades=400,
+    choices=("rs_03", "rs_03_old"),
+    upgrades=1000,
 )
 def cuts(bench: Bench) -> None:
     upgrade = _upgrade(bench)
@@ -89,6 +97,7 @@ def cuts(bench: Bench) -> None:
     _cut_operations(bench, upgrade)
     _cut_after_ack(bench, upgrade)
     _cut_after_complete(bench, upgrade)
+    _cut_start(bench, upgrade)
     _check_upgrade(bench, upgrade)
 
 
@@ -232,7 +241,9 @@ def _check_after_cut(
     announced = 1 + sum(one.kind is Reply.BOOT_VERSION for one in replies)
     # More than a burst means that it has no application to start.
     upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
-    if not upgrade.runs:
+    if not upgrade.runs and bench.choice("rs_03_old") == "kept":
+        bench.fail("the old application runs (rs_03_old)", "none is started")
+    elif not upgrade.runs:
         bench.succeed("no application is started", "none")
 
 
@@ -317,6 +328,7 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
                     bench.require(version is None, "the update command is accepted", got)
                     # The upgrade finished without a cut; EN-01 and EN-07 judge its result.
                     upgrade.runs = bench.application_runs()
+                    upgrade.operations = operation
                     upgrade.swap()
                     return
                 _check_after_cut(bench, upgrade, version)
@@ -379,3 +391,100 @@ def _cut_after_complete(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         bench.check_image(upgrade.new)
         upgrade.runs = True
         upgrade.swap()
+
+
+def _cut_start(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
+    """Cut the power in each flash operation between complete and the start of the application (a
+    swap of banks, a copy, a journal). The completed image has to run.
+    """
+    if not bench.subject.has_timed_cuts:  # reported by `_cut_operations`
+        return
+    _restore_old_image(bench, upgrade)
+    more = 0
+    while more < _OPERATIONS_MAX and all(
+        _cut_after(bench, upgrade, more, share) for share in _SHARES
+    ):
+        _cut_after(bench, upgrade, more, _SHARES[1], times=_CUTS_IN_A_ROW)
+        more += 1
+    if upgrade.operations < _OPERATIONS_MAX and more < _OPERATIONS_MAX:
+        _cut_rare_operations(bench, bench.good_image, upgrade.operations, more)
+
+
+def _cut_rare_operations(bench: Bench, image: bytes, before: int, more: int) -> None:
+    """Upgrade to the same image so often that a journal begins a new page, and cut the power in
+    the flash operations that only such an upgrade has. Up to complete other upgrades have about
+    `before` operations, and `more` after it.
+    """
+    upgrade = _InterruptedUpgrade(image, image)
+    while _cut_before(bench, upgrade, before):
+        before += 1
+    bench.application_runs()
+    while before and not _cut_before(bench, upgrade, before - 1):
+        bench.application_runs()
+        before -= 1
+    while _cut_after(bench, upgrade, more, _SHARES[0]):
+        more += 1
+    while more and not _cut_after(bench, upgrade, more - 1, _SHARES[0]):
+        more -= 1
+    bench.info(f"{before} flash operations before complete and {more} after it were cut")
+    for turn in range(1, _JOURNAL_UPGRADES + 1):
+        with bench.step(f"upgrade {turn} in a row"):
+            if not _cut_before(bench, upgrade, before):
+                _check_cuts(bench, upgrade, more, _SHARES[0])
+
+
+def _cut_before(bench: Bench, upgrade: _InterruptedUpgrade, operation: int) -> bool:
+    """Upgrade the running application, and cut the power before that flash operation. Returns
+    whether it was cut; otherwise the new application starts.
+    """
+    with bench.step(f"before flash operation {operation + 1}"):
+        bench.reset_to_bootloader()
+        bench.wait_until_listening()
+        upgrade.end_was_sent = False
+        bench.subject.cut_in_operation(operation, _SHARES[0], _OFF_S)
+        version = _upgrade_until_cut(bench, upgrade)
+        was_cut = bench.subject.take_cut()
+        if was_cut:
+            _check_after_cut(bench, upgrade, version)
+            _restore_old_image(bench, upgrade)
+        upgrade.runs = True
+    return was_cut
+
+
+def _cut_after(
+    bench: Bench, upgrade: _InterruptedUpgrade, operation: int, share: float, *, times: int = 1
+) -> bool:
+    """Complete an upgrade, and cut the power in that flash operation after it, and in the first one
+    after each further restart. Returns whether it was cut.
+    """
+    named = f"flash operation {operation + 1} after complete, {share:.0%} of it done"
+    with bench.step(f"{named}, {times} times in a row" if times > 1 else named):
+        _enter(bench, upgrade)
+        bench.packets(upgrade.new)
+        bench.end_transfer()
+        was_cut = _check_cuts(bench, upgrade, operation, share, times)
+        upgrade.runs = True
+        upgrade.swap()
+    return was_cut
+
+
+def _check_cuts(
+    bench: Bench, upgrade: _InterruptedUpgrade, operation: int, share: float, times: int = 1
+) -> bool:
+    """After complete, cut the power; then check that the new image runs. Returns whether the device
+    did that operation before its application ran.
+    """
+    subject, was_cut = bench.subject, False
+    for turn in range(times):
+        subject.cut_in_operation(0 if turn else operation, share, _OFF_S)
+        deadline = bench.now + _OFF_S + bench.waits.restart_s
+        while subject.is_cut_pending and bench.now < deadline:
+            bench.wait(_OFF_S / 2)
+        if not subject.take_cut():
+            break
+        was_cut = True
+    if was_cut:
+        bench.wait_for(Reply.BOOT_VERSION, within_s=_OFF_S + bench.limit("first_version_s"))
+        bench.collect(bench.waits.burst_s)
+        bench.check_image(upgrade.new)
+    return was_cut

@@ -171,6 +171,11 @@ class CompiledDevice(Machine):
         self._operations = 0
         self._cut = (operation, share, off_s)
 
+    @property
+    def is_cut_pending(self) -> bool:
+        """True until the cut has happened or is cancelled."""
+        return self._cut is not None
+
     def take_cut(self) -> bool:
         """True when the cut has happened; otherwise cancels it."""
         happened, self._cut = self._cut is None, None

@@ -44,6 +44,10 @@ class CompiledSubject(SimulatedSubject[CompiledDevice]):
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         self.device.set_cut(operation, share, off_s)
 
+    @property
+    def is_cut_pending(self) -> bool:
+        return self.device.is_cut_pending
+
     def take_cut(self) -> bool:
         return self.device.take_cut()
 
