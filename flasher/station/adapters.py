@@ -90,7 +90,7 @@ def _resolve(socket: SocketConfig, detected: Sequence[DetectedAdapter]) -> Resol
         raise UsageError(
             f"Socket {socket.name}: the adapter with the {what} {printable(wanted)} has "
             f"{len(channels)} channels: {', '.join(map(printable, channels))}.",
-            remedy="Name the channel as well.",
+            remedy="Set the channel as well.",
         )
     return Resolved(socket, bus | {"channel": channels[0]})
 

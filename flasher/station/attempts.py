@@ -106,7 +106,7 @@ class Attempts:
             self._addresses.setdefault(address, Rate(PER_ADDRESS_MAX)),
         ]
         wait_s = max(each.wait_s(now) for each in limits)
-        # Tries that these limits refuse must not use memory for the badges that they name.
+        # Refused tries must not use memory for their badges.
         if badge is not None and wait_s == 0.0:
             of_badge = self._badges.setdefault((badge, address), _OfBadge())
             limits += [of_badge.rate, of_badge.back_off]

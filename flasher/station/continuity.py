@@ -91,7 +91,8 @@ class Continuity:
         """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
         self._may_restart, self._was_silent = may_restart, was_silent and not may_restart
-        """A restart is not evidence; a start is, because the run began with silence."""
+        """The recipe allows restarts; the bus was silent before the run, so that any start is
+        evidence."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -241,7 +242,7 @@ class Continuity:
             self._awaits_application, self._burst_until = False, -inf
         if watcher.begun_announcements > begun:  # it may be pulled before the last frame
             if self._awaits_confirmation or self._awaits_complete:
-                # It may have been exchanged before the command reached it.
+                # The unit may have been exchanged before the command reached it.
                 self._missed_s = max(self._missed_s, missed_unheard_s)
             self._take_announcement(now, has_returned=has_returned)
         if watcher.announcements > announcements and self._is_identified:
@@ -345,7 +346,7 @@ class Continuity:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
             if self.watcher.request is None:
-                # It has to stay from the update command on; the reset caused this announcement.
+                # The unit must remain from the update command on; the reset caused this one.
                 self._count_caused(in_burst=in_burst)
             return
         if self._requested_s is not None:

@@ -80,7 +80,8 @@ REACH_S: Final = 2.0
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 READ_S: Final = 2.0
-"""A label scanned again sooner was read twice, or by two people who had not read the refusal."""
+"""Time in which a second scan of a label is a double read, or by a person who had not read the
+refusal."""
 NOTE_S: Final = 15.0
 """Time for which a socket shows that a card or label was dropped."""
 _RESUME: Final = Word.RESUME.value.lower()
@@ -277,7 +278,7 @@ class Line:
                 why = Refused(codes.NOT_OBSERVED.name, reason, _CHANGED.remedy)
             self._silent(socket, now, why, is_certain=False)
         elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
-            # It may have come after its card or label was scanned, in place of a silent one.
+            # The unit may have replaced a silent one after the scan of its card or label.
             self._drop_for(socket, now, _CHANGED, keeps_label=socket.binding is Binding.PROMPTED)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.note_unit(what, is_serial=self._is_serial(what.serial or ""))
@@ -413,7 +414,7 @@ class Line:
             self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=role)
             self._emit(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
-            # A PIN typed too late or too often: no message may show it.
+            # No message may show a PIN that was typed too late or too often.
             reason = text("No PIN is expected, and it is not a serial number of this recipe.")
             remedy = text("First scan the command that needs the PIN.")
             self._refuse(HIDDEN, Refused("NO_PIN_AWAITED", reason, remedy), source=source)
@@ -442,7 +443,7 @@ class Line:
         if isinstance(understood, Label):
             self._crew.check_assigned()
         was_in_doubt = waiting.is_in_doubt
-        # A refused card affects the next scan; two of a kind, until it is clear which one counts.
+        # A refused card affects the next scan; two cards or labels, until it is clear which counts.
         waiting.is_in_doubt = was_in_doubt and bool(waiting.text)
         match understood:
             case Label(serial):
@@ -655,7 +656,7 @@ class Line:
         if waiting.label and waiting.is_in_doubt:
             raise self._in_doubt(waiting)
         if not waiting.label:
-            # Until every check has passed: the label that follows must not go elsewhere.
+            # Kept until all checks pass: the label that follows must not go to another socket.
             waiting.is_in_doubt, waiting.refused_label = True, None
             waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
@@ -671,7 +672,7 @@ class Line:
             waiting.forget()
             self._bind(socket, serial, Binding.CONFIRMED, now, waiting.source)
         else:
-            # Its label waits until it is known whether it is another one.
+            # The label waits until it is known whether the unit is another one.
             waiting.card, waiting.is_in_doubt, socket.is_chosen = socket, False, True
             waiting.forget_at_s = now + CARD_LIMIT_S
             self._clear_drop_note(socket)

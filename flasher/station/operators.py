@@ -79,7 +79,7 @@ class Person(TomlTable):
     @field_validator("pin", mode="before")
     @classmethod
     def _check_pin(cls, value: Any) -> Any:
-        # Before pydantic checks the type: its message would show a PIN written here by mistake.
+        # Checked before pydantic, whose message would show a PIN written here by mistake.
         if value != "":
             pins.check_hash(value if isinstance(value, str) else "")
         return value
@@ -165,7 +165,7 @@ class Crew:
         return self._people.get(text)
 
     def may_be_pin(self, text: str) -> bool:
-        """True for a text that may be a PIN, for example a late one."""
+        """True for a text that may be a PIN, for example one typed too late."""
         return self.has_pins and pins.is_form(text)
 
     def check_assigned(self) -> None:

@@ -321,7 +321,7 @@ class Presence:
         serials = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, serials), "") if serials else None
         reported = (self.is_there, self._reported_serial, self._reported_in_bootloader)
-        # The unit itself is reported first; that it may be another one, in the next call.
+        # Report the unit first; the next call reports that it may be another one.
         was_missed = is_present and self._was_missed and self.is_there is True
         self._was_missed &= is_present and not was_missed
         if (is_present, serial, in_bootloader) == reported and not (is_power_up or was_missed):

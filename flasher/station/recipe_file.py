@@ -205,7 +205,7 @@ def _load_target(
     hashes = {file: _sha256(file) for file in files}
     image = load(image_path, base=firmware.base)
     release = read_release(manifest)
-    # os.devnull: a profile of the user must not change the recipe.
+    # os.devnull as profile: one of the user must not change the recipe.
     profile = load_profile(profile_path or os.devnull, firmware.device)
     if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
         raise UsageError("a file changed while it was read.", remedy="Try again.")

@@ -97,7 +97,7 @@ class Scanner:
             self._gone(error.args[0])
         except OSError as error:
             self._gone(printable(error.strerror or str(error)))
-        except Exception as error:  # noqa: BLE001  of a library, as termios.error: it is opened anew
+        except Exception as error:  # noqa: BLE001  by a library (termios.error): reopened
             self._gone(printable(str(error) or type(error).__name__))
         return self._device is not None
 

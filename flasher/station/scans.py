@@ -203,7 +203,7 @@ def _why_only(only: Socket, serial: str, source: Source) -> Binding:
     if only.occupancy is not Occupancy.SILENT:
         return Binding.PROMPTED  # the next one, when this one is out
     if last.outcome is not RunState.PASS and not last.has_sent and only.sees_units:
-        # It may be in its bootloader, and announce itself at any time.
+        # The unit may be in its bootloader and announce itself at any time.
         raise Refused(
             "TAKE_OUT",
             text(

@@ -320,7 +320,7 @@ class Socket:
         is_known = self.occupancy is not Occupancy.UNKNOWN
         is_time = self.begin_at_s is not None and now >= self.begin_at_s and is_known
         if self.binding is Binding.PROMPTED:
-            # It was put in, and has identified itself or had the time to.
+            # The unit was put in, and has identified itself or had time to.
             has_arrived = self.is_there and self.begin_at_s is not None
             is_time = has_arrived and (self.own is not None or is_time)
         else:

@@ -171,7 +171,7 @@ class UnitReads:
             value = ", ".join(fields[name][1] for name in wanted)
             expected = wanted_text(plan)
             if self._claim.kind is RunKind.VERIFY_ONLY:
-                # It was perhaps made on another day, with another date.
+                # An earlier run may have written another date.
                 expected = self._claim.written_before.get(key, expected)
             measured.append(Measurement(key, text=value, expected=expected))
             if value != expected:

@@ -310,7 +310,7 @@ class UnitSteps:
         if limit_s is not None:
             options = replace(options, timeout_s=limit_s)
         if is_in_bootloader and target.continuity.is_announcing:
-            # It announces itself without a reset. It would ignore one (R18), and the announcement
+            # The bootloader announces itself. It would ignore a reset (R18), and an announcement
             # of another unit would be taken for its own.
             wait_s = options.timings.boot_version_timeout_s
             options = replace(options, at_power_up=True, power_up_timeout_s=wait_s)

@@ -67,7 +67,7 @@ def _chance(units: MockUnits, what: str, serial: str) -> random.Random:
 
 
 def health_of(units: MockUnits, serial: str) -> Health:
-    """Draw the health of the unit with this serial number."""
+    """Health of the unit with this serial number, drawn by the seed."""
     chance = random.Random(f"{units.seed} {serial}")  # noqa: S311  a play, no secret
     at = chance.random()
     if at < units.bad:

@@ -20,7 +20,7 @@ from flasher.report.base import shortened, visible
 from flasher.report.chart import WIDTHS
 from flasher.report.scale import linear_ticks
 
-# pygal's finder of maps, which are not used here: Python 3.11 warns of its like at every import.
+# Remove pygal's finder of maps, not used here: Python 3.11 warns of it at every import.
 sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, pygal.PluginImportFixer)]
 
 SERIES_MAX: Final = 8

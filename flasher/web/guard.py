@@ -75,7 +75,7 @@ class BrowserEntry:
             return RedirectResponse("/" if request.session.get(_IS_IN) else _CLOSED, 303)
         self._key = ""
         request.session[_IS_IN] = True
-        # From a page of this server on, so that the cookie goes with it wherever the address was
+        # Redirect by a page of this server, so that the cookie is sent wherever the address was
         # clicked.
         return self._pages.show(request, "enter.html")
 
@@ -109,7 +109,7 @@ def application(
         SessionMiddleware,
         secret_key=secret,
         session_cookie="flasher" if entry is None else entry.cookie,
-        # The browser that an address let in could not come back; who signs in can.
+        # A browser that entered by the address could not enter again; one that signed in can.
         max_age=_ENTERED_S if entry is not None else None,
         same_site="strict",
         https_only=is_tls,
@@ -206,7 +206,7 @@ class _Sessions:
         is_stream = path.endswith("/events")
         sign_in = None
         if self._login is not None:
-            # A page that stays open looks for its stream by HEAD: no person is there for that.
+            # An open page requests its stream by HEAD, which is not a view by a person.
             is_use = not is_stream and scope["method"] in ("GET", "POST")
             sign_in = self._login.find(session, is_use=is_use)
         scope["sign_in"] = sign_in

@@ -164,7 +164,7 @@ class Login:
     def want(self, session: dict[str, Any], scope: Scope) -> None:
         """Store the requested page, to open it after sign-in."""
         query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
-        # One slash alone: two would begin the name of another computer.
+        # Exactly one slash: after two, the name of another computer would follow.
         session["wanted"] = "/" + scope["path"].lstrip("/\\") + (f"?{query}" if query else "")
 
     # -- in ---------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ class Login:
     async def _checked(self, address: str, fields: dict[str, str]) -> Person | None:
         """The person of a badge; None for the password. Raises _RefusedError."""
         code, pin = (fields.get(name, "").strip()[:_BADGE_MAX] for name in ("badge", "pin"))
-        # Beside the right password too, a wrong badge is a wrong try.
+        # A wrong badge is a wrong try, even with the right password.
         if self._badges is not None and code:
             return await self._person(self._badges, address, code, pin)
         self._count(address, "")
@@ -248,7 +248,7 @@ class Login:
             raise _RefusedError(trouble, 429, wait_s=wait_s)
 
     def _wrong(self, address: str, badge: str, why: str, name: str = "") -> _RefusedError:
-        # Without the text: a person may have typed a PIN where the badge belongs.
+        # Recorded without the text, which may be a PIN typed into the wrong field.
         data = {"name": name, "address": address, "why": why}
         pause_s = self._attempts.pause_s(address, badge, self._clock.monotonic_s())
         if pause_s:

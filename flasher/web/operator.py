@@ -177,7 +177,7 @@ class Screen:
         for name in (socket,) if socket in board.rows else tuple(board.rows):
             row = board.rows[name]
             state, passed = row.state, self._passed.get(name)
-            # PASS only after the event of the run's end, which follows its writing to disk.
+            # Show PASS only after `RunEnded`, which is published when the run is on disk.
             if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
                 state = SocketState.SAVING
             word = (state, row.serial, row.code, row.note, row.step)

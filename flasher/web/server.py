@@ -18,7 +18,7 @@ from flasher.protocol.text import printable
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
 """Host names that only this computer can reach."""
-# The server prints nothing into the program's terminal; a log takes its messages.
+# The server logs its messages instead of printing them to the terminal.
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 _END_LIMIT_S: Final = 1.0
 """Time after which open streams are closed at the end."""
@@ -39,7 +39,7 @@ class _Protocol(H11Protocol):
         self.place = "" if self.client is None else client_at(self.client[0])
         same = [each for each in self.connections if getattr(each, "place", "") == self.place]
         if len(same) > _OF_ONE_MAX:
-            # At once, and not when the loop has ended it: many may come together.
+            # Count it down at once, since many connections may come together.
             self.connections.discard(self)
             transport.abort()
 

@@ -143,7 +143,7 @@ def test_a_key_is_shown_rotated_and_replaced(
     assert rotated["public"] != shown.document["public"]
     (key,) = bench.keys.glob("*.key")
     key.unlink()
-    assert "NOT THERE" in flasher("station", "key", *place).out
+    assert "MISSING" in flasher("station", "key", *place).out
     assert flasher("station", "key", *place, "--lost").code == ExitCode.USAGE
     lost = flasher("station", "key", *place, "--lost", "--reason", "the disk died")
     assert lost.code == ExitCode.OK

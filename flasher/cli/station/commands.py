@@ -429,7 +429,7 @@ def key(
 ) -> int:
     """Show, or change, the key that signs the records."""
     if rotate and lost:
-        raise UsageError("--rotate and --lost do not go together.", remedy="Leave one out.")
+        raise UsageError("--rotate and --lost cannot be combined.", remedy="Remove one of them.")
     return _call("maintenance.key", output, records, operator, reason, rotate=rotate, lost=lost)
 
 

@@ -170,7 +170,7 @@ def key(
     is_there = file.exists()
     output.result(f"{printable(store.station)}: key {fingerprint(public)}")
     output.result(f"  public: {public}")
-    output.result(f"  file:   {printable(str(file))}" + ("" if is_there else " (NOT THERE)"))
+    output.result(f"  file:   {printable(str(file))}" + ("" if is_there else " (MISSING)"))
     output.result(f"  heads:  {', '.join(heads)}")
     return output.document(
         SigningKeyDocument(

@@ -120,7 +120,7 @@ def operator_page(
     pages = Pages(options.language)
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
-    # In processes of their own, so that pages do not slow the station down.
+    # Separate processes, so that pages do not slow the station down.
     answering = QueryProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
     routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     server = served(
@@ -268,7 +268,7 @@ def _tls(options: PagesOptions) -> Tls | None:
     certificate, key = options.web_certificate, options.web_key
     if (certificate is None) != (key is None):
         raise UsageError(
-            "--web-certificate and --web-key need each other.",
+            "--web-certificate and --web-key are needed together.",
             remedy="Give both.",
             code=ErrorCode.PAGES_NOT_SERVED,
         )

@@ -286,7 +286,7 @@ class _Session:
 
     def _second_stop(self) -> None:
         """Abort all runs after a second Ctrl-C; called in the signal handler."""
-        # No exception: inside a turn of the station it could leave a socket without its reply.
+        # Raising here could leave a socket without its reply, in the middle of a turn.
         self._failure = _stopped_now()
         self.station.abort_all()
 

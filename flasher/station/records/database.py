@@ -232,20 +232,20 @@ class Database:
     def _prepare_sqlite(self, connection: Any, record: Any) -> None:
         if self.location.file is not None:
             record.info[_OPENED] = _identity(self.location.file)
-        # Transactions are begun below, by hand: the driver's own begin too late, and without lock.
+        # `_begin_sqlite` begins transactions: the driver would begin them too late, without a lock.
         connection.isolation_level = None
         if self._read_only:
             connection.execute(f"PRAGMA busy_timeout = {self._lock_timeout_ms}")
             connection.execute("PRAGMA query_only = 1")
             return
         wanted = {
-            # First: changing the journal already needs the lock.
+            # The busy timeout comes first: changing the journal needs the lock.
             "busy_timeout": self._lock_timeout_ms,
             "journal_mode": "memory" if self.location.file is None else "wal",
             "synchronous": _SYNCHRONOUS_FULL,
             # Alembic replaces a table to change it, while other rows refer to its rows.
             "foreign_keys": 0 if self._changes_schema else 1,
-            # Or REPLACE would delete without the triggers.
+            # Otherwise REPLACE would delete rows without calling triggers.
             "recursive_triggers": 1,
         }
         for name, value in wanted.items():
@@ -304,7 +304,7 @@ def _server() -> ModuleType:
 def read_only_sqlite(file: Path) -> sqlite3.Connection:
     """Open a file without changing it, its journal or, where possible, its folder."""
     log = file.with_name(file.name + "-wal")
-    # Without a log no program writes, and none can be created in a read-only folder.
+    # Without a WAL file no program writes; a read-only folder cannot get one.
     is_still = not log.exists() and not os.access(file.parent, os.W_OK)
     uri = f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_still else ''}"
     return sqlite3.connect(uri, uri=True, check_same_thread=False)
@@ -471,7 +471,7 @@ def copy_checked(source: Path, part: Path) -> None:
         contextlib.closing(sqlite3.connect(part)) as copy,
     ):
         original.backup(copy)
-        # One file, without a log beside it that would be lost in copying it on.
+        # A single file: a WAL beside it could be lost when the backup is copied.
         copy.execute("PRAGMA journal_mode = DELETE")
         (found,) = copy.execute("PRAGMA integrity_check").fetchone()
     if found != "ok":

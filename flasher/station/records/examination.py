@@ -141,7 +141,7 @@ class Examiner:
         with self._database.reading() as connection:
             records_id = _records_id(connection)
             names = list(connection.execute(select(schema.station.c.name)).scalars())
-        # Before the records are read: a station may add rows, and their heads, meanwhile.
+        # Heads are read before the records, to which a station may add rows meanwhile.
         kept = list(self._reach(records_id, names))
         with self._database.reading() as connection:
             if self._since is not None and not _is_as_examined(connection, self._since):
@@ -283,7 +283,7 @@ class Examiner:
         first, end = trail.first.get(place, 0), 0
         wrong: list[tuple[int, ChainHead]] = []
         heads = each.place.of(trail.station, records_id)
-        # Of the rows that were examined before, the last one vouches for all before it.
+        # The hash of the last examined row covers all rows before it.
         begin = last if first else next(e for e in heads.entries() if isinstance(e, ChainHead))
         for head in (begin, last):
             if head.number <= trail.begin:
@@ -737,7 +737,7 @@ def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[P
 def _unused(connection: Connection) -> Iterator[Problem]:
     """Rows that no run refers to, although stations add them only for a run."""
     for table, naming in _USED.items():
-        # A join: of NOT IN (...), a server makes a list that it walks through for each row.
+        # A join, since a server would search a list of NOT IN (...) for each row.
         query = select(table).outerjoin(naming.table, naming == table.c.id).where(naming.is_(None))
         for row in connection.execute(query.order_by(table.c.id).limit(_RUNS_NAMED)).mappings():
             name = row.get("serial") or row.get("name")

@@ -56,7 +56,7 @@ class FileStore:
                 if not final.parent.exists():
                     final.parent.mkdir(exist_ok=True)
                     sync_folder(self.folder)
-                # Also over a file of that name: its content can only be equal, or damaged.
+                # Replaces a file of that name: its content is equal or damaged.
                 Path(part).replace(final)
                 sync_folder(final.parent)
             except BaseException:

@@ -25,7 +25,7 @@ def counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
 def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
     """Restrict a query of runs to a filter."""
     run = schema.run.c
-    # Runs of a time lie together; a lot has few. All else would lead through runs of all years.
+    # Use the index of the time or the lot; others would read runs of all years.
     by_time = chosen.since is not None and chosen.lot is None
     named: list[tuple[ColumnElement[Any], Select[Any] | None]] = [*named_in(chosen)]
     for column, ids in [*named, (run.unit_id, units_of(chosen))]:

@@ -98,7 +98,7 @@ class ServerHeads:
         """Insert heads; creates the table if needed. Raises RecordError."""
         with self._place.connected(writes=True) as connection:
             if not _is_there(connection):
-                # Two stations may find that at once.
+                # Two stations may create the table at the same time.
                 connection.execute(text("SELECT pg_advisory_xact_lock(7052, 7052)"))
                 if not _is_there(connection):
                     _metadata.create_all(connection)

@@ -51,7 +51,7 @@ def newest_runs(
     is_short = False
     begun = begun_in(chosen, run.begun_at)
     if begun:
-        # Beside its index, or a server would go along it until it met the first run of the time.
+        # Without the index of ids, along which a server would search for the first run.
         plain = beside_index(run_id)
         bounds = select(func.min(plain), func.max(plain)).where(*begun)
         low, high = connection.execute(bounds).one()

@@ -161,7 +161,7 @@ class Overview:
         with self._database.reading() as connection:
             found = newest_runs(connection, chosen, cursor, size + 1)
         query = run_query(schema.run.c.verification_reached.label("verified"))
-        # What no station writes is shown nowhere else: reports and `verify` name it.
+        # Pages leave out invalid rows; reports and `verify` report them.
         return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cursor, size)
 
     def rows(self, chosen: RunFilter, cursor: PageCursor, size: int) -> Page[dict[str, Any]]:
@@ -244,7 +244,7 @@ class Overview:
     def holder_count(self, sha256: str) -> int:
         """Number of these units, counted up to `HOLDERS_COUNTED` plus one."""
         target_id = schema.run_target.c.id
-        # In the order of the index of the image, or a server would go through the runs of all.
+        # In the order of the image's index, or a server would read the runs of all images.
         some = (
             _holders(self._artifacts(sha256))
             .with_only_columns(target_id, maintain_column_froms=True)
@@ -317,7 +317,7 @@ class Overview:
             counts: Iterable[Any] = ()
             if rolled is not None:
                 counts, rest = rolled.bad("code", column.name), rolled.tail
-            # Beside their indexes, which would lead through all runs.
+            # Without their indexes, by which all runs would be read.
             code, group = beside_index(run.code), beside_index(column)
             query = (
                 counting(rest.chosen, code, group, func.count())
@@ -378,7 +378,7 @@ class Overview:
         if until is not None:
             within.append(audit.at < utc_text(until))
         if within:
-            # By the station the index leads to the time; by the ids the newest come first.
+            # The index finds the times of a station; the order of ids gives the newest rows first.
             within.append(audit.station_id.in_(select(schema.station.c.id)))
             row_id = beside_index(audit.id)
             bounds = select(func.min(row_id), func.max(row_id)).where(*within)

@@ -244,8 +244,8 @@ class Copying:
         found = self._source.position_after(last)
         if found is not None:
             return found
-        # After another head than the last one here: older records were put back, or the file
-        # beside the key began later than this place.
+        # The last head is unknown here: older records were restored, or the file in the
+        # key's folder is younger than this place.
         old = last.number - _RECENT
         recent = {
             each.hash for each in self._target.entries(max(old, 0)) if isinstance(each, ChainHead)

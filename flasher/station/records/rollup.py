@@ -140,7 +140,7 @@ class EndCounts:
     def add(
         self, state: str, code: str, is_virtual: int, duration_s: float | None, runs: int = 1
     ) -> None:
-        """Count `runs` runs without PASS, or one with it."""
+        """Add `runs` runs without PASS, or one run with PASS."""
         self.by_state[state] += runs
         self.virtual_runs += bool(is_virtual) * runs
         if state == RunState.PASS.value:
@@ -209,7 +209,7 @@ class Rollup:
             try:
                 has_more = self.add(now())
             except (RecordError, sqlite3.Error, OSError, ValueError) as error:
-                # Another process adds, or nothing can be written: the records themselves are read.
+                # Another process adds runs, or the file is read-only: pages use the records.
                 _LOG.info("no runs were added to %s: %s", self._file, error)
             wait(_PAUSE_S if has_more else _UNTIL_NEXT_S)
 
@@ -643,7 +643,7 @@ class Rolled:
             return at if is_in and begun_at < spans[at][1] else _NOWHERE
 
         found: dict[int, Units] = defaultdict(Units)
-        # Of units with other runs the records have the history that counts.
+        # The history of units with further runs is read from the records.
         apart = {unit for rest in (self.tail, *self._cut(whole)) for unit in self._judged(rest)}
         counted_apart: Counter[History] = Counter()
         for _, runs in groupby(

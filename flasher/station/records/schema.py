@@ -41,7 +41,7 @@ _SIGNATURE_SIZE: Final = 88
 
 
 def _key() -> Column[int]:
-    # SQLite counts by itself only in a plain INTEGER.
+    # SQLite assigns ids only in an INTEGER column.
     return Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True)
 
 

@@ -196,7 +196,7 @@ class Signer:
                 trail.begin(self._now(), self.records_id)
             return
         if loaded is None or loaded.public != public:
-            # A rotation that was committed, and not ended.
+            # A rotation was committed but not completed.
             loaded = SigningKey.load(following)
             if loaded is None or loaded.public != public:
                 raise KeyMissingError(

@@ -1,4 +1,4 @@
-"""The records of a station: few operations, each on disk when it returns, or an error.
+"""Records of a station: begins, writes, steps and ends of runs, each on disk on return.
 
     store = Store.open("records.sqlite", station="line-2", clock=SystemClock())
     store.recover()
@@ -140,7 +140,7 @@ class Store:
         try:
             database = opened()
         except OldSchemaError:
-            # What is on a server is for its owner to change, after a backup of the server's own.
+            # The owner of a server upgrades its records, after a backup by the server's tools.
             if read_only or location.file is None:
                 raise
             report(f"Records of an older flasher: copies, then changes {location.shown} (minutes).")
@@ -223,7 +223,7 @@ class Store:
         """
         now = self._clock.utc()
         order = check_order(order, recipe, now)
-        # One claim at a time, of all stations: two must not find the last place of a lot free.
+        # One claim at a time in all stations: two must not take the last place of a lot.
         with self.signer.writing("claims") as trail:
             return Claiming(trail, order, recipe, now).begin(self._clock.monotonic_s())
 

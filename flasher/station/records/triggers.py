@@ -253,7 +253,7 @@ def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
 
 
 def _function(name: str, body: str) -> str:
-    # The path of who makes it: tables of a session's own must not stand before the records.
+    # The search path at creation: temporary tables of a session must not hide the records.
     return (
         f"CREATE OR REPLACE FUNCTION {name}() RETURNS trigger LANGUAGE plpgsql"
         f" SET search_path FROM CURRENT AS $$ BEGIN {body}; END $$"
@@ -289,8 +289,8 @@ _IN_RESTORED: Final = re.compile(
     r"ANY \(ARRAY\[(\('[^']*'::character varying\)::text(?:, |(?=\])))+\]\)"
 )
 _AND_RESTORED: Final = re.compile(r"CHECK \(\((\([^()]*\) AND \([^()]*\)) AND \(\(")
-"""PostgreSQL prints `x IN ('A', 'B')` and `a AND b AND (c AND d)` another way once they were dumped
-and restored."""
+"""PostgreSQL prints `x IN ('A', 'B')` and `a AND b AND (c AND d)` differently after dump and
+restore."""
 
 
 def fingerprint_of(connection: Connection) -> dict[str, str]:

@@ -187,7 +187,7 @@ def _stated(connection: Connection) -> list[tuple[object, Mapping[str, str]]]:
 
 
 def _change(connection: Connection) -> None:
-    # Only here: a start that changes nothing does not wait for it.
+    # Imported here: a start without changes does not need it.
     from alembic import command  # noqa: PLC0415
     from alembic.config import Config  # noqa: PLC0415
 

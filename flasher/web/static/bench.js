@@ -1,9 +1,9 @@
 "use strict";
-// The bench page: puts the pieces that the server made into the page, and sends what was chosen.
+// Bench page: inserts the parts that the server renders, and submits forms.
 
 let isFocusLost = false;
 
-// The file that an unfolding text is about, if it is about one.
+// Name of the file to which a <details> element belongs, if any.
 function about(summary) {
   return summary.parentElement.querySelector(":scope > form [name=name]")?.value;
 }
@@ -16,14 +16,14 @@ function apply(message) {
   for (const [id, html] of Object.entries(message.parts ?? {})) {
     byId(id).innerHTML = html;
   }
-  // What was unfolded stays so when its piece comes anew, unless it is about another file by now.
+  // Keep <details> open when its part is replaced, unless it now belongs to another file.
   for (const [id, what] of opened) {
     const summary = byId(id);
     if (summary && about(summary) === what) {
       summary.parentElement.setAttribute("open", "");
     }
   }
-  // Who uses the keyboard is where he was, or at what is wanted now, as soon as something is.
+  // Restore the keyboard focus, or move it to the next control as soon as there is one.
   for (const id of isFocusLost ? [name, "now"] : []) {
     if (document.activeElement === document.body) {
       byId(id)?.focus();

@@ -1,5 +1,5 @@
 "use strict";
-// The page that checks certificates: sends the file, or the text, and shows what was found.
+// Page that checks certificates: uploads a file or text, and shows the result.
 
 byId("check").addEventListener("submit", async (event) => {
   event.preventDefault();

@@ -1,5 +1,5 @@
 "use strict";
-// The operator page: puts what the station says into the page. It decides nothing.
+// Operator page: displays the messages of the station.
 
 const SHAPES = {
   starting: "M6 2h12v4l-4.5 6 4.5 6v4H6v-4l4.5-6L6 6z",
@@ -26,7 +26,7 @@ function put(element, text) {
   }
 }
 
-// In Latin capitals; a Chinese character is as wide as its height.
+// Width in Latin capitals; a Chinese character is as wide as high.
 const widthOf = (word) => [...word].reduce((sum, char) => sum + (char > "\u2e80" ? 1.4 : 1), 0);
 
 function sound(tones) {

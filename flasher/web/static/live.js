@@ -1,8 +1,7 @@
 "use strict";
-// The stream of a page, and its dead man's switch. The cover of the page is let down by an animation
-// of the style sheet three seconds after the last message; only a message puts it off. It needs no
-// script to come down: neither a lost connection, a dead station nor a broken script leaves an old
-// state in sight.
+// The event stream of a page, and its dead man's switch: an animation of the style sheet covers the
+// page three seconds after the last message, and only a message delays it. So neither a lost
+// connection, a dead station nor a broken script leaves an old state visible.
 
 const token = document.querySelector("meta[name=flasher-token]").content;
 const byId = (id) => document.getElementById(id);
@@ -35,7 +34,7 @@ function follow(path, apply) {
       }
     };
   };
-  // An answer that is no stream ends it: the password is wanted again, or the server is starting.
+  // A response without a stream closes it: sign-in is needed again, or the server is starting.
   const again = async () => {
     const answer = await fetch(location.href, { method: "HEAD" }).catch(() => null);
     if (answer && answer.redirected) {
@@ -44,7 +43,7 @@ function follow(path, apply) {
     open();
   };
   open();
-  // A browser may stop pages that nobody sees; what it kept is old when somebody looks again.
+  // A browser may freeze a hidden page: reconnect when it is shown again.
   addEventListener("pageshow", (event) => event.persisted && (isLost(), source.close(), open()));
   return () => Date.now() - opened;
 }
