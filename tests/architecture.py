@@ -38,7 +38,7 @@ def imports() -> dict[str, set[str]]:
 
 
 def _uses(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+    for node in _statements(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "flasher":
             parts = (node.module or "").split(".")[1:]
             yield from parts[:1] or [each.name for each in node.names]
@@ -46,6 +46,15 @@ def _uses(tree: ast.Module) -> Iterator[str]:
             for each in node.names:
                 if each.name.startswith("flasher."):
                     yield each.name.split(".")[1]
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements, also those of functions; an import is in no expression."""
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        nested = getattr(node, part, ())
+        for each in nested if isinstance(nested, list) else ():
+            yield each
+            yield from _statements(each)
 
 
 def drawing() -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from babel.messages.catalog import Catalog, Message
-from babel.messages.extract import extract_from_dir
+from babel.messages.extract import extract
 from babel.messages.pofile import read_po, write_po
 
 from flasher.events import Phase
@@ -71,21 +71,15 @@ _SYSTEM: Final = (
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "locale"
 LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
-_PAGES: Final = "**/templates/*.html"
-_METHODS: Final = {"text": ("**.py", "python"), "_": (_PAGES, "jinja2.ext:babel_extract")}
-_OPTIONS: Final = {_PAGES: {"trimmed": "true"}}
 
 
 def sentences() -> Iterator[str]:
     """Every sentence of the code and of the pages that is shown in the reader's language."""
-    for keyword, method in _METHODS.items():
-        for name, _, message, _, _ in extract_from_dir(
-            ROOT, method_map=[method], options_map=_OPTIONS, keywords={keyword: None}
-        ):
-            # `text` of SQLAlchemy is another function
-            if keyword == "_" or "flasher.i18n" in (ROOT / name).read_text("utf-8"):
-                assert isinstance(message, str)
-                yield message
+    for path in sorted(ROOT.rglob("*.py")):
+        if b"flasher.i18n" in path.read_bytes():  # `text` of SQLAlchemy is another function
+            yield from _marked("python", path, "text")
+    for path in sorted(ROOT.glob("**/templates/*.html")):
+        yield from _marked("jinja2.ext:babel_extract", path, "_")
     yield from spoken()
     yield from (text for texts in _TEXTS.values() for text in texts.values())
     yield from (text for each in _CAUSES.values() for text in each if text)
@@ -125,6 +119,14 @@ def sentences() -> Iterator[str]:
         yield from (label(*each) for each in meaningful_fields(item.content))
     yield from flag_names(BatteryFault, sum(BatteryFault))
     yield from ("label", *(word.value.lower() for word in Word))  # what a scan means
+
+
+def _marked(method: str, path: Path, keyword: str) -> Iterator[str]:
+    """The sentences that a file gives to the function of this name."""
+    with path.open("rb") as file:
+        for _, message, _, _ in extract(method, file, {keyword: None}, (), {"trimmed": "true"}):
+            assert isinstance(message, str)
+            yield message
 
 
 def path_of(language: str) -> Path:

@@ -33,19 +33,16 @@ HOPS_MAX = 12
 
 
 @pytest.mark.slow
-def test_the_drawing_is_that_of_the_imports() -> None:
+def test_the_drawing_is_that_of_the_imports_and_every_package_is_in_the_table() -> None:
     assert architecture.page(TEXT) == TEXT, "draw it anew: python -m tests.architecture"
+    named = set(re.findall(r"`(\w+)(?:/|\.py)`", TEXT))
+    assert set(architecture.imports()) - named == set()
 
 
 @pytest.mark.slow
 def test_no_package_imports_itself_by_way_of_others() -> None:
     edges = architecture.imports()
     assert [name for name in edges if name in architecture._reached(edges, name)] == []
-
-
-def test_every_package_is_in_the_table() -> None:
-    named = set(re.findall(r"`(\w+)(?:/|\.py)`", TEXT))
-    assert set(architecture.imports()) - named == set()
 
 
 class Calls:

@@ -15,7 +15,7 @@ from flasher import events
 from flasher.cli.documents import to_json
 from flasher.cli.main import COMMANDS
 from flasher.cli.output import Output
-from flasher.cli.schema import build, command_modules, event_classes
+from flasher.cli.schema import command_modules, event_classes
 from flasher.protocol.contents import UserString
 from flasher.protocol.fields import WireText
 from tests import schema_document
@@ -48,9 +48,9 @@ def hold_output(schema: Mapping[str, Any], text: str, code: int) -> list[dict[st
 
 def test_the_file_is_drawn_from_the_code() -> None:
     written = schema_document.SCHEMA.read_text(encoding="utf-8")
-    drawn = "draw it anew: python -m tests.schema_document"
-    assert json.loads(written) == build(), drawn
-    assert written == schema_document.schema_document(), drawn
+    drawn = schema_document.schema_document()
+    assert json.loads(written) == json.loads(drawn), "draw it anew: python -m tests.schema_document"
+    assert written == drawn, "draw it anew: python -m tests.schema_document"
 
 
 def test_it_is_a_json_schema(schema: dict[str, Any]) -> None:
