@@ -340,6 +340,7 @@ def test_names_of_secrets() -> None:
     assert not any(map(is_secret, ("bitrate", "key", "pass", "channel")))
 
 
+@pytest.mark.slow
 def test_no_file_and_no_output_has_a_password_of_the_bus(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

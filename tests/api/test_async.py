@@ -228,6 +228,7 @@ def awaited(connection: flasher.Connection, calls: list[Call], ends_after: int |
     return watched.seen
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     calls=st.lists(st.sampled_from(CALLS), min_size=1, max_size=3),

@@ -24,6 +24,7 @@ except Exception:
 """
 
 
+@pytest.mark.slow
 def test_asammdf_is_imported_for_its_files_only() -> None:
     pytest.importorskip("asammdf", reason="needs the extra mf4")
     subprocess.run([sys.executable, "-c", _PROGRAM], check=True)

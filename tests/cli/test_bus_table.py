@@ -237,6 +237,7 @@ def test_a_variable_that_agrees_is_the_source_before_the_table(
     assert api.bit_rate(fallback=fallback) == BitRate(250_000, "CAN_BITRATE")
 
 
+@pytest.mark.slow
 def test_doctor_says_that_it_is_in_effect_and_what_it_names(
     flasher: Flasher, here: Path, opened: list[dict[str, Any]]
 ) -> None:

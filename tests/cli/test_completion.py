@@ -113,6 +113,7 @@ def test_can_interfaces_of_linux_are_offered_as_channels(
     assert complete("flasher scan -c ") == {"can0", "vcan1"}
 
 
+@pytest.mark.slow
 def test_the_program_itself_answers_the_shell() -> None:
     asked = {
         "_FLASHER_COMPLETE": "zsh_complete",
@@ -263,6 +264,7 @@ def test_an_action_tells_what_it_reads(flasher: Flasher) -> None:
     assert "  flasher.toml" in flasher("profile", "show", "--help").out
 
 
+@pytest.mark.slow
 def test_no_command_is_imported_for_the_list_of_commands() -> None:
     """So that `flasher --help` is quick."""
     script = (
@@ -279,6 +281,7 @@ def test_no_command_is_imported_for_the_list_of_commands() -> None:
     assert done.stdout.splitlines()[-1] == "[] []"
 
 
+@pytest.mark.slow
 def test_only_the_chosen_command_is_imported() -> None:
     script = (
         "import sys; from flasher.cli.main import COMMANDS, main; main(['scan', '--help']); "

@@ -52,6 +52,7 @@ def test_the_version_is_the_distributions(flasher: Flasher) -> None:
     assert flasher("--version").out == f"flasher {version('welling-flasher')}\n"
 
 
+@pytest.mark.slow
 def test_python_m_flasher_is_the_same_and_exits_with_the_code() -> None:
     words, environment = (*FLASHER, "image-info", OBC_BIN), clean_environment()
     done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)

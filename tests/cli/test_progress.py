@@ -151,6 +151,7 @@ def test_quiet_shows_no_bar_on_a_terminal(terminal: Terminal) -> None:
     assert written == ""
 
 
+@pytest.mark.slow
 def test_errors_are_coloured_on_a_terminal_unless_no_color_is_set(
     terminal: Terminal, flasher: Flasher
 ) -> None:
@@ -314,6 +315,7 @@ def test_everything_that_is_sent_again_has_a_sentence() -> None:
     assert {reason for reason in reasons if reason_text(reason, "packet 3") == reason} == set()
 
 
+@pytest.mark.slow
 def test_tqdm_is_loaded_only_for_a_bar(tmp_path: Path) -> None:
     code = (
         "import sys; from flasher.cli.main import main; "

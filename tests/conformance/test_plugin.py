@@ -205,6 +205,7 @@ def test_the_suite_without_a_device_is_wrong_usage(pytester: pytest.Pytester) ->
     done.stderr.fnmatch_lines(["*--btl-suite needs a device*"])
 
 
+@pytest.mark.slow
 def test_loading_the_plugin_loads_nothing_of_the_suite_and_no_adapter() -> None:
     code = (
         f"import sys, {PLUGIN}\n"

@@ -168,6 +168,7 @@ def _failures(report: RunReport) -> str:
     )
 
 
+@pytest.mark.slow
 def test_a_bootloader_that_follows_the_document_passes() -> None:
     report = _run(_HERE, "RS-01", "TX-01", "EN-07", "BU-02")
     assert [result.verdict for result in report.results] == [CaseVerdict.PASS] * 4

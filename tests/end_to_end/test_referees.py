@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import random
 
+import pytest
+
 from flasher.api import as_target
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
@@ -27,6 +29,7 @@ def some(*numbers: int) -> frozenset[int]:
 # -- flasher's host, a device of literal frames -------------------------------------------------
 
 
+@pytest.mark.slow
 @each("size_bytes", SIZES)
 @each("target", ["wmc", "bms", "obc"])
 def test_the_host_upgrades_a_device_of_literal_frames(target: str, size_bytes: int) -> None:

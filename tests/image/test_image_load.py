@@ -460,6 +460,7 @@ def test_a_file_name_cannot_disturb_a_terminal(
     assert "a\\x1b[31m\\nname" in said
 
 
+@pytest.mark.slow
 def test_a_file_that_spans_gigabytes_is_refused_quickly_and_in_little_memory() -> None:
     assert (BAD / "gigabytes.hex").stat().st_size == 132
     said, seconds, megabytes = measure(BAD / "gigabytes.hex")

@@ -319,6 +319,7 @@ def _exchanged_unit(folder: Path) -> UnitBench:
     return unit
 
 
+@pytest.mark.slow
 @each(
     "made, code, shows",
     [
