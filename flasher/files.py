@@ -20,9 +20,9 @@ from typing import Any, Final
 from flasher.errors import ErrorCode, Fault, FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
-"""Bytes of a settings file."""
+"""Maximum size of a settings file in bytes."""
 JSON_MAX_SIZE: Final = 6 * 1024 * 1024
-"""Bytes of a report. JSON takes up to thirty times its size in memory."""
+"""Maximum size of a report in bytes. JSON takes up to thirty times its size in memory."""
 _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
 _DOTS_MAX: Final = 128

@@ -30,14 +30,14 @@ from flasher.i18n import text
 from flasher.wording import wording_of
 
 SIZE_MAX: Final = 2 * 1024 * 1024
-"""Bytes above which the older half is dropped: some thousand upgrades."""
+"""Size in bytes above which the older half is dropped: some thousand upgrades."""
 _READ_MAX: Final = 2 * SIZE_MAX
-"""Bytes read from the end of the file: other programs may have made it larger."""
+"""Maximum size in bytes that is read, from the end: other programs may have made it larger."""
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
 _REACHED_SIZE: Final = 32
-"""Bytes of a progress file, written at once."""
+"""Size of a progress file in bytes, written with one call."""
 MOCK: Final = "the built-in mock"
 """Adapter name of a device model, which ends with its program."""
 _LEFT_IN: Final = {
@@ -136,7 +136,7 @@ class Flash:
     is_running: bool = False
     """True while a program runs the upgrade."""
     reached: Reached | None = None
-    """Set for an upgrade without an end."""
+    """Last progress of an upgrade without an end; null for others."""
 
     @property
     def device_left(self) -> str:
@@ -335,7 +335,7 @@ _TYPES: Final = {
     }
     for kind in (Began, Ended)
 }
-"""Allowed types of each key."""
+"""Allowed JSON types of each key of a line."""
 
 
 def working_folder() -> str:

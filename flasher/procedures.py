@@ -67,9 +67,9 @@ if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate
 
 INFO_LISTEN_S: Final = 0.5
-"""Long enough to receive faults twice: they are sent every 200 ms while any is set (table 5)."""
+"""Time to receive faults twice: they are sent every 200 ms while any is set (table 5)."""
 INFO_LISTEN_ONLY_S: Final = 3.0
-"""For devices without queries, which send about once a second."""
+"""Time to listen for devices without queries, which send about once a second."""
 SCAN_LISTEN_S: Final = 1.0
 _WAS_OFF: Final = frozenset({TroubleKind.BUS_OFF, TroubleKind.RESTARTED})
 _REOPEN_PAUSE_S: Final = 0.1
@@ -130,7 +130,7 @@ class DeviceInfo:
     target: Target
     dialect: Dialect
     readings: tuple[ItemReading, ...]
-    """In the order of the document; empty for devices without queries."""
+    """Queries with answers, in the order of the document; empty for devices without queries."""
     survey: Survey
 
     @property
@@ -161,7 +161,7 @@ class Procedures:
     profile: Profile
     bit_rate: BitRate | None
     is_alone: bool
-    """No other tool can be on this bus: queries need not listen for one first."""
+    """True if no other tool can be on this bus: queries need not listen for one first."""
     watch: CallOptions
 
     @property

@@ -60,7 +60,7 @@ class DetectedAdapter:
 
     interface: str
     channel: str
-    """Empty if not reported."""
+    """Channel or port; empty if not reported."""
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -59,9 +59,9 @@ class Echoes:
         self._flagged = flagged
         self._gives_own = gives_own
         self._expected: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Sent frames without echo so far, oldest first."""
+        """Sent frames whose echo has not arrived yet, oldest first."""
         self._unreturned: deque[Frame] = deque(maxlen=ECHO_FRAMES)
-        """Sent frames that this handle does not receive."""
+        """Sent frames whose echo this handle does not receive."""
         self._echoed: dict[Frame, float] = {}
         """Time stamps of the latest echoes."""
 

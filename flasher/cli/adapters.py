@@ -87,7 +87,7 @@ def describe_adapter(found: DetectedAdapter, dialect: Dialect) -> str:
 
 
 def choose_adapter(bus: Bus, output: Output) -> Bus:
-    """Return the bus; if it names no adapter, with the only one detected, and a message.
+    """Return the bus, with the only adapter detected (and a message) if none is named.
 
     Raises UsageError for several adapters, BusError for none.
     """

@@ -96,7 +96,7 @@ class HelpedCommand(rich_click.RichCommand):
         return self.params
 
     def get_help_option(self, ctx: click.Context) -> None:
-        """Replaced by the output options."""
+        """Return None: `flasher.cli.framework` adds the help options."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write examples; in the full help also exit codes, files and environment variables."""

@@ -113,7 +113,7 @@ examples:
 `flasher help CODE` explains the code of an error, as E402.
 """
 _COMPLETE: Final = "_FLASHER_COMPLETE"
-"""Set by a shell that completes a command line."""
+"""Environment variable set by a shell that completes a command line."""
 _LOG: Final = logging.getLogger("flasher.cli")
 _CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station", "ui"})
 """Commands that change a device."""

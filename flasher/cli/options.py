@@ -237,7 +237,7 @@ class Bus:
 
     @cached_property
     def bit_rate(self) -> BitRate:
-        """Read once, so that plan, messages and records agree. Raises UsageError and BusError."""
+        """Bit rate, read once so that all output agrees. Raises UsageError and BusError."""
         if self.mock:
             return BitRate(self.dialect.bitrate_bps, "the dialect's")
         return settle_bit_rate(self.dialect, fallback=self.fallback, **self.config)

@@ -58,7 +58,7 @@ class Output:
         self.ending: Callable[[FlasherError], ClosingLine] | None = None
         """Formats the last line for an error, in a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
-        """Replaced while a progress bar is on the screen."""
+        """Writes a text to stderr; replaced while a progress bar is on the screen."""
         # A lost terminal no longer reports that it is one.
         self._terminals = [each for each in (sys.stdout, sys.stderr) if each.isatty()]
 

@@ -25,7 +25,7 @@ from flasher.python_can import can
 from flasher.trace.decoder import ROUTES, TITLES
 
 FD_SIZE: Final = 64
-"""Bytes of each frame: programs refuse frames shorter than the DBC states."""
+"""Size of each frame in bytes: programs refuse frames shorter than the DBC states."""
 _DATA_AT: Final = PREFIX_SIZE + COMMAND_SIZE
 _NAME_MAX: Final = 32
 """Maximum length of a name; longer ones go into an attribute, as Vector's tools write them."""

@@ -39,7 +39,7 @@ from flasher.protocol.wire import Damage, Message
 SECOND_DEVICE_WAIT_S: Final = 0.1
 """Wait after an answer for the answer of a second device, in seconds."""
 _DOUBLED_S: Final = 0.0003
-"""Maximum interval of a message and its copy made by the link: two messages take longer."""
+"""Maximum time between a message and its copy made by the link, in seconds."""
 _CLEARLY_APART_S: Final = 0.002
 """Minimum interval of answers that were sent separately; frames of one message, or of consecutive
 messages, are closer."""
@@ -79,7 +79,7 @@ class _Question:
     odd_rounds: int = 0
     """Number of consecutive rounds with more answers than copies."""
     contents: list[Content] = field(default_factory=list)
-    """All different answers."""
+    """All different answers to the query."""
 
 
 @dataclass

@@ -28,7 +28,7 @@ DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
 DEFAULT_ADAPTER_RETURN_S: Final = 5.0
 """Time to plug in a USB adapter again."""
 BRIEF_ADAPTER_RETURN_S: Final = 0.8
-"""Time limit before anything was sent, when only a bus-off is worth waiting for."""
+"""Maximum wait for a lost adapter before anything was sent, when only a bus-off is worth it."""
 FRAME_GAP_SHARE: Final = 0.8
 """Maximum gap between two frames, as a share of the receiver's inter-frame timeout (R12); the rest
 is a margin for late wake-ups."""

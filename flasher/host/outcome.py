@@ -59,9 +59,9 @@ class Statistics:
     naks: int = 0
     timeouts: int = 0
     duration_s: float = 0.0
-    """From the first reset to the end."""
+    """Time from the first reset to the end."""
     transfer_s: float | None = None
-    """From request transfer to the ACK of the last packet, in the last attempt that got so far."""
+    """Time from request transfer to the ACK of the last packet, in the last attempt with one."""
 
 
 def describe_progress(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
@@ -343,7 +343,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
     "by flasher rescue and a power cycle."
 )
-"""For a device that did not answer the update command sent into its silence either (R26)."""
+"""Explanation for a device that was silent to the update command as well (R26)."""
 
 
 _TWO_PERHAPS_ERASED: Final = _Explanation(

@@ -26,10 +26,10 @@ from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version, printable
 
 HEAD_SIZE: Final = 65_536
-"""Bytes examined to detect the format."""
+"""Number of bytes examined to detect the format."""
 _LINES_EXAMINED: Final = 100
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
-"""Bytes. Covers the gap between vector table and code; a larger gap separates another part."""
+"""Gap size in bytes: more than between vector table and code; a larger gap separates parts."""
 FILE_MAX_SIZE: Final = 128 * 1024 * 1024
 """Maximum size in bytes of a HEX, S-record or ELF file."""
 

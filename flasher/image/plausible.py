@@ -50,8 +50,8 @@ _UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF_16_EXAMINED: Final = 64
 _CONTROLS: Final = bytes(byte for byte in range(0x20) if byte not in b"\t\n\v\f\r\x1b") + b"\x7f"
 _OTHER_ENCODING_SIZE: Final = 256
-"""So many bytes without control character are text in some encoding. The probability for random
-bytes is 10^-13."""
+"""Number of bytes without control character that count as text in some encoding. The probability
+for random bytes is 10^-13."""
 LIKELY_CAUSES: Final = "the wrong file, an encrypted image, a header in front, or another processor"
 """Causes of an image without vector table, for messages."""
 _OTHER_WAIVERS: Final = (

@@ -141,7 +141,7 @@ class _Reading:
         self._load = load
         self._into = into
         self._batch: dict[_Piece, _Source] = {}
-        """In file order, without repetitions, which intelhex rejects."""
+        """Records in file order, without repetitions, which intelhex rejects."""
         self._loads_left = PIECES_MAX
 
     def add(self, address: int, data: bytes, text: str, prefix: str = "") -> None:

@@ -88,7 +88,7 @@ def ids_received_by(node: Node, dialect: Dialect) -> frozenset[int]:
 
 
 def due_again(due_at: float, delay_s: float, now: float) -> float:
-    """Next time of something periodic: `delay_s` after it was due, so that delays do not add up;
+    """Next time of a periodic action: `delay_s` after it was due, so that delays do not add up;
     `delay_s` after `now` if that has passed, or if it was not due.
     """
     following = due_at + delay_s

@@ -47,7 +47,7 @@ from flasher.protocol.wire import Message
 SHUTDOWN_PERIOD_S: Final = 0.2
 """Interval of SHUTDOWN until all other nodes are ready."""
 SHUTDOWN_DELAY_S: Final = 1.0
-"""From the first SHUTDOWN to the opening of the discharge switch, whatever the answers."""
+"""Time from the first SHUTDOWN to the opening of the discharge switch, whatever the answers."""
 FAULT_PERIOD_S: Final = 0.2
 """Interval of fault messages while any fault is set (table 5)."""
 IDLE_SHUTDOWN_S: Final = 30 * 60.0

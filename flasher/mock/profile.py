@@ -66,9 +66,9 @@ class DeviceProfile:
     without_application: Literal["announces", "listens"] = "announces"
     """After the burst, with no application to start: goes on announcing, or is silent (RS-03)."""
     window_s: Seconds = 0.2
-    """How long it listens after its last announcement (UP-04)."""
+    """Time of listening after the last announcement (UP-04)."""
     reset_delay_s: Seconds = 0.05
-    """From reset or power to the first announcement."""
+    """Time from reset or power-up to the first announcement."""
     boot_version: str = "V1.0.0"
     """Version text of the bootloader, 6 characters."""
 
@@ -94,11 +94,11 @@ class DeviceProfile:
     repeated_end: Literal["same_answer", "silence"] = "same_answer"
     """End of transfer again, once answered (EN-02)."""
     refused_hold_s: Seconds = 1.0
-    """From refusing an image to announcing again."""
+    """Time from refusing an image to announcing again."""
     after_complete: Literal["starts", "restarts"] = "starts"
     """Starts the new application at once, or through the bootloader (EN-03)."""
     start_delay_s: Seconds = 0.1
-    """From complete to the start of the new application."""
+    """Time from complete to the start of the new application."""
 
     # Application.
     upgrade_in_application: Literal["general_feedback", "silence"] = "general_feedback"
@@ -120,11 +120,11 @@ class DeviceProfile:
     battery_use: Literal["riding", "resting"] = "resting"
     """Rides and charges in turn, or rests: a vehicle in use is not upgraded."""
     battery_seed: Number = 1
-    """Decides how the cells differ."""
+    """Seed of the random differences between the cells."""
     faults: Number = 0
-    """Faults that are set from the start, as the 32 bits of 720 1204."""
+    """Faults set from the start: 32 bits of the fault message (CAN id 720, command 1204)."""
     idle_shutdown: Literal["off", "on"] = "off"
-    """Switches off when the bus was idle for 30 min and the pack current small throughout (5.1)."""
+    """Switches off after 30 min with an idle bus and a small pack current (table 5)."""
 
     # Memory.
     application_area_bytes: Number = 8 * 1024 * 1024

@@ -121,7 +121,7 @@ class MemoryMap:
         )
 
     def read(self, start: int, end: int) -> bytes | None:
-        """Read from `start` up to `end`, exclusive; None if a byte is outside memory."""
+        """Read memory from `start` up to `end`, exclusive; None if a byte is outside of it."""
         found = b""
         while start < end:
             area = next((each for each in self._areas if 0 <= start - each[0] < each[1]), None)

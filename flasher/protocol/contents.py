@@ -81,7 +81,7 @@ class Empty(Content):
 
 @dataclass(frozen=True)
 class Handshake(Content):
-    """Asks whether a BMS is present."""
+    """Query whether a BMS is present."""
 
     text: bytes = constant(b"HANDSHAKE")
 

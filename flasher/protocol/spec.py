@@ -24,9 +24,9 @@ CRC_SIZE: Final = 4
 LENGTH_MIN: Final = COMMAND_SIZE
 LENGTH_MAX: Final = 0xFF
 PREFIX_SIZE: Final = len(HEADER) + MODE_SIZE + LENGTH_SIZE
-"""Bytes of a message before its command."""
+"""Number of bytes of a message before its command."""
 OVERHEAD_SIZE: Final = PREFIX_SIZE + CRC_SIZE + len(TAIL)
-"""Bytes of a message that the length field does not count."""
+"""Number of bytes of a message that its length field does not count."""
 MESSAGE_MIN_SIZE: Final = OVERHEAD_SIZE + LENGTH_MIN
 MESSAGE_MAX_SIZE: Final = OVERHEAD_SIZE + LENGTH_MAX
 FRAME_DATA_SIZE: Final = 8

@@ -11,7 +11,7 @@ from typing import Annotated
 from flasher.validation import NumberRange
 
 Timeout = Annotated[float, NumberRange(gt=0, le=3600)]
-"""Seconds; a timeout of zero would expire at once."""
+"""Timeout in seconds; zero would expire at once."""
 Pause = Annotated[float, NumberRange(ge=0, le=3600)]
 Tries = Annotated[int, NumberRange(ge=1, le=1000)]
 
@@ -32,13 +32,13 @@ class Timings:
     inter_frame_timeout_s: Timeout = 0.1
     """Maximum time between two frames of a message (R12)."""
     boot_version_timeout_s: Timeout = 5.0
-    """From reset to the first boot version (R12)."""
+    """Time from reset to the first boot version (R12)."""
     request_transfer_timeout_s: Timeout = 10.0
-    """From update command to request transfer, while the device erases its flash (R12)."""
+    """Time from update command to request transfer, while the device erases its flash (R12)."""
     ack_timeout_s: Timeout = 0.5
-    """From a packet to its ACK or NAK (R12)."""
+    """Time from a packet to its ACK or NAK (R12)."""
     complete_timeout_s: Timeout = 10.0
-    """From end of transfer to complete (R12)."""
+    """Time from end of transfer to complete (R12)."""
     packet_tries: Tries = 5
     """Maximum number of transmissions of one packet (R12)."""
     end_tries: Tries = 3

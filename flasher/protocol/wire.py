@@ -92,7 +92,7 @@ def split(can_id: int, wire: bytes) -> list[Frame]:
 # -- receiving ----------------------------------------------------------------------------------
 
 _HEAD_SIZE: Final = PREFIX_SIZE + COMMAND_SIZE
-"""Bytes needed to check a header."""
+"""Number of bytes needed to check a header."""
 _NOTHING: Final[tuple[Message | Damage, ...]] = ()
 
 

@@ -32,7 +32,7 @@ class BusTable(TomlTable):
     interface: str
     """Back end of python-can for the adapter."""
     channel: str | None = None
-    """Which adapter or port."""
+    """Adapter or port."""
     bitrate: int | None = Field(default=None, ge=LOWEST_BPS, le=HIGHEST_BPS)
     """Bits per second; a rate other than the dialect's is refused unless given with -b."""
     fd: bool | None = None

@@ -123,7 +123,7 @@ class VersionQuery:
     """
 
     command: Number16
-    """Asks for the version."""
+    """Command of the query."""
     answer_id: Annotated[int, NumberRange(ge=0, le=0x7FF)]
     """CAN id of the answer."""
     answer_command: Number16

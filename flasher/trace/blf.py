@@ -25,7 +25,7 @@ _CONTAINER_TYPE: Final = 10
 _PLAIN, _PACKED = 0, 2
 _SIGNATURE: Final = b"LOBJ"
 _SEARCHED: Final = 8
-"""Bytes within which the next object begins."""
+"""Maximum distance in bytes to the next object."""
 _FRAME_SIZES: Final = {1: 48, 73: 64, 86: 48, 100: 116, 101: 72}
 """Minimum size of each object type with a frame."""
 _VERSIONS: Final = (1, 2)

@@ -10,7 +10,7 @@ from io import BufferedIOBase
 from typing import Final, Self
 
 FILE_MAX_SIZE: Final = 1024 * 1024 * 1024
-"""Bytes, also after unpacking: half a day of a full bus."""
+"""Maximum size in bytes, also after unpacking: half a day of a full bus."""
 _RATIO_MAX: Final = 50
 """Recordings compress to a tenth; a higher ratio is an attack on memory."""
 _UNPACKED_FREE: Final = 1024 * 1024
@@ -18,7 +18,7 @@ _UNPACKED_FREE: Final = 1024 * 1024
 _IDLE_MAX: Final = 100_000
 _IDLE_PER_FRAME: Final = 10
 _LINE_MAX: Final = 65_536
-"""Bytes. Frames of other networks have the longest lines."""
+"""Maximum length of a line in bytes. Frames of other networks have the longest lines."""
 
 
 class UnfitError(Exception):

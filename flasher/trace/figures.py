@@ -90,12 +90,12 @@ class LinkReport:
     line_s: float
     """Wire time of one copy of each acknowledged packet and its ACK, back to back."""
     transfer_s: float
-    """From the first frame of the first packet to the last ACK, summed over attempts."""
+    """Time from the first frame of the first packet to the last ACK, summed over attempts."""
     share_of_line_rate: float | None
     """`line_s` / `transfer_s`: 1 is a bus that never waits; more than 1 is a virtual bus. None
     before the first ACK."""
     host_turnaround: Distribution | None
-    """From the last frame of an ACK to the first frame of the next packet; None without samples."""
+    """Time from the end of an ACK to the first frame of the next packet; None without samples."""
     device_answer: Distribution | None
     """From a packet's last frame on the wire to the last frame of its ACK or NAK; None without
     samples. Repeated packets are left out: the answer may belong to any copy."""

@@ -40,7 +40,7 @@ IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
 _LATE_BOOT_S: Final = 0.25
 """Boot versions this soon after an update command may have been on the wire before it."""
 _VERSION_SIZE: Final = 32
-"""Bytes of the previous packet that are searched for the begin of a version text."""
+"""Size in bytes of the end of a packet that is searched for the begin of a version text."""
 _MAX_NOTED: Final = 10
 """Maximum number of different texts of one kind."""
 
@@ -123,7 +123,7 @@ class ObservedUpgrade:
     # The transfer.
     total: int | None = None
     packets: list[PacketStory] = field(default_factory=list)
-    """In the order of first copies; limited in number."""
+    """Packets in the order of their first copies; limited in number."""
     current: PacketStory | None = None
     restarts: int = 0
     is_restarted: bool = False
@@ -163,7 +163,7 @@ class ObservedUpgrade:
         self._update_at_s = self._request_at_s = self.begin_s
         self._by_number: dict[int, PacketStory] = {}
         self._left_s: dict[int, float] = {}
-        """When the latest copy of each packet had left the wire."""
+        """Time when the latest copy of each packet had left the wire, in seconds."""
         self._last_boot = ""
         self._tail = b""
 

@@ -42,13 +42,13 @@ _COMPANIONS: Final = ("-journal", "-wal")
 """Suffixes of files that SQLite writes next to a database, with parts of its content."""
 _COPIED_MAX_SIZE: Final = 256 * 1024 * 1024
 _VALUE_MAX: Final = 65_536
-"""Bytes of one value."""
+"""Maximum size of a value in bytes."""
 _ROW_MIN_SIZE: Final = 8
-"""Bytes of the smallest row of seven columns: a damaged file may lead in circles."""
+"""Minimum size of a row of seven columns, in bytes: a damaged file may lead in circles."""
 
 SUFFIXES = ".asc .blf .csv .db .log .mf4 .pcap .pcapng .trc, also followed by .gz"
 _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
-"""Bytes, for a format that is read in one piece."""
+"""Maximum size in bytes of a format that is read in one piece."""
 _PIECE_SIZE: Final = 65_536
 _TIME_MAX_S: Final = 1e11
 """About the year 5000. No clock gives a later time, or its negative."""

@@ -75,7 +75,7 @@ class TraceVerdict:
     packet: int | None
     """Current packet, from 1; None outside of the transfer."""
     attempt: int
-    """From 1; 0 without an upgrade."""
+    """Number of the attempt, from 1; 0 without an upgrade."""
     text: str
     """Description in one or two sentences."""
     likely: str = ""
@@ -153,7 +153,7 @@ class PacketStory:
     """Packet in an attempt: tries, NAKs, answer time."""
 
     number: int
-    """From 1."""
+    """Packet number, from 1."""
     attempt: int
     tries: int
     """Number of copies sent."""
@@ -164,7 +164,7 @@ class PacketStory:
     answered_at_s: float | None
     """Time of the ACK; None without one."""
     answer_s: float | None
-    """From the last frame of the latest copy to the ACK; None without one."""
+    """Time from the last frame of the latest copy to the ACK; None without one."""
 
     @property
     def is_clean(self) -> bool:
@@ -181,9 +181,9 @@ class UpgradeStory:
     begin_s: float
     end_s: float
     image_size_bytes: int | None
-    """From the update command; None if that is not in the trace."""
+    """Image size from the update command; None if that is not in the trace."""
     total_packets: int | None
-    """From the packets; None without any."""
+    """Packet total stated in the packets; None without any."""
     boot_version: str | None
     """Name and version of the bootloader; None if not announced."""
     running_version: str | None
@@ -191,7 +191,7 @@ class UpgradeStory:
     attempts: int
     phases: tuple[PhaseSpan, ...]
     packets: tuple[PacketStory, ...]
-    """In the order of first copies; attempts one after the other."""
+    """Packets in the order of their first copies; attempts one after the other."""
     steps: tuple[StoryLine, ...]
     steps_left_out: int
     """Number of steps dropped."""
@@ -226,7 +226,7 @@ class BusFigures:
     """Bus load, error frames and damage during a whole trace."""
 
     duration_s: float
-    """From the first frame to the last."""
+    """Time from the first frame to the last."""
     frames: int
     """Number of frames, without error frames."""
     load: float | None
@@ -270,7 +270,7 @@ class Story:
     frames: int
     bus: BusFigures
     upgrades: tuple[UpgradeStory, ...]
-    """In the order of their beginnings."""
+    """Upgrades in the order of their beginnings."""
     talkers: tuple[Talker, ...]
     """Most frames first."""
     verdict: TraceVerdict
@@ -281,6 +281,6 @@ class Story:
     steps_left_out: int
     talkers_left_out: int = 0
     recorded: Recorded | None = None
-    """Set for a bundle."""
+    """Facts recorded by the tool, for a bundle."""
     damage: str = ""
     """Place and reason at which reading stopped; the story covers the part before."""

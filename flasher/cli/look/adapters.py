@@ -40,7 +40,7 @@ class FoundAdapter:
 
     interface: str
     channel: str
-    """Empty if its back end does not report it."""
+    """Channel or port; empty if the back end does not report it."""
     arguments: list[str]
     """Options that select it."""
     serial_number: str | None
@@ -70,7 +70,7 @@ class AdaptersDocument:
 
     adapters: list[FoundAdapter]
     serial_ports: list[FoundAdapter] | None
-    """Each may be an slcan adapter; null if the package that lists them is missing."""
+    """Possible slcan adapters; null if the package that lists serial ports is missing."""
     not_seen: list[NotSeen]
 
 

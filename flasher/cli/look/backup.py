@@ -97,7 +97,7 @@ class DataInBackup:
     connection: str
     memory: MemoryInBackup | None
     info: InfoDocument
-    """Same as the output of `flasher info --json`."""
+    """Document of `flasher info --json`."""
 
 
 DOCUMENTS: Final = (BackupDocument,)

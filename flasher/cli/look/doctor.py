@@ -96,7 +96,7 @@ class DoctorDocument:
     adapters: list[AdapterDocument]
     bitrate_bps: int
     health: HealthDocument | None
-    """Null if no adapter was opened, like `traffic`."""
+    """State of the controller; null if no adapter was opened, like `traffic`."""
     traffic: TrafficDocument | None
 
 

@@ -35,7 +35,7 @@ class InfoDocument:
     can_be_asked: bool
     """False if the documents have no query for the device."""
     items: dict[str, dict[str, FieldValue] | None]
-    """Each item with its fields; null for one that was not answered."""
+    """Items with their fields; null for one that was not answered."""
     unanswered: dict[str, str]
     """Reason for each null item."""
     faults: FieldValue

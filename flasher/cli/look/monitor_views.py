@@ -66,7 +66,7 @@ class FrameLine:
     kind: Literal["frame"]
     can_id: int
     data: str
-    """In hexadecimal."""
+    """Data bytes in hexadecimal."""
     extended: bool
     remote: bool
     error: bool
@@ -91,7 +91,7 @@ class MonitorView:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Releases nothing here."""
+        """Do nothing; a table restores the terminal here."""
 
     def __call__(self, event: object) -> None:
         match event:

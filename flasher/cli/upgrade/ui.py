@@ -35,7 +35,7 @@ class ServingLine:
 
     event: Literal["serving"]
     address: str
-    """Works once, in the browser that opens it first."""
+    """URL of the page; works once, in the browser that opens it first."""
 
 
 @dataclass(frozen=True)

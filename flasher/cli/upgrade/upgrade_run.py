@@ -30,7 +30,7 @@ from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
 Watching = Callable[[Connection, Recording], AbstractContextManager[CallOptions]]
-"""Entered when the bus is open; yields the listeners of the upgrade."""
+"""Context of an upgrade, entered when the bus is open; yields the event listeners."""
 
 
 @dataclass

@@ -89,7 +89,7 @@ class ReportsOldVersion(MockDevice):
 
 @variant("starts-torn-image", "PW-01", also="RS-03 TX-12 EN-04 PW-02")
 class StartsTornImage(MockDevice):
-    """Starts what is stored of an image that was broken off."""
+    """Starts an incompletely stored image."""
 
     def _boot(self, now: float) -> str:
         super()._boot(now)
@@ -238,7 +238,7 @@ class CompletesSecondEnd(MockDevice):
 
 @variant("refusal-is-final", "EN-04", profile={"image_checksum": "crc32"})
 class RefusalHangs(HangingDevice):
-    """Takes nothing after it has refused an image, until power is cut."""
+    """Ignores all messages after it has refused an image, until power is cut."""
 
     def _refuse_end(self, now: float) -> str:
         detail = super()._refuse_end(now)

@@ -364,7 +364,7 @@ class AcksTwice(MockDevice):
 
 @variant("blank-packet-unanswered", "FR-03", also="TX-07")
 class BlankPacketUnanswered(MockDevice):
-    """Does not acknowledge a packet of FF only until it is repeated. Has nothing to program for a
+    """Acknowledges a packet of FF bytes only when it is repeated. Has no data to program for a
     blank packet, and forgets to answer it.
     """
 
