@@ -81,7 +81,6 @@ class Proof:
     content: Mapping[str, Any] = field(default_factory=dict)
     """Rows of the run, which the certificate contains."""
     row: Mapping[str, Any] = field(default_factory=dict)
-    """The signed audit row."""
     seal: str = ""
     """Signed lines of an existing certificate; "" to make them."""
 

@@ -23,7 +23,7 @@ NAMES_SHOWN: Final = 3
 
 @dataclass(frozen=True)
 class HealthCheck:
-    """Result of one check."""
+    """Name, verdict and text of one check of the station."""
 
     name: str
     is_good: bool

@@ -35,7 +35,7 @@ class NotPrinted(Exception):  # noqa: N818  not an error of the station
 
 @dataclass(frozen=True)
 class LabelJob:
-    """A label to print."""
+    """A label to print for a unit, with the values of its template."""
 
     socket: str
     serial: str

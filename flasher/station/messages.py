@@ -187,7 +187,6 @@ class Ask:
     number: int
     what: JournalWrite | StepEnded
     measurements: tuple[Measurement, ...] = ()
-    """The measurements of the step."""
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,6 @@ class TargetWatcher:
         self.answers = 0
         """Number of version answers, to any tool."""
         self.answer: Content | None = None
-        """The last version answer."""
         self.power_ups = 0
         """Number of times that another unit may have been put in: announcements after a pause or
         after frames of the application, or frames of the application after unlimited

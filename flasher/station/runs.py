@@ -48,7 +48,6 @@ class ActiveRun:
     ended_s: float = 0.0
     attached: list[AttachmentFile] = field(default_factory=list)
     result: RunResult | None = None
-    """Result to be saved."""
     is_save_noted: bool = False
 
 

@@ -92,14 +92,14 @@ ALONE: Final = frozenset({Word.CANCEL, Word.RESUME})
 
 @dataclass(frozen=True)
 class Label:
-    """The label of a unit."""
+    """A scan that is the serial number of a unit."""
 
     serial: str
 
 
 @dataclass(frozen=True)
 class ScanCommand:
-    """A command word with its argument."""
+    """A scan that is a command, for example SOCKET A."""
 
     word: Word
     argument: str = ""

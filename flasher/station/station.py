@@ -418,7 +418,6 @@ class Station:
     # -- beginning --------------------------------------------------------------------------------
 
     def _claim(self, order: Order) -> line.SocketInput:
-        """Claim a run in the records."""
         socket = order.socket
         try:
             life = self._life(order.serial)
@@ -506,7 +505,6 @@ class Station:
         self._carry_out()
 
     def _end_lost(self, socket: str, reason: str, *, hung: bool) -> None:
-        """End the run of a lost process."""
         run = self._active_run(socket)
         if run is None:
             return

@@ -128,7 +128,6 @@ class WorkerSupervisor:
 
     @property
     def ports(self) -> Mapping[str, WorkerPort]:
-        """Running processes by socket."""
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
 
     def send(self, socket: str, message: ToWorker) -> bool:

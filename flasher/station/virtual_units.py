@@ -53,7 +53,7 @@ _NUMBERS_TRIED: Final = 10_000
 
 
 class Health(StrEnum):
-    """Health of a virtual unit."""
+    """Behaviour of a virtual unit in its run."""
 
     GOOD = "good"
     SLOW = "slow"

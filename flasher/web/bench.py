@@ -69,7 +69,7 @@ _LOG: Final = logging.getLogger("flasher.web")
 
 @dataclass
 class UpgradeEnding:
-    """Result or error of an upgrade."""
+    """End of an upgrade: result or error, bundle and entry in the history."""
 
     result: Result | None
     error: FlasherError | None

@@ -18,7 +18,7 @@ from flasher.trace.decoder import BusEvent
 
 
 class Activity(Enum):
-    """Current activity of the bench."""
+    """Work that the bench is doing, shown on its page."""
 
     NOTHING = "nothing"
     ADAPTERS = "adapters"
@@ -163,10 +163,8 @@ class BenchState:
     saved_bytes: int = 0
     """Number of bytes of memory read for a backup so far."""
     saved: Saved | None = None
-    """The last backup."""
     watched: BusWatch | None = None
     dropped: tuple[str, ...] = ()
-    """Names of files dropped on the page."""
     target: Target | None = None
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None

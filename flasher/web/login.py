@@ -80,8 +80,6 @@ class Badges:
 
 
 class _RefusedError(Exception):
-    """The sign-in is refused."""
-
     def __init__(
         self, trouble: str, status: int = 403, *, wait_s: int = 0, badge: str = ""
     ) -> None:

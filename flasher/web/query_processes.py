@@ -41,7 +41,6 @@ class Question:
     """The request of a page, as plain data."""
 
     path: str
-    """Path of the route."""
     fields: Mapping[str, str] = field(default_factory=dict)
     """Query parameters of the URL, without empty ones."""
     run: int = 0
@@ -62,7 +61,6 @@ class Answer:
     media_type: str = HTML
     status: int = 200
     file_name: str = ""
-    """Name of a file to save."""
     location: str = ""
     """Path on this server to redirect to."""
     after: str = ""

@@ -179,7 +179,6 @@ class SupervisorPages:
         return Answer(location=f"/units?{urlencode(unit)}")
 
     def trace(self, question: Question) -> Answer:
-        """The complete explanation of a run's bus trace."""
         details = self.store.read.run(RunId(question.run))
         found = self._story(details)
         if not isinstance(found, Story):

@@ -143,7 +143,7 @@ def _share(text: str) -> float:
 
 @dataclass(frozen=True)
 class Address:
-    """Address of the pages."""
+    """Host and port at which the pages are served."""
 
     host: str
     port: int

@@ -77,7 +77,6 @@ class View:
         yield
 
     def __call__(self, event: StationEvent) -> None:
-        """Show one event."""
         self.board.apply(event)
         self.show(event)
 

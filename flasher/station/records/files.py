@@ -115,7 +115,6 @@ class FileStore:
                     part.unlink(missing_ok=True)
 
     def path(self, sha256: str) -> Path:
-        """The path of the file with this hash."""
         return self.folder / sha256[:2] / sha256
 
     def read(self, sha256: str) -> bytes:

@@ -132,7 +132,7 @@ class By(StrEnum):
 
 @dataclass(frozen=True)
 class AuditRow:
-    """A row of the audit trail."""
+    """A row of the audit trail with its parsed data."""
 
     station: str
     number: int
