@@ -25,7 +25,7 @@ command (R2).
 _QUIET_S: Final = 0.05
 """Required silence on the bus after a repetition (R10)."""
 _SETTLE_S: Final = 0.3
-"""Extra time after burst and window until a started application listens."""
+"""Extra time after burst and window, where no application is started."""
 _BLIND_S: Final = 1.0
 """A device that announces nothing for this long after a reset may be in a transfer."""
 UPDATES_MAX: Final = 50
@@ -95,13 +95,16 @@ class PatientHost:
         tester = self._tester
         deadline = tester.now + limit_s
         while True:
+            # One that starts at the end of its limit answers the last reset.
+            is_last = tester.now >= deadline
             with tester.collecting_feedback():
                 tester.send(self._encoder.reset())
                 runs = tester.wait_for(Reply.FEEDBACK) is not None
-            if runs or tester.now >= deadline:
-                # A message sent before the end of a burst that the reset started would be lost.
+            if runs or is_last:
+                # A message sent before the application listens again would be lost.
                 if tester.wait_for(Reply.BOOT_VERSION) is not None:
-                    tester.wait(self._tester.waits.burst_s + _SETTLE_S)
+                    start_s = self._profile.limit("start_s") if runs else _SETTLE_S
+                    tester.wait(tester.waits.burst_s + start_s)
                     tester.forget()
                 return runs
             # The reset may have started a burst (RS-02), which another reset would restart.
@@ -220,8 +223,9 @@ class PatientHost:
                 return one.at < began_at + LEFTOVER_S
             return one.kind is Reply.ACK and one.number != number
 
-        last = "no answer"
-        for tries in range(1, PACKET_TRIES + 1):
+        last, tries, requests = "no answer", 0, 0
+        while tries < PACKET_TRIES and requests < UPDATES_MAX:
+            tries += 1
             self.send_packet(image, number)
             # A repeated update command may cause a second erase (R25, R16).
             kinds = (*_PACKET_ANSWERS, Reply.REQUEST) if number == 1 else _PACKET_ANSWERS
@@ -229,17 +233,21 @@ class PatientHost:
             if reply is None and number == 1 and tries == PACKET_TRIES - 1:
                 erase_s = self._profile.limit("erase_s")
                 self._tester.wait_for(Reply.REQUEST, within_s=erase_s)
-            if reply is None or reply.kind is Reply.REQUEST:
+            if reply is not None and reply.kind is Reply.REQUEST:
+                requests += 1
+                tries -= 1  # not an answer to the packet
+                continue
+            if reply is None:
                 continue
             last = str(reply)
             if reply.kind is Reply.BOOT_VERSION:
                 return last
             is_next = reply.kind is Reply.NAK and reply.number == number + 1
-            by_profile = is_next and tries > 1 and self._profile.choice("tx_02") != "ack"
+            by_profile = is_next and tries + requests > 1 and self._profile.choice("tx_02") != "ack"
             if not by_profile and reply.kind is not Reply.ACK:
                 continue
             # Wait until the answers to all copies have arrived.
-            quiet_after = PACKET_TRIES if tries > 1 else 0
+            quiet_after = PACKET_TRIES if tries + requests > 1 else 0
             while quiet_after and self._tester.next_message(_QUIET_S) is not None:
                 quiet_after -= 1
             return ""

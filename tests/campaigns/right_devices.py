@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import random
 import sys
@@ -33,6 +34,7 @@ from flasher.mock.variants.entering import LOOP_S, QueuesUpdates
 from flasher.mock.variants.framing import HeaderAtFrameStart, PaddingFatal, ShortFrameEnds
 from flasher.mock.variants.transfer import FillerChecked
 from flasher.protocol import messages
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING, Command, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Reassembler
@@ -203,6 +205,12 @@ class AnswersLate(MockDevice):
         self._due_at += max(0.0, self._held_until - now)
         return detail
 
+    def _await_host(self, now: float) -> None:
+        before = self._due_at
+        super()._await_host(now)
+        if self._due_at != before:  # a pause begins when the answer is sent
+            self._due_at += max(0.0, self._held_until - now)
+
     def _complete_again(self, now: float) -> str:
         # Nothing to check this time, when it has answered the first one.
         if self.profile.repeated_end == "same_answer" and not self._held:
@@ -218,6 +226,21 @@ def answers_late(**late_s: float) -> type[AnswersLate]:
     """A device that sends these messages late: `answers_late(Nak=0.4)`."""
     kinds = {getattr(messages, name): value for name, value in late_s.items()}
     return type("AnswersLate", (AnswersLate,), {"late_s": kinds})
+
+
+class StartsSlowly(MockDevice):
+    """Receives nothing in the first `slow_s` of its application."""
+
+    slow_s: ClassVar[float] = 4.85
+    _deaf_until = -math.inf
+
+    def _start(self, now: float) -> str:
+        self._deaf_until = now + self.slow_s
+        return super()._start(now)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self.state is not BootloaderState.APPLICATION or now >= self._deaf_until:
+            super().receive(frame, now)
 
 
 class CountsFromPackets(MockDevice):

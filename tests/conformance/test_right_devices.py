@@ -23,6 +23,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants.ending import RecordErasedLast
 from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
+from flasher.mock.variants.framing import PaddingFatal
 from tests.campaigns.dual_bank import (
     CopiesImage,
     CopyingStore,
@@ -37,6 +38,7 @@ from tests.campaigns.right_devices import (
     ListensAfterBurst,
     RefusesByNak,
     RefusesInBurst,
+    StartsSlowly,
     answers_late,
     faults_of,
     right_device,
@@ -234,7 +236,7 @@ def test_a_dual_bank_device_may_keep_its_old_application(
 
 
 @pytest.mark.slow
-@each("kind", (SwapsBanks, CopiesImage, KeepsJournal))
+@pytest.mark.parametrize("kind", [SwapsBanks, CopiesImage, KeepsJournal])
 def test_power_cuts_leave_a_dual_bank_device_its_old_or_new_application(
     kind: type[MockDevice],
 ) -> None:
@@ -282,7 +284,7 @@ class _ErasesJournal(KeepsJournal):
 
 
 @pytest.mark.slow
-@each("kind", (_ForgetsCopy, _TriesOnce, _ErasesJournal))
+@pytest.mark.parametrize("kind", [_ForgetsCopy, _TriesOnce, _ErasesJournal])
 def test_a_device_that_loses_an_image_to_a_power_cut_after_complete_fails(
     kind: type[MockDevice],
 ) -> None:
@@ -330,3 +332,20 @@ def test_init_finds_whether_the_old_application_is_kept(kind: type[MockDevice], 
 def test_walks_on_a_dual_bank_device_find_nothing(old: str) -> None:
     profile = ConformanceProfile({**profile_of_mock().given, "rs_03_old": old})
     assert Explorer(subject(SwapsBanks), profile, seed="4").explore(400).finding is None
+
+
+@each("target", ("bms", "wmc", "obc"))
+def test_an_application_may_take_its_time_to_listen(target: str) -> None:
+    report = run(
+        subject(StartsSlowly, target=target),
+        profile_of_mock(),
+        selection=Selection(cases=("BR-01", "RS-01", "RS-03", "UP-02", "UP-03", "EN-01", "EN-07")),
+    )
+    assert [result.reason for result in report.results if result.verdict not in HELD] == []
+
+
+def test_an_update_command_that_is_not_accepted_may_let_the_old_application_start() -> None:
+    kind = type("Right", (SwapsBanks,), {"reassembler_type": PaddingFatal})
+    device = dataclasses.replace(MOCK_PROFILE, update_in_transfer="ignored", window_s=0.06)
+    given: dict[str, Value] = {**_KEPT, "fr_07": "rejected"}
+    assert blamed("FR-07", kind=kind, device=device, given=given) == []

@@ -120,7 +120,10 @@ class Probe(PacketTransfer):
         else:
             if reset and reply is None:  # by now the application was started
                 bench.reset_to_bootloader()
-            bench.update(len(self.image))
+            if reset or reply is not None:
+                bench.update(len(self.image))
+            else:
+                bench.update_again(len(self.image))
         self.stored = 0
 
     def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:
