@@ -88,6 +88,7 @@ def test_many_updates_in_a_row_may_erase_to_the_limit_each() -> None:
     assert blamed("UP-08", device=slow, given={"up_08": "either"}) == []
 
 
+@pytest.mark.slow
 @each("late_s", (0.3, 0.45, 0.498))
 def test_damage_may_be_answered_as_late_as_a_packet(late_s: float) -> None:
     cases = ("FR-04", "FR-06", "CR-02", "CR-03")
@@ -99,6 +100,7 @@ def test_bit_flips_may_be_answered_late() -> None:
     assert blamed("CR-01", kind=answers_late(Nak=0.498)) == []
 
 
+@pytest.mark.slow
 @each("case_id", ("TX-01", "TX-03", "TX-04", "TX-06", "SE-04", "EN-02", "CO-04"))
 @each("bad_packet", ("silence", "nak_received"))
 def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> None:
@@ -177,6 +179,7 @@ def test_wrong_update_commands_are_sent_when_the_device_listens(case_id: str) ->
     assert blamed(case_id, kind=kind, given={**_AFTER_BURST, "up_02": "nak"}) == []
 
 
+@pytest.mark.slow
 @each("case_id", ("FR-06", "FR-10", "CR-03", "PW-01", "PW-02"))
 def test_a_device_may_listen_only_after_its_announcements(case_id: str) -> None:
     assert blamed(case_id, kind=ListensAfterBurst, given=_AFTER_BURST) == []
@@ -216,6 +219,7 @@ def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
 _KEPT: dict[str, Value] = {"rs_03_old": "kept"}
 
 
+@pytest.mark.slow
 @each("kind", (SwapsBanks, CopiesImage))
 @each("old", ("kept", "either"))
 @each(
@@ -319,6 +323,7 @@ def test_a_device_that_is_stated_to_erase_its_application_must_not_run_it() -> N
     assert found
 
 
+@pytest.mark.slow
 @each("kind, value", ((MockDevice, "erased"), (SwapsBanks, "kept"), (CopiesImage, "kept")))
 def test_init_finds_whether_the_old_application_is_kept(kind: type[MockDevice], value: str) -> None:
     device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts")
@@ -328,6 +333,7 @@ def test_init_finds_whether_the_old_application_is_kept(kind: type[MockDevice], 
     assert found["device.largest_image_bytes"].value == device.image_limit_bytes
 
 
+@pytest.mark.slow
 @each("old", ("kept", "either"))
 def test_walks_on_a_dual_bank_device_find_nothing(old: str) -> None:
     profile = ConformanceProfile({**profile_of_mock().given, "rs_03_old": old})
