@@ -12,9 +12,10 @@ _EDGES = {"mock", "simulated", "real"}
 """Modules that depend on the rest of flasher."""
 _REPORTING = {
     *("trace_excerpt", "diff", "html_report", "reports"),
-    *("bench_options", "plugin", "summary_page", "side_by_side"),
+    *("bench_options", "plugin", "summary_page", "side_by_side", "matrix", "parallel", "replay"),
 }
-"""Modules that open a bench or report a run, but neither make nor judge bytes."""
+"""Modules that open a bench, send what was recorded or report a run, but neither make nor judge
+bytes."""
 
 
 def test_every_module_but_the_edges_is_under_the_contract() -> None:

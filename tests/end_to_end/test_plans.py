@@ -83,7 +83,7 @@ def test_the_oracle_finds_a_success_that_is_none(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_oracle_finds_a_twin_that_was_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(DuplicateDetector, "_see_two", lambda _duplicates, _what: None)
+    monkeypatch.setattr(DuplicateDetector, "_set_evidence", lambda _duplicates, _what: None)
     twin = "stranger erase=0.05 late=0.003 ; @packet3+0.02 power device=1 seconds=9"
     verdict = play(Plan.parse(f"world target=wmc packets=3 ; stranger erase=0.05 ; {twin}"))
     assert verdict.left == "new / none"
