@@ -39,12 +39,14 @@ _LEADING: Final = re.compile(r"(?<![^.!? \N{IDEOGRAPHIC FULL STOP}])\{\w+\} ?")
 _BETWEEN: Final = re.compile(r"(?<=[.!?]) (?=\S)|(?<=\N{IDEOGRAPHIC FULL STOP})(?=\S)")
 """Space between two sentences."""
 _SENTENCES: Final = re.compile(r"(.+?[.!?])( )([A-Z].*)()", re.DOTALL)
-_CLAUSES: Final = re.compile(r"(.+?)(; )(.+)()", re.DOTALL)
+_CLAUSES: Final = re.compile(r"((?:[^()]|\([^()]*\))+?)(; )(.+)()", re.DOTALL)
 _BRACKETS: Final = re.compile(r"(.+?)( \()(.+)(\))", re.DOTALL)
 _COLON: Final = re.compile(r"(.+?)(: )(.+)()", re.DOTALL)
 """Patterns of texts that are joined from several ones."""
 _WHOLE: Final = re.compile(r"(?:(?![.!?] [A-Z]|; ).)*", re.DOTALL)
 """Values that are not joined themselves."""
+_BALANCED: Final = re.compile(r"(?:[^()]|\([^()]*\))*")
+"""Values with whole brackets."""
 _ANY: Final = re.compile(r".*", re.DOTALL)
 _FULL_STOPS: Final = {"zh": "\N{IDEOGRAPHIC FULL STOP}"}
 
@@ -104,6 +106,7 @@ class Translator(Formatter):
             or self._matched(sentence, _WHOLE)
             or self._split(sentence, _SENTENCES)
             or self._split(sentence, _CLAUSES)
+            or self._matched(sentence, _BALANCED)
             or self._matched(sentence, _ANY)
             or self._matched(f"{sentence}.", _ANY).removesuffix(self._stop)
             or self._split(sentence, _BRACKETS)

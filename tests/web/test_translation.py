@@ -111,3 +111,11 @@ def test_a_text_of_very_many_parts_stays_as_it_is_and_costs_little(joined: str) 
 
     assert translate(joined) == joined
     assert translate._plain.cache_info().misses == 1
+
+
+def test_brackets_with_two_clauses_stay_one_part() -> None:
+    why = "the battery gives 3336 mA, more than 1000 mA; --allow-in-use waives this"
+    assert translator("de")(f"BMS: the vehicle is in use ({why}).") == (
+        "BMS: das Fahrzeug wird benutzt (die Batterie gibt 3336 mA ab, mehr als 1000 mA;"
+        " --allow-in-use erlässt dies)."
+    )
