@@ -355,3 +355,9 @@ def test_an_update_command_that_is_not_accepted_may_let_the_old_application_star
     device = dataclasses.replace(MOCK_PROFILE, update_in_transfer="ignored", window_s=0.06)
     given: dict[str, Value] = {**_KEPT, "fr_07": "rejected"}
     assert blamed("FR-07", kind=kind, device=device, given=given) == []
+
+
+def test_walks_wait_for_late_answers_to_damage() -> None:
+    explorer = Explorer(subject(answers_late(Nak=0.488)), profile_of_mock(), seed="1")
+    walk = ["reset", "update=128", "packet-doubled", "end"]
+    assert explorer.replay(walk).finding is None

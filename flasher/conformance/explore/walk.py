@@ -213,7 +213,7 @@ class Walk:
         if self.phase is DevicePhase.ANNOUNCING:
             self._listen(broken_s)  # no longer, as the window is short
             return
-        self._listen(max(bench.limit("ack_s"), broken_s))
+        self._listen(bench.waits.settle_s)
         self._naks_due = 0
 
     def _judge(self, reply: Received) -> None:
