@@ -361,3 +361,10 @@ def test_walks_wait_for_late_answers_to_damage() -> None:
     explorer = Explorer(subject(answers_late(Nak=0.488)), profile_of_mock(), seed="1")
     walk = ["reset", "update=128", "packet-doubled", "end"]
     assert explorer.replay(walk).finding is None
+
+
+def test_walks_know_that_a_pause_may_count_from_the_last_packet_stored() -> None:
+    device = dataclasses.replace(MOCK_PROFILE, transfer_timeout_s=2.5)
+    explorer = Explorer(subject(CountsFromPackets, device), profile_of_mock(device), seed="1")
+    steps = ["reset", "update=128", "packet", "wait=1", "packet-again", "wait=1"]
+    assert explorer.replay([*steps, "packet-mode"]).finding is None

@@ -169,7 +169,8 @@ class Walk:
             elif self.has_application is None:
                 self.phase, self._may_restart = DevicePhase.UNCLEAR, True
         pause_s = bench.now - self._answered_at
-        may_end = bench.choice("tx_12") != "waits" and pause_s > 0.8 * bench.limit("pause_s")
+        left_s = min(0.8 * bench.limit("pause_s"), bench.limit("pause_s") - bench.waits.settle_s)
+        may_end = bench.choice("tx_12") != "waits" and pause_s > left_s
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
 
@@ -626,7 +627,6 @@ class Walk:
             named = f"no {' or '.join(right)} within {within_s:g} s"
             raise Violation("no ACK", f"{named} after packet {number} again")
         self._acks_due[number] = 0
-        self._answered_at = self.bench.now
 
     def _packet_between(self, _: str) -> None:
         """Send the next packet with empty frames in between."""
