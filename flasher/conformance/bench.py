@@ -17,7 +17,7 @@ from flasher.conformance.judge import Judge, TimeName
 from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
-from flasher.conformance.subject import BY_BUS, Subject, readback_source
+from flasher.conformance.subject import BY_BUS, SIMULATED_BUS, Subject, readback_source
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import (
     MEMORY_BYTES,
@@ -90,6 +90,11 @@ class Bench:
     @property
     def now(self) -> float:
         return self.port.now()
+
+    @property
+    def is_in_virtual_time(self) -> bool:
+        """True when waiting takes no time."""
+        return self.port.timestamp_source == SIMULATED_BUS
 
     @property
     def good_image(self) -> bytes:

@@ -19,7 +19,7 @@ from flasher.conformance.results import (
     RunStopped,
     TraceEntry,
 )
-from flasher.conformance.subject import Subject
+from flasher.conformance.subject import SIMULATED_BUS, Subject
 from flasher.conformance.waits import Waits
 from flasher.conformance.wire import Reply, reported_version
 
@@ -86,7 +86,7 @@ def restore(
         reasons.append(f"{how}: {reason}")
         later_s = bench.tester.began_at - began_at
         trace += [one._replace(at_s=one.at_s + later_s) for one in bench.tester.trace]
-    has_wires = subject.port.timestamp_source != "simulated bus"
+    has_wires = subject.port.timestamp_source != SIMULATED_BUS
     diagnosis = [] if crashed else diagnose(trace, bench.encoder, has_wires=has_wires)
     return RestoreResult("", "; ".join(reasons), tuple(trace), tuple(diagnosis))
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.results import DeviceCrashed
-from flasher.conformance.subject import Arrival
+from flasher.conformance.subject import SIMULATED_BUS, Arrival
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, FlasherError
 from flasher.protocol.frame import Frame
@@ -29,7 +29,7 @@ class SimulatedPort:
     """Port on a simulated bus. Its methods raise DeviceCrashed too."""
 
     echoes = True
-    timestamp_source = "simulated bus"
+    timestamp_source = SIMULATED_BUS
     uncertainty_s = 0.0
     sends_error_frames = True
 

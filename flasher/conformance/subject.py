@@ -11,6 +11,8 @@ from flasher.conformance.wire import Encoder, RawFrame
 if TYPE_CHECKING:  # the profile needs the validation library, which the list of cases does not
     from flasher.conformance.profile import ConformanceProfile
 
+SIMULATED_BUS: Final = "simulated bus"
+"""Source of time stamps on a bus in virtual time."""
 READBACK: Final = "readback"
 BY_BUS: Final = "memory over the bus"
 

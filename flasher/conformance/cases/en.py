@@ -11,8 +11,15 @@ from flasher.conformance.wire import END, WRITE, Received, Reply, describe, pack
 
 _RESET_PERIOD_S: Final = 0.2
 """Interval at which a tool repeats a command (4.3)."""
-_WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
-"""Values to send in place of 04."""
+_MARK: Final = 0x04
+_FLIPPED_MARKS: Final = tuple(_MARK ^ 1 << bit for bit in range(8))
+_WRONG_MARKS: Final = (
+    *_FLIPPED_MARKS,
+    *(mark for mark in (*range(0x20), 0xFF) if mark not in (_MARK, *_FLIPPED_MARKS)),
+)
+"""Values to send in place of 04: each flipped bit, every control character."""
+_SILENT_MARKS: Final = 7
+"""Values that a device which ignores the first one gets between two waits."""
 _UPGRADE_KINDS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
 """Possible answers to end of transfer; a starting application may send other reports."""
 
@@ -86,23 +93,34 @@ def end_early_and_twice(bench: Bench) -> None:
                 bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
                 _restart_transfer(bench, image, stored, reply)
     bench.packets(image, done + 1)
-    for mark in _WRONG_MARKS:
-        with bench.step(f"end of transfer with {mark:02X}"):
-            bench.stay_before(image, total + 1)
-            bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
-            answers = bench.collect(bench.limit("ack_s"))
-            ok = not any(one.kind in (Reply.COMPLETE, Reply.ACK) for one in answers)
-            bench.require(ok, "rejected", describe(answers))
-        if any(one.kind in (Reply.NAK, Reply.BOOT_VERSION) for one in answers):
-            bench.send_packet(image, total)
-            known = bench.wait_for(Reply.ACK, Reply.NAK, unlike=lambda one: one.number < total)
-            if known is None:
-                _restart_transfer(bench, image, total)
-            break
+    _check_wrong_marks(bench, image)
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
         _check_second_end(bench, Reply.COMPLETE)
         bench.check_image(image)
+
+
+def _check_wrong_marks(bench: Bench, image: bytes) -> None:
+    """Send end of transfer with other values than 04 to a device that has stored all packets."""
+    total = packet_count(len(image))
+    left, size = list(_WRONG_MARKS), 1
+    while left:
+        marks, left = left[:size], left[size:]
+        with bench.step(f"end of transfer with {bytes(marks).hex(' ').upper()}"):
+            bench.stay_before(image, total + 1)
+            for mark in marks:
+                bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
+            kinds = (*_UPGRADE_KINDS, Reply.BOOT_VERSION)
+            reply = bench.wait_for(*kinds, within_s=bench.limit("ack_s"))
+            ok = reply is None or reply.kind not in (Reply.COMPLETE, Reply.ACK)
+            bench.require(ok, "rejected", reply or "silence")
+        if reply is None or reply.kind not in (Reply.NAK, Reply.BOOT_VERSION):
+            size = _SILENT_MARKS
+            continue
+        bench.send_packet(image, total)
+        if bench.wait_for(Reply.ACK, Reply.NAK, unlike=lambda one: one.number < total) is None:
+            _restart_transfer(bench, image, total)
+            left = [mark for mark in left if mark in _FLIPPED_MARKS]
 
 
 def _restart_transfer(
