@@ -411,6 +411,19 @@ def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged(again: 
     assert played.seen["undetectable: exchanged between its card and its label"] == 1
 
 
+def test_a_unit_that_an_aborted_run_left_silent_in_its_transfer_is_scanned_twice() -> None:
+    """Nobody can tell it from one that was pulled: the first scan ends as UNIT_CHANGED."""
+    played = told(
+        "line sockets=1 recipe=held ; unit label=2 pace=slow ; person name=jo ; person name=al ;"
+        " @3.0 put unit=2 socket=A ; @19.0 label by=jo unit=2 ; @20.0 station seconds=1.0 ;"
+        " @29.0 pull unit=2 ; @99.04 put unit=2 socket=A ; @103.0 card by=al unit=2 socket=A ;"
+        " @103.2 label by=al unit=2 ; @105.6 abort by=al socket=A ; @107.8 label by=al unit=2"
+    )
+    assert played.text == ""
+    assert played.seen is not None
+    assert played.seen["ERROR UNIT_CHANGED"] == 1
+
+
 def test_a_label_whose_card_was_used_up_is_not_taken_for_one_that_was_scanned_alone() -> None:
     """Two people at one page scan the same card; the label of the first is refused. The label of
     the second follows before the refusal is read, when another unit is in the socket."""

@@ -785,7 +785,7 @@ class World:
         self.seen[self._last_end] += 1
         if event.code == "INTERNAL":
             raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
-        if event.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay):
+        if event.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay, self.now):
             raise Violation(
                 "ACCUSED",
                 f"{event.serial} in {bay.name} was touched by nobody, and is said to be another"
@@ -1021,11 +1021,13 @@ def _is_calm(bay: Bay) -> bool:
     return bay.disturbed_at < bay.run_at - CALM_S
 
 
-def _has_given_up(bay: Bay) -> bool:
-    """Its unit waited in a transfer that another run had left, and has announced itself since, as
-    one does that is switched on.
+def _has_given_up(bay: Bay, now: float) -> bool:
+    """Its unit waited in a transfer that another run had left, and was silent for as long as one
+    that was pulled, or has announced itself since, as one does that is switched on.
     """
-    return bay.began_in_transfer and bay.unit is not None and bay.unit.gave_up_at >= bay.run_at
+    if not bay.began_in_transfer or bay.unit is None:
+        return False
+    return bay.unit.gave_up_at >= bay.run_at or bay.spoke_at <= now - SILENCE_S
 
 
 def _stored(unit: PaperUnit) -> _Stored:
