@@ -62,7 +62,7 @@ _COMPLETED: Final = {
 
 @dataclass(frozen=True)
 class Began:
-    """Beginning of an upgrade, before anything is written to the device."""
+    """History entry for the start of an upgrade, before anything is written to the device."""
 
     at: str
     """Local time with UTC offset."""

@@ -192,7 +192,7 @@ class CaseResult:
 
     @cached_property
     def not_tried(self) -> tuple[str, ...]:
-        """Distinct parts that this bench could not try, with reasons."""
+        """Distinct checks of the case that this bench could not make, with reasons."""
         found = (one for one in self.checks if one.outcome is CheckOutcome.UNSUPPORTED)
         return tuple(dict.fromkeys(f"{one.expected} ({one.got})" for one in found))
 
@@ -356,7 +356,7 @@ class RunReport:
 
     @cached_property
     def not_tried(self) -> dict[str, list[str]]:
-        """Reasons why parts were not tried, with the cases that passed without them."""
+        """Reasons why checks were not made, with the cases that passed without them."""
         found: dict[str, dict[str, None]] = {}
         for _, result in self.by_case():
             for check in result.checks if result.verdict is CaseVerdict.PASS_IN_PART else ():

@@ -30,7 +30,7 @@ _ENDS: Final = b"\r\n\t"
 
 
 class NoScanner(Exception):  # noqa: N818  it may be plugged in later
-    """A scanner cannot be read; the argument is the reason, a sentence."""
+    """A scanner cannot be opened or read. The message is one sentence with the reason."""
 
 
 class Reads(Protocol):

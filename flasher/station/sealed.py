@@ -106,7 +106,10 @@ class Sealed:
         )
 
     def life(self) -> UnitLife:
-        """The unit as the page shows it. Raises ValidationError, KeyError or TypeError."""
+        """Runs of the unit, as stored in the certificate; the last one is the certified run.
+
+        Raises ValidationError, KeyError or TypeError for content of another form.
+        """
         details = details_of_content(self.content, self.recipe)
         runs = [RunDetails(_RUN.validate_python(run), (), (), (), ()) for run in self.earlier]
         state = UnitState.after(details.run.state)

@@ -180,7 +180,8 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
         return
     if path.samefile(image):
         raise UsageError(
-            f"{printable(str(path))} is the image itself.", remedy="Name another file with -o."
+            f"{printable(str(path))} is the image itself, which would be overwritten.",
+            remedy="Name another file with -o.",
         )
     if not overwrite:
         raise UsageError(

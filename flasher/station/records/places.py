@@ -234,8 +234,8 @@ class Copying:
         last = self._target.last()
         if last is None and self.shown in self._known_places():
             raise RecordError(
-                f"The heads that were stored in {self.shown} are missing.",
-                cause="the heads that were stored there are missing; another share may be mounted",
+                f"The heads of the hash chain that were copied to {self.shown} are missing.",
+                cause="another share may be mounted there, or its files were deleted",
                 remedy=f"Mount the share. To start again there, delete {self._known}.",
             )
         if last is None:
