@@ -356,7 +356,7 @@ class SixteenBitSize(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("hangs-at-20th-update", "UP-08", also="FR-07 UP-06 TX-12 TM-05")
+@variant("hangs-at-20th-update", "UP-08", also="FR-07 UP-05 UP-06 TX-12 TM-05 PW-01")
 class HangsAt20thUpdate(HangingDevice):
     """Hangs at the 20th update command since power-up until power is cut. Allocates a buffer for
     each transfer, and frees none.

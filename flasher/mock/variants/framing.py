@@ -75,7 +75,7 @@ class TailIgnored(Reassembler):
         super()._judge_message(size, found)
 
 
-@variant("trusts-length", "FR-05", also="TX-01 CR-02")
+@variant("trusts-length", "FR-05", also="TX-01 CR-02 BU-01")
 class LengthTrusted(Reassembler):
     """After a broken-off message, swallows the next ones until its length is used up."""
 

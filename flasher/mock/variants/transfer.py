@@ -375,7 +375,7 @@ class BlankPacketUnanswered(MockDevice):
         return self._reply(None, now)
 
 
-@variant("pause-counts-from-start", "TX-12", also="CR-01 CR-02 TX-07 TM-02 BU-02")
+@variant("pause-counts-from-start", "TX-12", also="FR-06 FR-10 CR-01 CR-02 CR-03 TX-07 TM-02 BU-02")
 class PauseCountsFromStart(MockDevice):
     """Counts the pause from request transfer on, not from the last packet."""
 
@@ -389,7 +389,7 @@ class PauseCountsFromStart(MockDevice):
         super()._await_host(self._began_at)
 
 
-@variant("timer-wraps", "TX-12")
+@variant("timer-wraps", "TX-12", also="CR-01")
 class TimerWraps(MockDevice):
     """Gives up a transfer 65.536 s after its start, where its clock of 16 bits wraps."""
 
