@@ -158,7 +158,7 @@ def test_a_stopped_line_waits_for_the_people_at_its_page(
     [
         (("--web", "0.0.0.0:0"), "to other computers without TLS"),
         (("--web", "0.0.0.0:0", "--web-insecure"), "without a password"),
-        (("--web", "0", "--web-key", RECIPE), "need each other"),
+        (("--web", "0", "--web-key", RECIPE), "are needed together"),
         (("--web", "0", "--web-key", RECIPE, "--web-certificate", RECIPE), "cannot be used"),
         (("--web", "0", "--web-password", RECIPE.parent / "none"), "none"),
         (("--web", "70000"), "must be PORT"),

@@ -41,7 +41,7 @@ def test_the_mock_passes_as_obc() -> None:
 
 
 @pytest.mark.slow
-@each(
+@pytest.mark.parametrize(  # a whole suite each
     "choices",
     [
         {"reset_in_bootloader": "restarts", "without_application": "listens"},
