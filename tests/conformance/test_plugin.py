@@ -49,6 +49,7 @@ def test_power_up(btl_bench, btl_power, btl_measurements):
 """
 
 
+@pytest.mark.slow
 def test_a_team_adds_its_own_tests_beside_the_suite(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(test_own=OWN)
     done = pytester.runpytest_inprocess(*MOCK, "--btl-suite", "-k", "test_own or RS", "-v")
