@@ -13,16 +13,19 @@ from typing import Final
 
 from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.conformance.catalogue import (
+    CASES,
     Selection,
     bench_gaps,
     catalogue_order,
     known_cases,
     missing_requirements,
+    why_unsupported,
 )
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import FINAL_IMAGE_OK, CaseResult, CaseVerdict, RunReport
 from flasher.conformance.runner import RunObserver, SuiteOptions, SuiteRun, check_selection
 from flasher.conformance.subject import Subject
+from flasher.processes import end_with_parent
 
 _PARTS_A_JOB: Final = 4
 """So that no process is idle while another one has the slow cases."""
@@ -50,23 +53,33 @@ def run_in_processes(
     """
     check_selection(selection, profile)
     chosen = selection.chosen()
-    count = min(jobs * _PARTS_A_JOB, len(chosen))
+    count = max(1, min(jobs * _PARTS_A_JOB, len(chosen)))
     parts = [chosen[start::count] for start in range(count)]
-    observer.run_began(len(chosen) * suite.repeat)
+    can_run = [
+        case_id
+        for case_id in chosen
+        if case_id in CASES and not why_unsupported(CASES[case_id], subject, profile)
+    ]
+    observer.run_began(len(can_run) * suite.repeat)
     context = multiprocessing.get_context("spawn")
     event = context.Event()
     with ProcessPoolExecutor(jobs, context, _begin, (event,)) as pool:
-        futures = {pool.submit(_run_part, options, part, suite): part for part in parts}
-        reports: list[RunReport] = []
-        left: set[Future[RunReport]] = set(futures)
-        while left:
-            ended, left = wait(left, timeout=_POLL_S, return_when="FIRST_COMPLETED")
-            for future in ended:
-                reports.append(_report_of(future, futures[future], subject, profile, suite))
-                for result in reports[-1].results:
-                    observer.case_ended(result)
-            if stopped():
-                event.set()
+        futures = [pool.submit(_run_part, options, part, suite) for part in parts]
+        try:
+            left = set(futures)
+            while left:
+                ended, left = wait(left, timeout=_POLL_S, return_when="FIRST_COMPLETED")
+                for future in ended:
+                    for result in () if future.exception() else future.result().results:
+                        observer.case_ended(result)
+                if stopped():
+                    event.set()
+        finally:
+            event.set()  # an error of one ends the others
+        reports = [
+            _report_of(future, part, subject, profile, suite)
+            for future, part in zip(futures, parts, strict=True)
+        ]
     return _merged(reports, chosen, subject, profile)
 
 
@@ -74,6 +87,7 @@ def _begin(event: Event) -> None:
     global _is_stopped  # noqa: PLW0603  a process of the pool has no other place
     _is_stopped = event
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent sets the event
+    end_with_parent()
 
 
 def _run_part(options: BenchOptions, cases: Sequence[str], suite: SuiteOptions) -> RunReport:
@@ -104,15 +118,15 @@ def _merged(
     subject: Subject,
     profile: ConformanceProfile,
 ) -> RunReport:
-    """One report; for what only one process reports, the first one that does."""
+    """Merge the reports of the parts; of different texts the first one counts."""
     order = {case_id: number for number, case_id in enumerate(chosen)}
     results = [result for each in reports for result in each.results]
     texts = {text.id: text for each in reports for text in each.cases}
-    finals = [each.final_image for each in reports if each.final_image]
-    wrong = [final for final in finals if final != FINAL_IMAGE_OK]
-    first = reports[0]
+    ended = [each for each in reports if each.final_image]
+    wrong = [each.final_image for each in ended if each.final_image != FINAL_IMAGE_OK]
+    seen_by = [each.final_image_seen_by for each in ended]
     return replace(
-        first,
+        reports[0],
         cases=tuple(texts[case_id] for case_id in chosen),
         results=tuple(sorted(results, key=lambda each: (each.repeat, order[each.case_id]))),
         gaps=bench_gaps(missing_requirements(subject, profile), chosen),
@@ -122,11 +136,9 @@ def _merged(
         not_upgradable=next((each.not_upgradable for each in reports if each.not_upgradable), ""),
         killed_by=next((each.killed_by for each in reports if each.killed_by), ""),
         rescues=tuple(rescue for each in reports for rescue in each.rescues),
-        final_image=next(iter([*wrong, *finals]), ""),
+        final_image=(wrong or [FINAL_IMAGE_OK if ended else ""])[0],
         final_image_seen_by=tuple(
-            name
-            for name in first.final_image_seen_by
-            if all(name in each.final_image_seen_by for each in reports if each.final_image)
+            name for name in (seen_by or [()])[0] if all(name in each for each in seen_by)
         ),
         duration_s=sum(each.duration_s for each in reports),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from itertools import groupby
@@ -16,7 +16,7 @@ from flasher.conformance.trace_excerpt import decoded_rows
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import TARGETS, Node, can_id
+from flasher.protocol.spec import TARGETS, Node, Target, can_id
 from flasher.trace.decoder import Decoder
 
 _LIMITS: Final = ("first_version_s", "erase_s", "ack_s", "complete_s", "start_s")
@@ -44,22 +44,15 @@ class ReplayResult:
     """Messages of the device in the trace; equal ones in a row count once."""
     differences: tuple[ReplayDifference, ...]
     trouble: str = ""
-    """Why the good image could not be flashed, or why the device stopped; empty for none."""
+    """Why the comparison is not whole: the good image could not be flashed, the device or the user
+    stopped; empty for none."""
 
 
-def replay(
-    subject: Subject,
-    profile: ConformanceProfile,
-    frames: Sequence[tuple[float, Frame]],
-    *,
-    stopped: Callable[[], bool] = lambda: False,
-) -> ReplayResult:
-    """Flash the good image, send the tool's frames of a trace again at their times, and compare the
-    device's messages. Raises UsageError for a trace without a frame to the device, BusError, and
-    RunStopped.
+def recording(frames: Iterable[tuple[float, Frame]], target: Target) -> list[TraceEntry]:
+    """Select the frames to the device, and those of its messages. Raises UsageError for a trace
+    that has nothing to send or nothing to compare.
     """
-    target = TARGETS[subject.target]
-    answer_ids = {can_id(target.node, to) for to in (None, *Node) if to != target.node}
+    answer_ids = _answer_ids(target)
     recorded = [
         TraceEntry(at_s, frame.can_id == target.request_id, RawFrame(*frame[:5]))
         for at_s, frame in frames
@@ -70,18 +63,38 @@ def replay(
             f"The trace has no frame to the {target.node.name}.",
             remedy="Name the target with -t, or another trace.",
         )
-    done = restore(subject, profile, flash=True, stopped=stopped)
-    if not done.ok:
-        trouble = f"the good image could not be flashed first: {done.reason}"
-        return ReplayResult(subject.name, 0, len(_messages(recorded)), (), trouble)
-    patience_s = max(map(profile.limit, _LIMITS))
-    player = _Player(subject, answer_ids, patience_s, stopped)
+    if not _messages(recorded):
+        raise UsageError(
+            f"The trace has no message of the {target.node.name}: there is nothing to compare.",
+            cause="only the tool was recorded, or the device was silent",
+        )
+    return recorded
+
+
+def replay(
+    subject: Subject,
+    profile: ConformanceProfile,
+    recorded: Sequence[TraceEntry],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+) -> ReplayResult:
+    """Flash the good image, send the tool's frames of a `recording` again at their times, and
+    compare the device's messages. The good image is flashed again at the end, also after a stop.
+    Raises BusError.
+    """
+    player = _Player(subject, max(map(profile.limit, _LIMITS)), stopped)
     trouble = ""
     try:
-        player.play(recorded)
+        done = restore(subject, profile, flash=True, stopped=stopped)
+        if done.ok:
+            player.play(recorded)
+        else:
+            trouble = f"the good image could not be flashed first: {done.reason}"
+    except RunStopped:
+        trouble = "it was stopped"
     except DeviceCrashed as crashed:
         trouble = str(crashed)
-    done = restore(subject, profile, flash=True, stopped=stopped)
+    done = restore(subject, profile, flash=True)
     if not (trouble or done.ok):
         trouble = f"the good image could not be flashed afterwards: {done.reason}"
     before, after = _messages(recorded), _messages(player.answers)
@@ -89,9 +102,13 @@ def replay(
     differences = tuple(
         ReplayDifference(tuple(before[i:j]), tuple(after[m:n]))
         for kind, i, j, m, n in matcher.get_opcodes()
-        if kind != "equal"
+        if kind != "equal" and player.frames_sent
     )
     return ReplayResult(subject.name, player.frames_sent, len(before), differences, trouble)
+
+
+def _answer_ids(target: Target) -> set[int]:
+    return {can_id(target.node, to) for to in (None, *Node) if to != target.node}
 
 
 class _Player:
@@ -100,12 +117,11 @@ class _Player:
     def __init__(
         self,
         subject: Subject,
-        answer_ids: set[int],
         patience_s: float,
         stopped: Callable[[], bool],
     ) -> None:
         self._port = subject.port
-        self._answer_ids = answer_ids
+        self._answer_ids = _answer_ids(TARGETS[subject.target])
         self._patience_s = patience_s
         self._stopped = stopped
         self._decoder = Decoder()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final, Protocol
 
-from flasher.station.children import signals_blocked
+from flasher.processes import signals_blocked
 from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, WorkerSetup
 from flasher.station.worker import worker_main
 

@@ -10,7 +10,6 @@ import asyncio
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response, S
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import FlasherError
-from flasher.station.children import signals_blocked
+from flasher.processes import end_with_parent, signals_blocked
 from flasher.web.pages import Pages
 from flasher.web.sign_ins import SignIn
 
@@ -127,18 +126,10 @@ def _begin(make: Callable[[], Answering]) -> None:
     """Initialize a process. It must not fail, or another process would start at once."""
     global _make  # noqa: PLW0603  a process has one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
     _make = make
-
-
-def _end_with_parent() -> None:
-    """End this process with its parent: a station that was killed cannot do it."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _answer(question: Question) -> Answer:

@@ -254,6 +254,9 @@ def test_cases_that_failed_are_selected_by_the_report_alone(
     none = flasher(*MOCK, "--rerun-failed", report)
     assert none.code == 2
     assert "there is nothing to run again" in none.err
+    other = flasher("conformance", "-t", "wmc", "--mock", "--rerun-failed", report)
+    assert other.code == 2
+    assert "is about the target bms, not wmc" in other.err
     for words in (("--case", "RS-01"), ("--quick",), ("--seed", "1")):
         both = flasher(*MOCK, "--rerun-failed", report, *words)
         assert both.code == 2

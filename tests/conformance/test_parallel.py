@@ -45,6 +45,13 @@ def test_two_processes_report_what_one_does(flasher: Flasher) -> None:
     assert _without_times(two.document) == _without_times(one.document)
 
 
+def test_without_a_case_several_processes_report_what_one_does(flasher: Flasher) -> None:
+    none = ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--exclude", "RS-01")
+    one, two = flasher("--json", *none), flasher("--json", *none, "--jobs", "2")
+    assert one.code == two.code
+    assert _without_times(two.document) == _without_times(one.document)
+
+
 def test_a_stop_ends_all_processes() -> None:
     report = run_in_processes(
         BenchOptions("bms", is_mock=True),

@@ -7,8 +7,11 @@ from pathlib import Path
 import pytest
 
 from flasher.conformance.mock import MockSubject
-from flasher.conformance.replay import replay
+from flasher.conformance.replay import recording, replay
+from flasher.conformance.restore import restore
+from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
+from flasher.protocol.spec import TARGETS
 from flasher.trace.reader import read_trace
 from tests.cli.conftest import Flasher
 
@@ -53,7 +56,7 @@ def test_a_slower_device_gets_the_next_frame_after_its_answer(
 
 def test_the_good_image_runs_after_a_replay(trace: Path) -> None:
     subject = MockSubject()
-    replay(subject, PROFILE, list(read_trace(trace)))
+    replay(subject, PROFILE, recording(read_trace(trace), TARGETS["bms"]))
     assert subject.readback().startswith(subject.good_image)
 
 
@@ -66,7 +69,38 @@ def test_a_crash_is_a_finding(flasher: Flasher, trace: Path) -> None:
 
 def test_a_trace_of_another_device_is_refused(trace: Path) -> None:
     with pytest.raises(UsageError, match="The trace has no frame to the WMC"):
-        replay(MockSubject("wmc"), PROFILE, list(read_trace(trace)))
+        recording(read_trace(trace), TARGETS["wmc"])
+
+
+def test_a_trace_without_a_message_of_the_device_is_no_proof(trace: Path) -> None:
+    sent = [each for each in read_trace(trace) if each[1].can_id == TARGETS["bms"].request_id]
+    with pytest.raises(UsageError, match="there is nothing to compare"):
+        recording(sent, TARGETS["bms"])
+
+
+class _Counting(MockSubject):
+    """Counts the frames that are sent to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent, send = 0, self.port.send
+
+        def count(frame: RawFrame) -> None:
+            self.sent += 1
+            send(frame)
+
+        self.port.send = count  # type: ignore[method-assign]
+
+
+def test_a_stop_puts_the_good_image_back_and_claims_nothing(trace: Path) -> None:
+    """It is asked for when three frames of the trace have been sent."""
+    recorded = recording(read_trace(trace), TARGETS["bms"])
+    first = _Counting()
+    assert restore(first, PROFILE, flash=True).ok
+    subject = _Counting()
+    found = replay(subject, PROFILE, recorded, stopped=lambda: subject.sent >= first.sent + 3)
+    assert (found.trouble, found.frames_sent) == ("it was stopped", 3)
+    assert subject.readback().startswith(subject.good_image)
 
 
 def test_a_device_on_a_bus_is_not_flashed_without_being_asked_for(

@@ -294,7 +294,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
         )
     _check_files(chosen)
     if chosen.rerun_failed is not None:
-        chosen = _only_failed(chosen, chosen.rerun_failed)
+        chosen = _only_failed(chosen, chosen.rerun_failed, bench.device.name)
     wear = chosen.selection.wears(chosen.upgrades)
     if wear and not bench.is_simulated:
         named = ", ".join(f"{case_id} {count} times" for case_id, count in wear.items())
@@ -338,7 +338,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     return code
 
 
-def _only_failed(chosen: Choices, path: Path) -> Choices:
+def _only_failed(chosen: Choices, path: Path, target: str) -> Choices:
     """Select the cases that did not pass in a report. Raises UsageError when there is none, or when
     the report cannot be read.
     """
@@ -349,6 +349,12 @@ def _only_failed(chosen: Choices, path: Path) -> Choices:
             remedy="Leave out --case, --group, --exclude, --quick and --seed.",
         )
     report = read_report(path)
+    if report.target != target:
+        raise UsageError(
+            f"{printable(str(path))} is about the target {report.target}, not {target}.",
+            where="--rerun-failed",
+            remedy=f"Write -t {report.target}, or name another report.",
+        )
     failed = [case_id for case_id, each in verdicts_of(report).items() if each in _FAILED]
     if not failed:
         raise UsageError(

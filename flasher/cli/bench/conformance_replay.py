@@ -10,7 +10,7 @@ from flasher.cli.framework import argument, command, option
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output, counted
 from flasher.conformance.bench_options import BenchOptions
-from flasher.conformance.replay import ReplayResult
+from flasher.conformance.replay import ReplayResult, recording
 from flasher.conformance.replay import replay as replay_trace
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
@@ -45,19 +45,15 @@ def replay(output: Output, bus: Bus, bench: BenchOptions, *, trace: str, yes: bo
     """Send the frames of a recorded trace to a device again, and compare its answers: a fault from
     a bench or from the field, on new code.
     """
-    from flasher.conformance.results import RunStopped  # noqa: PLC0415  much is loaded
     from flasher.trace.reader import read_trace  # noqa: PLC0415
 
     bench = described(bench, bus)
-    frames = list(read_trace(trace))
+    recorded = recording(read_trace(trace), bench.device)
     if not bench.is_simulated:
         confirm_wear("the device is flashed, and gets all frames of the trace", is_agreed=yes)
     with opened(bench, output) as (subject, profile, stopped):
-        try:
-            found = replay_trace(subject, profile, frames, stopped=stopped)
-        except RunStopped:
-            output.error_line("it was stopped; the device may be in the middle of a transfer")
-            return ExitCode.INTERRUPTED
+        found = replay_trace(subject, profile, recorded, stopped=stopped)
+        was_stopped = stopped()
     output.result(
         f"{printable(found.subject)}: {counted(found.frames_sent, 'frame')} sent, "
         f"{counted(found.messages_recorded, 'message')} of the device in the trace"
@@ -65,10 +61,7 @@ def replay(output: Output, bus: Bus, bench: BenchOptions, *, trace: str, yes: bo
     for each in found.differences:
         output.results(printable(f"- {text}") for text in each.recorded)
         output.results(printable(f"+ {text}") for text in each.answered)
-    if found.trouble:
-        output.result(printable(found.trouble))
-    is_same = not (found.differences or found.trouble)
-    output.result(
-        "the device answers as in the trace" if is_same else "the device answers differently"
-    )
-    return output.document(found, exit_code=ExitCode.OK if is_same else ExitCode.PARTIAL)
+    differs = "differently" if found.differences else "as in the trace"
+    output.result(printable(found.trouble) or f"the device answers {differs}")
+    code = ExitCode.PARTIAL if found.differences or found.trouble else ExitCode.OK
+    return output.document(found, exit_code=ExitCode.INTERRUPTED if was_stopped else code)

@@ -85,7 +85,7 @@ def serve(
     """Run a simulated device until the user stops it or `is_over`. It survives a lost adapter, and
     with `crashes` its own FlasherErrors, each reported once.
     """
-    clock, crash = connection.clock, ""
+    clock, reported = connection.clock, ""
     while True:
         try:
             drive(
@@ -104,9 +104,11 @@ def serve(
         except FlasherError as error:
             if not crashes or isinstance(error, UsageError):
                 raise
-            if crash != (crash := f"{error.what} {error.cause}"):
-                cause = f" ({printable(error.cause)})" if error.cause else ""
-                output.error_line(f"warning: {printable(error.what)}{cause}; the device restarts")
+            cause = f" ({printable(error.cause)})" if error.cause else ""
+            text = f"warning: {printable(error.what)}{cause}; the device restarts"
+            if text != reported:
+                reported = text
+                output.error_line(text)
         else:
             return
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import select
 import signal
 import tempfile
@@ -174,6 +173,8 @@ class BootloaderProcess:
             # The suite handles Ctrl-C and signals to the process group, and ends this process.
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 signal.signal(number, signal.SIG_IGN)
+            import resource  # noqa: PLC0415  Windows has none, and no bootloader under test
+
             signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
             resource.setrlimit(resource.RLIMIT_FSIZE, (_FILE_MAX_SIZE, _FILE_MAX_SIZE))
             os.dup2(self._stderr.fileno(), _STDERR)

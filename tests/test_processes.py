@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from flasher.station.children import signals_blocked
+from flasher.processes import signals_blocked
 
 HEARS = """
 import signal, sys
