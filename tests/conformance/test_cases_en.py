@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+from flasher.conformance.catalogue import Selection
+from flasher.conformance.mock import MockSubject, device_maker
 from flasher.conformance.results import CaseVerdict
+from flasher.conformance.runner import run
+from flasher.mock.model import AnyMessage, MockDevice
+from flasher.protocol import messages
+from flasher.protocol.spec import Command
 from tests.loops import each
 
+from .bench import PROFILE
 from .verdicts import cases_of, not_passed, verdicts
 
 CASES = ("EN-01", "EN-02", "EN-04", "EN-07", "EN-08")
@@ -60,3 +67,24 @@ def test_without_a_second_image_the_rest_of_a_row_of_upgrades_is_judged() -> Non
         "EN-07": CaseVerdict.PASS_IN_PART,
         "EN-08": CaseVerdict.UNSUPPORTED,
     }
+
+
+class _CompletesAfterRefusing(MockDevice):
+    """Refuses an end mark other than 04, and then takes it all the same."""
+
+    def _take_row(self, row: AnyMessage, now: float) -> None:
+        if isinstance(row, messages.Malformed) and row.message.command == Command.END_OF_TRANSFER:
+            self._send(messages.Nak(1))
+            super()._take_row(messages.EndOfTransfer(), now)
+        else:
+            super()._take_row(row, now)
+
+
+def test_an_end_mark_that_is_refused_and_then_taken_fails() -> None:
+    subject = MockSubject(make_device=device_maker(_CompletesAfterRefusing))
+    selection = Selection(cases=("EN-02",))
+    report = run(subject, PROFILE, selection=selection)
+    failure = report.results[0].first_failure
+    assert failure is not None
+    assert failure.step.startswith("end of transfer with")
+    assert "complete" in failure.got

@@ -18,7 +18,7 @@ _WRONG_MARKS: Final = (
     *(mark for mark in (*range(0x20), 0xFF) if mark not in (_MARK, *_FLIPPED_MARKS)),
 )
 """Values to send in place of 04: each flipped bit, every control character."""
-_SILENT_MARKS: Final = 7
+_SILENT_MARKS: Final = 18
 """Values that a device which ignores the first one gets between two waits."""
 _UPGRADE_KINDS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
 """Possible answers to end of transfer; a starting application may send other reports."""
@@ -83,7 +83,7 @@ def end_early_and_twice(bench: Bench) -> None:
             # A NAK of any number (R6) and no other message.
             bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
             bench.judge.note_stimulus(heard=True)
-            bench.expect_silence(QUIET_S, ignoring=(Reply.BOOT_VERSION,))
+            bench.expect_silence(bench.limit("ack_s"), ignoring=(Reply.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
             reply = bench.wait_for(Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
             if str(reply) == f"ACK {stored + 1}":
@@ -112,9 +112,10 @@ def _check_wrong_marks(bench: Bench, image: bytes) -> None:
                 bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
             kinds = (*_UPGRADE_KINDS, Reply.BOOT_VERSION)
             reply = bench.wait_for(*kinds, within_s=bench.limit("ack_s"))
-            ok = reply is None or reply.kind not in (Reply.COMPLETE, Reply.ACK)
-            bench.require(ok, "rejected", reply or "silence")
-        if reply is None or reply.kind not in (Reply.NAK, Reply.BOOT_VERSION):
+            answers = [] if reply is None else [reply, *bench.collect(QUIET_S)]
+            ok = not any(one.kind in (Reply.COMPLETE, Reply.ACK) for one in answers)
+            bench.require(ok, "rejected", describe(answers))
+        if not any(one.kind in (Reply.NAK, Reply.BOOT_VERSION) for one in answers):
             size = _SILENT_MARKS
             continue
         bench.send_packet(image, total)
@@ -139,9 +140,10 @@ def _restart_transfer(
 
 def _check_second_end(bench: Bench, first_answer: Reply) -> None:
     """Send end of transfer again, immediately after its answer, and check the second answer."""
-    bench.send(bench.encoder.end())
+    sent = bench.send(bench.encoder.end())
     reply = bench.wait_for(*_UPGRADE_KINDS, within_s=bench.limit("complete_s"))
-    replies = [] if reply is None else [reply, *bench.collect(QUIET_S)]
+    quiet_s = max(QUIET_S, sent.left_at + bench.limit("ack_s") - bench.now)
+    replies = [] if reply is None else [reply, *bench.collect(quiet_s)]
     answers = [one for one in replies if one.kind in _UPGRADE_KINDS]
     # A running application may send general feedback to an unknown message (R17).
     silence: list[list[Reply]] = [[], [Reply.FEEDBACK]]
