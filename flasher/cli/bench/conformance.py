@@ -604,8 +604,8 @@ def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
     help="where the two files are written (default: here)",
 )  # fmt: skip
 def header(output: Output, *, folder: Path) -> int:
-    """Write the two C files that make a bootloader a subject for --subject: flasher_dut.h, and
-    flasher_dut_process.c for one that is linked as a program.
+    """Write the two C files that make a bootloader a subject for --subject. The header is
+    flasher_dut.h; a bootloader that is linked as a program also needs flasher_dut_process.c.
     """
     names = ("flasher_dut.h", "flasher_dut_process.c")
     written = []

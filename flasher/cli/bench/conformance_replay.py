@@ -22,7 +22,8 @@ examples:
 
 The device gets its good image first, as at the beginning of each case, and at the end. The frames
 to the device are sent at their times in the trace, later where it takes longer to answer. Exit code
-12 when its answers differ; how often it announces itself is not compared.
+12 when its answers differ: - is a message of the trace that did not come, + one that came instead;
+how often the device announces itself is not compared.
 """
 
 
