@@ -128,6 +128,10 @@ class Case:
     largest: int = 0
     """Adds the time of this many upgrades to the largest image."""
 
+    def choices_in(self, profile: ConformanceProfile) -> dict[str, str]:
+        """The choices that decide its verdict, as this profile states them."""
+        return {key: profile.choice(key) for key in self.choices}
+
     def limit_with(self, profile: ConformanceProfile, subject: Subject) -> float:
         """Time limit of the case for this device, on the bench's clock."""
         waits = Waits(profile, subject.port.bitrate_bps)
@@ -190,7 +194,7 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
         case.stimulus,
         case.expectation,
         tuple(sorted(need.value for need in case.requires)),
-        {key: profile.choice(key) for key in case.choices},
+        case.choices_in(profile),
         deviation,
     )
 

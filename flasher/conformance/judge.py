@@ -6,11 +6,13 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import ceil, inf
+from types import MappingProxyType
 from typing import Final
 
+from flasher.conformance.profile_time import limits_of
 from flasher.conformance.results import CaseStopped, CaseVerdict, Check, CheckOutcome, MeasuredTime
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Received, Reply, describe
@@ -34,9 +36,14 @@ class TimeName:
 
 
 class Judge:
-    """Judges the messages that the tester of a case receives."""
+    """Judges the messages that the tester of a case receives. `choices` are those of the profile
+    that decide the verdict.
+    """
 
-    def __init__(self, tester: BusTester) -> None:
+    def __init__(
+        self, tester: BusTester, choices: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
+        self._choices = choices
         self.checks: list[Check] = []
         self.measurements: list[MeasuredTime] = []
         self.infos: list[str] = []
@@ -72,9 +79,18 @@ class Judge:
 
     # -- checks -----------------------------------------------------------------------------------
 
-    def check(self, ok: bool, expected: str, got: object) -> bool:  # noqa: FBT001
-        """Record a check; returns `ok`."""
-        self._record(CheckOutcome.PASS if ok else CheckOutcome.FAIL, expected, str(got))
+    def check(
+        self,
+        ok: bool,  # noqa: FBT001
+        expected: str,
+        got: object,
+        *,
+        by: Mapping[str, float] | None = None,
+    ) -> bool:
+        """Record a check; returns `ok`. `by` are the profile keys that decide it (default: the
+        choices of the case, and the limits of the last wait if no message came in it).
+        """
+        self._record(CheckOutcome.PASS if ok else CheckOutcome.FAIL, expected, str(got), by)
         return ok
 
     def require(self, ok: bool, expected: str, got: object) -> None:  # noqa: FBT001
@@ -194,9 +210,10 @@ class Judge:
         got = f"{value_s * 1000:.1f} ms"
         if any(abs(value_s - limit) < unsure_s for limit in limits):
             got = f"{got} +- {unsure_s * 1000:.1f} ms"
-            self._record(CheckOutcome.INCONCLUSIVE, expected, got)
+            self._record(CheckOutcome.INCONCLUSIVE, expected, got, limits_of(*limits))
             return
-        self.check(low_s <= value_s and (high_s is None or value_s <= high_s), expected, got)
+        ok = low_s <= value_s and (high_s is None or value_s <= high_s)
+        self.check(ok, expected, got, by=limits_of(*limits))
 
     def check_measured(self, name: str, *, low_s: float = 0.0, high_s: float | None = None) -> None:
         """Judge all recorded times of this name in one check that reports their distribution. Fails
@@ -216,13 +233,24 @@ class Judge:
             outcome = CheckOutcome.INCONCLUSIVE
         else:
             outcome = CheckOutcome.PASS
-        self._record(outcome, expected, f"{_spread(values_s)} +- {unsure_s * 1000:.1f} ms")
+        got = f"{_spread(values_s)} +- {unsure_s * 1000:.1f} ms"
+        self._record(outcome, expected, got, limits_of(low_s, high_s or 0.0))
 
-    def _record(self, outcome: CheckOutcome, expected: str, got: str) -> None:
+    def _record(
+        self,
+        outcome: CheckOutcome,
+        expected: str,
+        got: str,
+        by: Mapping[str, float] | None = None,
+    ) -> None:
         is_first = all(check.outcome is not CheckOutcome.FAIL for check in self.checks)
         if outcome is CheckOutcome.FAIL and is_first and self._tester.stalled_s:
             self.stall = f"this program stalled for {self._tester.stalled_s * 1000:.0f} ms"
-        self.checks.append(Check(self._step, outcome, expected, got, self._tester.elapsed_s))
+        judged_by: dict[str, str | float] = {}
+        if outcome in (CheckOutcome.FAIL, CheckOutcome.INCONCLUSIVE):
+            judged_by |= {**self._choices, **self._tester.expired} if by is None else by
+        at_s = self._tester.elapsed_s
+        self.checks.append(Check(self._step, outcome, expected, got, at_s, judged_by))
 
 
 def _spread(ranked_s: Sequence[float]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from flasher.conformance.profile_time import limits_of
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
 from flasher.conformance.wire import MEMORY_BYTES, Received, Reply, packet_count, reported_version
@@ -81,6 +82,7 @@ class PatientHost:
             while unanswered and tester.wait_for(kind, within_s=late_s) is not None:
                 unanswered -= 1
             return reply
+        tester.expired = limits_of(within_s)
         return None
 
     def application_runs(self, within_s: float | None = None) -> bool:
@@ -106,6 +108,7 @@ class PatientHost:
                     start_s = self._profile.limit("start_s") if runs else _SETTLE_S
                     tester.wait(tester.waits.burst_s + start_s)
                     tester.forget()
+                tester.expired = {} if runs else limits_of(limit_s)
                 return runs
             # The reset may have started a burst (RS-02), which another reset would restart.
             quiet_s = self._tester.waits.burst_s + _SETTLE_S

@@ -24,6 +24,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from flasher.conformance.profile_time import ProfileTime
 from flasher.conformance.wire import IMAGE_BYTES_MAX, RESET, RESET_TEXT
 from flasher.errors import Fault, did_you_mean, printable
 from flasher.files import read_toml
@@ -237,8 +238,10 @@ class ConformanceProfile:
         return self.choice(name) in (word, "either")
 
     def limit(self, name: str) -> float:
-        """Time `name` of the table `limits` ("erase_s"), in seconds."""
-        return float(self.value(f"limits.{name}"))
+        """Time `name` of the table `limits` ("erase_s"), in seconds; a `ProfileTime`."""
+        path = f"limits.{name}"
+        value_s = float(self.value(path))
+        return ProfileTime(value_s, {path: value_s})
 
     def number(self, name: str) -> int:
         """Number `name` of the table `device` ("largest_image_bytes")."""

@@ -70,10 +70,24 @@ class Check:
     expected: str
     got: str
     at_s: float
+    judged_by: Mapping[str, str | float] = field(default_factory=dict)
+    """Profile keys that decide a check which did not pass, with their values: the choices of its
+    case, and the limits of a wait without an answer or of a time.
+    """
+
+    @property
+    def expected_by(self) -> str:
+        """The expected result, with the profile keys that decide it."""
+        values = {
+            key: value if isinstance(value, str) else f"{value:g}"
+            for key, value in self.judged_by.items()
+        }
+        keys = ", ".join(f"{key} = {value}" for key, value in values.items())
+        return f"{self.expected} (profile: {keys})" if keys else self.expected
 
     def __str__(self) -> str:
         step = f"{self.step}: " if self.step else ""
-        return f"{step}expected {self.expected}; got {self.got}"
+        return f"{step}expected {self.expected_by}; got {self.got}"
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     except RunStopped as ended:
         return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))
     except (CaseLimitReached, DeviceCrashed) as ended:
-        bench.fail("the case is completed", ended)
+        bench.check(False, "the case is completed", ended, by={})  # noqa: FBT003
         return CaseEnd(CaseVerdict.FAIL, str(ended))
     except BusError as error:
         stop = f"the adapter failed in {case.id}: {error.what}"
@@ -242,6 +242,7 @@ class SuiteRun:
             seed=seed,
             stopped=self._must_stop,
             upgrades=self._options.upgrades or WEAR.get(case.id, 0),
+            choices=case.choices_in(self._profile),
         )
         verdict, note, self.stopped = execute(case, bench)
         self._adapter_failed = bool(self.stopped) and verdict is CaseVerdict.ERROR

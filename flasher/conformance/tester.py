@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -15,6 +15,7 @@ from math import inf
 from typing import Final, NamedTuple
 
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.profile_time import limits_of
 from flasher.conformance.results import CaseLimitReached, RunStopped, TraceEntry
 from flasher.conformance.subject import BusPort
 from flasher.conformance.waits import Waits
@@ -115,6 +116,10 @@ class BusTester:
         """Set by cases that need `Reply.APPLICATION`, which otherwise only appears in the
         trace.
         """
+        self.expired: Mapping[str, float] = {}
+        """Limits of the profile that the last wait since the last message was sent lasted for; none
+        when a message arrived in it.
+        """
         self.frames_sent = 0
         self.frames_received = 0
         self.left_at = self.began_at
@@ -189,6 +194,7 @@ class BusTester:
             self.wait_until(at)
         began_at = self.now
         self._stalled_s = 0.0
+        self.expired = {}
         raw = b"".join(frame.data for frame in frames if frame.can_id == self.encoder.to_device)
         if writes := len(_NO_READ.findall(raw)):
             self._feedback_due += writes
@@ -238,8 +244,10 @@ class BusTester:
         deadline = self.now + within_s + self.port.uncertainty_s
         while not self._received:
             if self.now >= deadline:
+                self.expired = limits_of(within_s)
                 return None
             self._pump(deadline)
+        self.expired = {}
         return self._received.popleft()
 
     def wait_for(
@@ -265,6 +273,7 @@ class BusTester:
         """Return the messages received so far and in the next `for_s`."""
         self.wait(for_s)
         found = list(self._received)
+        self.expired = {} if found else limits_of(for_s)
         self._received.clear()
         return found
 
@@ -295,7 +304,7 @@ class BusTester:
         if self._stopped():
             raise RunStopped("the run was stopped")
         self._note_stall(self._left_port_at)
-        until = min(deadline, self.ends_at, now + _POLL_S)
+        until = float(min(deadline, self.ends_at, now + _POLL_S))
         arrival = self.port.receive(until)
         self._left_port_at = self.port.now()
         if arrival is None:

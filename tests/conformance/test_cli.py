@@ -50,7 +50,8 @@ def test_a_failure_has_one_line_with_expected_got_and_a_command_that_repeats_it(
     run = flasher(*WRONG, "--seed", "a b", "--junit", "/dev/null")
     assert run.code == 12
     (line,) = (line for line in run.out.splitlines() if line.startswith("FAIL RS-01"))
-    assert "expected boot version; got nothing within" in line
+    keys = "(profile: device.versions = 4, limits.version_spacing_s = 0.05)"
+    assert f"expected boot version {keys}; got nothing within" in line
     command = shlex.split(line.partition("replay: ")[2])
     assert command[:2] == ["flasher", "conformance"]
     assert "--junit" not in command
@@ -131,7 +132,8 @@ def test_a_terminal_shows_which_case_runs_and_what_fails_at_once(
     run = flasher(*WRONG)
     assert f"RS-04 {CASES['RS-04'].title}" in run.err
     assert "after RS-01" in run.err
-    assert "RS-01 fail: expected boot version; got nothing within 0.2 s (1 left)" in run.err
+    assert "RS-01 fail: expected boot version (profile: device.versions = 4" in run.err
+    assert "; got nothing within 0.2 s (1 left)" in run.err
     assert "0/2 " in run.err
 
 

@@ -104,12 +104,15 @@ def _case_lines(
     among `crashes` yet, also all that the bootloader printed.
     """
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
-    reason = result.reason
+    reason, failure = result.reason, result.first_failure
+    limit = _TEXT_LIMIT
+    if failure is not None:  # the profile keys in it take no room from the rest
+        limit += len(failure.expected_by) - len(failure.expected)
     if result.verdict is CaseVerdict.DEVIATION:
         reason = f"{reason} (profile: {text.deviation})"
     head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
     replay = f" | replay: {result.replay}" if result.replay else ""
-    yield printable(f"{head}: {_short(reason)}") + replay
+    yield printable(f"{head}: {_short(reason, limit)}") + replay
     crash, *printed = result.reason.split(LINE_JOINT)
     place = _ADDRESS.sub("", crash)
     if printed and place not in crashes:

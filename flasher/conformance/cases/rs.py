@@ -48,6 +48,7 @@ _LONG_STAY_S: Final = 4320.0
     stimulus="reset to the running application",
     expectation="general feedback, then boot version 4 times, 50 ms apart",
     requires={TIMING},
+    choices=("device.versions",),
 )
 def reset(bench: Bench) -> None:
     with bench.tester.collecting_feedback():
@@ -65,7 +66,7 @@ def reset(bench: Bench) -> None:
     clause="Welling 5.1, figure 2 (begin); R18",
     stimulus="two resets in a row; reset after the second boot version",
     expectation="one clean restart; inside the bootloader as the profile says (rs_02)",
-    choices=("rs_02",),
+    choices=("rs_02", "device.versions"),
 )
 def reset_again(bench: Bench) -> None:
     count = bench.number("versions")

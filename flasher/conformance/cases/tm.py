@@ -28,7 +28,7 @@ _PATIENCE: Final = 3
     stimulus="packets with gaps between their frames, from 0 to just below the inter-frame timeout",
     expectation="accepted up to it (tm_02)",
     requires={DESTRUCTIVE, TIMING},
-    choices=("tm_02",),
+    choices=("tm_02", "limits.inter_frame_s"),
 )
 def gaps(bench: Bench) -> None:
     limit_s = bench.limit("inter_frame_s")

@@ -292,6 +292,7 @@ def wrong_start_byte(bench: Bench) -> None:
     expectation="every packet is accepted and stored at its place; the second image runs",
     requires={DESTRUCTIVE, LONG},
     largest=2,
+    choices=("device.largest_image_bytes",),
 )
 def many_packets(bench: Bench) -> None:
     if needs_power(bench.profile) and not bench.subject.has_power:
@@ -397,7 +398,7 @@ def other_filler(bench: Bench) -> None:
     "packets and before the end; a transfer of more than 66 s without a pause",
     expectation="announces again or keeps waiting (tx_12); reachable; the long transfer continues",
     requires={DESTRUCTIVE, LONG},
-    choices=("tx_12",),
+    choices=("tx_12", "limits.pause_s"),
     upgrades=80,
 )
 def pause(bench: Bench) -> None:

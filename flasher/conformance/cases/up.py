@@ -42,6 +42,7 @@ _MANY: Final = 24
     stimulus="update command for 1, 127, 128, 129, 78351 bytes and the largest image",
     expectation="request transfer within the erase limit; the packets of that size are accepted",
     requires={DESTRUCTIVE, LONG},
+    choices=("device.largest_image_bytes",),
 )
 def sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
@@ -68,7 +69,7 @@ def sizes(bench: Bench) -> None:
     "of the good image with a bit more beyond the largest image",
     expectation="rejected before anything is erased: the old application starts",
     requires={DESTRUCTIVE},
-    choices=("up_02",),
+    choices=("up_02", "device.largest_image_bytes"),
 )
 def wrong_sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
@@ -112,7 +113,7 @@ def without_reset(bench: Bench) -> None:
     expectation="accepted inside the window; between the announcements and after the window as the "
     "profile says (up_04_burst, up_04)",
     requires={DESTRUCTIVE, TIMING},
-    choices=("up_04", "up_04_burst"),
+    choices=("up_04", "up_04_burst", "limits.window_s"),
 )
 def window(bench: Bench) -> None:
     count = bench.number("versions")
