@@ -37,6 +37,10 @@ AREA_BYTES: Final = 80 * 1024
 """Smaller than the mock's own, since the largest image is sent often; larger than 16 bits tell."""
 _RUN: Final = [case_id for case_id in catalogue_order(CASES) if case_id not in WEAR]
 """A whole run, of cases that need not be named."""
+NOT_OF_MODEL: Final = {
+    "PW-04": "the model's flash does not fail; shown by bugs 91 to 93 planted in the example in C"
+}
+"""Cases that need a compiled bootloader, with what shows that they detect a mistake."""
 _COUNTING: Final = frozenset({"hangs-at-20th-update"})
 """Which case meets the fault depends on those before it."""
 _CAUGHT: Final = frozenset({CaseVerdict.FAIL, CaseVerdict.ERROR})
@@ -113,6 +117,7 @@ def document(rows: Iterable[Row]) -> str:
     lines += ["", "## By case", "", "| case | title | caught |", "|---|---|---|"]
     for case_id in _RUN:
         caught = ", ".join(row.variant for row in rows if case_id in row.fails)
+        caught = NOT_OF_MODEL.get(case_id, caught)
         lines.append(f"| {case_id} | {CASES[case_id].title} | {caught} |")
     lines += ["", "## Not seen", ""]
     lines += [f"- {name}: {one.unseen}." for name, one in VARIANTS.items() if one.unseen]

@@ -84,6 +84,8 @@ class Requirement(Enum):
     """Forces the device's CAN controller into bus-off."""
     TIMED_CUT = "timed-cut"
     """Cuts the power at the moment of a flash operation or a frame."""
+    FAILING_FLASH = "failing-flash"
+    """Makes calls of the flash driver fail."""
     SECOND_IMAGE = "second-image"
     """Needs a second good image, smaller than the first one."""
     CHECKSUM = "checksum"
@@ -260,6 +262,10 @@ MISSING_ON_BARE_BENCH: Final = {
     Requirement.SECOND_IMAGE: ("a second good image", "--second-image"),
     Requirement.BUS_OFF: ("a way to make the device go bus-off", _SIMULATED),
     Requirement.TIMED_CUT: ("power cuts at the moment of a flash operation or a frame", _SIMULATED),
+    Requirement.FAILING_FLASH: (
+        "flash memory that can be made to fail",
+        "--subject, with the current files of `flasher conformance header`",
+    ),
     Requirement.ERROR_FRAMES: ("an adapter that sends error frames", _SIMULATED),
 }
 """Equipment missing on a bench of device, adapter and good image: text, and the option that adds
@@ -306,6 +312,7 @@ def missing_requirements(subject: Subject, profile: ConformanceProfile) -> list[
         Requirement.SECOND_IMAGE: subject.second_image is not None,
         Requirement.BUS_OFF: subject.has_bus_off,
         Requirement.TIMED_CUT: subject.has_timed_cuts,
+        Requirement.FAILING_FLASH: subject.flash_faults is not None,
         Requirement.ERROR_FRAMES: subject.port.sends_error_frames,
         Requirement.CHECKSUM: profile.choice("en_04") != "none",
         Requirement.VERSION: reported_version(subject.target, subject.good_image) is not None,

@@ -13,7 +13,15 @@ from types import MappingProxyType
 from typing import Final
 
 from flasher.conformance.profile_time import limits_of
-from flasher.conformance.results import CaseStopped, CaseVerdict, Check, CheckOutcome, MeasuredTime
+from flasher.conformance.results import (
+    CaseLimitReached,
+    CaseStopped,
+    CaseVerdict,
+    Check,
+    CheckOutcome,
+    DeviceCrashed,
+    MeasuredTime,
+)
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Received, Reply, describe
 
@@ -49,6 +57,8 @@ class Judge:
         self.infos: list[str] = []
         self.stall = ""
         """How this program stalled in the wait of the first failed check; "" when it did not."""
+        self.ended_in = ""
+        """The step in which the device crashed or the case ran out of time."""
         self._tester = tester
         self._step = ""
         self._stimuli = self._heard = self._unanswered = 0
@@ -74,6 +84,9 @@ class Judge:
         before, self._step = self._step, f"{self._step}, {name}" if self._step else name
         try:
             yield
+        except (CaseLimitReached, DeviceCrashed):
+            self.ended_in = self.ended_in or self._step
+            raise
         finally:
             self._step = before
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from flasher.bus.link import Clock, Link, StampingLink
 from flasher.conformance.results import Unsupported
-from flasher.conformance.subject import Arrival
+from flasher.conformance.subject import Arrival, FlashFaults
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.files import read
@@ -103,6 +103,7 @@ class RealSubject:
 
     has_bus_off = False
     has_timed_cuts = False
+    flash_faults: FlashFaults | None = None
 
     def __init__(
         self,

@@ -137,7 +137,8 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     except RunStopped as ended:
         return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))
     except (CaseLimitReached, DeviceCrashed) as ended:
-        bench.check(False, "the case is completed", ended, by={})  # noqa: FBT003
+        with bench.step(bench.judge.ended_in):
+            bench.check(False, "the case is completed", ended, by={})  # noqa: FBT003
         return CaseEnd(CaseVerdict.FAIL, str(ended))
     except BusError as error:
         stop = f"the adapter failed in {case.id}: {error.what}"

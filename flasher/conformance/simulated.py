@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.results import DeviceCrashed
-from flasher.conformance.subject import SIMULATED_BUS, Arrival
+from flasher.conformance.subject import SIMULATED_BUS, Arrival, FlashFaults
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, FlasherError
 from flasher.protocol.frame import Frame
@@ -84,6 +84,7 @@ class SimulatedSubject(Generic[DeviceT]):
     """A simulated device as a subject. Without `good_image` it uses both images of `own`."""
 
     has_power = has_readback = has_bus_off = has_timed_cuts = True
+    flash_faults: FlashFaults | None = None
 
     def __init__(
         self,

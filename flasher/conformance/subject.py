@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from enum import Enum
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from flasher.conformance.wire import Encoder, RawFrame
@@ -48,6 +50,45 @@ class BusPort(Protocol):
         """The next frame, or None at `deadline`."""
 
 
+class FlashCall(Enum):
+    """A call of the flash driver."""
+
+    READ = "read"
+    ERASE = "erase"
+    WRITE = "write"
+
+
+class FlashEffect(Enum):
+    """What is wrong with a call of the flash driver."""
+
+    ERROR = "reports an error, once"
+    WORN_SECTOR = "reports an error, as do all later ones of its sector"
+    WRONG_BIT = "has a wrong bit, without an error"
+    """A bit that stays 1 in each write, or is read wrong once."""
+
+
+class FlashFault(NamedTuple):
+    """Call number `number` (from 0, of its kind) of the flash driver fails."""
+
+    call: FlashCall
+    number: int
+    effect: FlashEffect
+
+
+class FlashFaults(Protocol):
+    """Makes the flash memory of a device fail."""
+
+    failed_at: float | None
+    """Time of the call that failed first; None before it."""
+
+    @property
+    def calls(self) -> Mapping[FlashCall, int]:
+        """Calls since `fail`."""
+
+    def fail(self, fault: FlashFault | None) -> None:
+        """Make one call fail, or none; calls are counted from now on."""
+
+
 class Subject(Protocol):
     """The device under test. Unavailable operations raise `Unsupported`."""
 
@@ -64,6 +105,8 @@ class Subject(Protocol):
     has_readback: bool
     has_bus_off: bool
     has_timed_cuts: bool
+    flash_faults: FlashFaults | None
+    """None when its flash cannot be made to fail."""
 
     @property
     def port(self) -> BusPort:

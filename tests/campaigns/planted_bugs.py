@@ -36,7 +36,7 @@ RUNS: Final = {
 """The arguments of the suite: the quick cases with the default profile, and all cases with that of
 the example."""
 _RUN_MAX_S: Final = 900
-_DUT: Final = Path(__file__).parents[2] / "flasher" / "conformance" / "dut"
+DUT: Final = Path(__file__).parents[2] / "flasher" / "conformance" / "dut"
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Outcome:
 def try_out(bug: Bug, folder: Path, runs: Sequence[str]) -> Outcome:
     """Some runs of the suite on a build with sanitizers."""
     sources = plant(bug, folder)
-    make("host", sources / "build", f"DUT={_DUT}", source=sources)
+    make("host", sources / "build", f"DUT={DUT}", source=sources)
     began = time.perf_counter()
     found = {run: _failures(sources / "build" / "boot", RUNS[run]) for run in runs}
     shutil.rmtree(sources)

@@ -6,16 +6,18 @@ import dataclasses
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import zlib
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.dut import CanFrame, Facts
-from flasher.conformance.dut.pipes import FACTS, HEADER, PipeMessage
+from flasher.conformance.dut import CanFrame, Facts, Host
+from flasher.conformance.dut.pipes import ABI, FACTS, HEADER, PipeMessage
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import run
@@ -154,6 +156,41 @@ class ErasesForEach(PythonBootloader):
         super()._begin(size)
 
 
+class ClaimsToHandleErrors(PythonBootloader):
+    """Ignores what the flash reports, like the bootloader for the older interface."""
+
+    facts = dataclasses.replace(PythonBootloader.facts, abi=2)
+
+
+class HandlesErrors(ClaimsToHandleErrors):
+    """Rejects an image that the flash does not hold."""
+
+    def start(self, host: Host, cause: int) -> None:
+        super().start(host, cause)
+        self._received = b""
+
+    def _begin(self, size: int) -> None:
+        super()._begin(size)
+        self._received = b""
+
+    def _store(self, data: bytes) -> None:
+        before = self._stored
+        super()._store(data)
+        if self._stored > before:
+            self._received += data[5:][: self._size - before * 128]
+
+    def _end(self) -> None:
+        if self.host.flash_read(0x1000, self._size) == self._received:
+            check = zlib.crc32(self._received)
+            record = struct.pack("<IIII", 0x600DC0DE, self._size, check, 0)
+            if self.host.flash_write(0, record) and self._is_whole():
+                self._send(b"\xc5\x02", bytes(2))
+                self._start_application()
+                return
+        self._nak()
+        self._stored, self._size, self._announced = -1, 0, 0
+
+
 def _run(subject: str, *cases: str) -> RunReport:
     with open_subject(subject, "bms", None, good_image=None, second_image=None) as (
         device,
@@ -173,6 +210,19 @@ def test_a_bootloader_that_follows_the_document_passes() -> None:
     report = _run(_HERE, "RS-01", "TX-01", "EN-07", "BU-02")
     assert [result.verdict for result in report.results] == [CaseVerdict.PASS] * 4
     assert report.ok
+
+
+def test_a_flash_that_fails_is_not_for_a_bootloader_of_the_older_interface() -> None:
+    (result,) = _run(_HERE, "PW-04").results
+    assert result.verdict is CaseVerdict.UNSUPPORTED
+    assert result.reason == "needs flash memory that can be made to fail"
+
+
+@pytest.mark.slow
+def test_one_that_ignores_errors_of_its_flash_fails_and_one_that_compares_passes() -> None:
+    assert "flash erase 1 of" in _failures(_run(_FLAWS + "ClaimsToHandleErrors", "PW-04"))
+    report = _run(_FLAWS + "HandlesErrors", "PW-04")
+    assert report.ok, _failures(report)
 
 
 def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_flash() -> None:
@@ -398,11 +448,31 @@ def test_a_library_in_the_working_directory_says_what_it_lacks(
 
 def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -> None:
     program = tmp_path / "boot"
-    facts = HEADER.pack(PipeMessage.FACTS.value, FACTS.size) + FACTS.pack(2, *8 * [0])
+    facts = HEADER.pack(PipeMessage.FACTS.value, FACTS.size) + FACTS.pack(ABI + 1, *8 * [0])
     program.write_text(f"#!{sys.executable}\nimport os\nos.write(1, {facts!r})\nos.read(0, 1)\n")
     program.chmod(0o755)
-    with pytest.raises(UsageError, match="built with version 2"):
+    with pytest.raises(UsageError, match=f"version {ABI + 1} .* this flasher has version {ABI}"):
         _run(str(program), "RS-01")
+
+
+_OF_ABI_1 = """
+import os, struct, sys
+def told(kind, data):
+    os.write(1, struct.pack("<B3xI", ord(kind), len(data)) + data)
+told("f", struct.pack("<9I", 1, 4096, 1024, 8, 0, 2048, 100, 10, 3))
+os.read(0, 8 + 12)
+told("e", struct.pack("<QI", 5, 0))
+answer = os.read(0, 64)
+told("l", repr(struct.unpack("<B3xIQ", answer)).encode())
+os._exit(4)
+"""
+
+
+def test_a_program_of_the_first_version_of_the_header_gets_its_answers(tmp_path: Path) -> None:
+    program = tmp_path / "boot"
+    program.write_text(f"#!{sys.executable}{_OF_ABI_1}")
+    program.chmod(0o755)
+    assert f"its last log lines: ({ord('k')}, 8, 105)" in _run(str(program), "RS-01").stopped
 
 
 def test_the_command_line_tests_it(flasher: Flasher) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaigns.planted_bugs import plant, read_bugs
+from tests.campaigns.planted_bugs import DUT, plant, read_bugs
 from tests.cli.conftest import Flasher
 from tests.examples.bootloader import PROFILE, emulated, make, missing
 
@@ -66,9 +66,42 @@ def test_every_planted_bug_applies(tmp_path: Path) -> None:
     """`python -m tests.campaigns.planted_bugs` builds them and runs the suite on them."""
     _need("patch")
     bugs = read_bugs()
-    assert [int(bug.name[:2]) for bug in bugs] == list(range(1, 91))
+    assert [int(bug.name[:2]) for bug in bugs] == list(range(1, 94))
     for bug in bugs:
         plant(bug, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("number", "step"),
+    [
+        ("91", "flash write 1 of 7 reports an error, once"),
+        ("92", "flash erase 1 of 60 reports an error, once"),
+        ("93", "flash write 1 of 7 has a wrong bit, without an error"),
+    ],
+)
+def test_a_bootloader_that_trusts_its_flash_fails_where_the_flash_does(
+    number: str, step: str, flasher: Flasher, tmp_path: Path
+) -> None:
+    _need("make", "gcc", "patch")
+    (bug,) = [bug for bug in read_bugs() if bug.name.startswith(number)]
+    sources = plant(bug, tmp_path)
+    make("host", tmp_path, f"DUT={DUT}", source=sources)
+    subject = ("--subject", tmp_path / "libboot.so", "--profile", PROFILE)
+    ran = flasher("conformance", "-t", "bms", *subject, "--case", "PW-04", "--json")
+    assert ran.code == 12
+    (result,) = ran.document["report"]["results"]
+    assert result["findings"][0]["step"] == step
+    assert ran.document["report"]["final_image"] == "verified"
+
+
+def test_a_flash_that_fails_is_no_trouble_for_the_example(flasher: Flasher, tmp_path: Path) -> None:
+    _need("make", "gcc")
+    make("host", tmp_path)
+    subject = ("--subject", tmp_path / "boot", "--profile", PROFILE)
+    ran = flasher("conformance", "-t", "bms", *subject, "--case", "PW-04", "--json")
+    assert ran.code == 0, ran.out
+    (result,) = ran.document["report"]["results"]
+    assert result["checks"]["passed"] > 30 * 3  # faults; what runs, a later upgrade and its image
 
 
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:

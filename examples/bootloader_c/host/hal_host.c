@@ -3,7 +3,6 @@
 #include "config.h"
 #include "flasher_dut.h"
 
-
 static const flasher_dut_facts facts = {
     .abi = FLASHER_DUT_ABI,
     .flash_bytes = APPLICATION_BYTES + SECTOR_BYTES,
@@ -40,14 +39,12 @@ void hal_flash_read(uint32_t offset, uint8_t *data, uint32_t size)
 
 bool hal_flash_erase(uint32_t offset)
 {
-    host->flash_erase(offset);
-    return true;
+    return host->flash_erase(offset) == 0;
 }
 
 bool hal_flash_write(uint32_t offset, const uint8_t *data, uint32_t size)
 {
-    host->flash_write(offset, data, size);
-    return true;
+    return host->flash_write(offset, data, size) == 0;
 }
 
 _Noreturn void hal_start_application(void)

@@ -1,5 +1,5 @@
-"""PW: power cuts. Whenever the power is cut, the device stays reachable and never starts a mixture
-of two images.
+"""PW: power cuts, and flash memory that fails. The device stays reachable all the same, and never
+starts a mixture of two images.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, Requirement, case
+from flasher.conformance.results import Unsupported
+from flasher.conformance.subject import FlashCall, FlashEffect, FlashFault, FlashFaults
 from flasher.conformance.wire import (
     PACKET_BYTES,
     PACKET_FRAMES,
@@ -35,6 +37,12 @@ _SHARES: Final = (0.0, 0.5, 1.0)
 """Before, halfway through and after a flash operation."""
 _OPERATIONS_MAX: Final = 24
 """Operations of one upgrade to cut; larger images only repeat similar ones."""
+_EFFECTS: Final = {
+    FlashCall.ERASE: (FlashEffect.ERROR, FlashEffect.WORN_SECTOR),
+    FlashCall.WRITE: (FlashEffect.ERROR, FlashEffect.WORN_SECTOR, FlashEffect.WRONG_BIT),
+    FlashCall.READ: (FlashEffect.WRONG_BIT,),
+}
+"""How each call of the flash driver can fail."""
 
 
 class _Cut(NamedTuple):
@@ -134,6 +142,37 @@ def second_cut(bench: Bench) -> None:
             bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     _check_upgrade(bench, upgrade)
+
+
+@case(
+    "PW-04",
+    "flash memory that fails",
+    clause="Welling 5.1, figure 2 (end); R7; R14; R19",
+    stimulus="upgrades in which an erase or write of the flash reports an error, once or in a "
+    "worn-out sector, or in which a bit stays 1 without an error or is read wrong once: the first "
+    "two calls of each kind, the middle one and the last two; then an upgrade without a fault",
+    expectation="complete only when the flash holds the image and it starts, else any answer or "
+    "none; only complete images run, and the device can be upgraded without the fault",
+    requires={DESTRUCTIVE, POWER, LONG, Requirement.READBACK, Requirement.FAILING_FLASH},
+    upgrades=200,
+)
+def failing_flash(bench: Bench) -> None:
+    faults = bench.subject.flash_faults
+    if faults is None:
+        raise Unsupported("the flash of the device cannot be made to fail")
+    upgrade = _upgrade(bench)
+    with bench.step("without a fault"):
+        faults.fail(None)
+        bench.start_transfer(len(upgrade.new))
+        bench.finish(upgrade.new)
+        count = dict(faults.calls)
+        bench.check_upgrade()
+    for call, effects in _EFFECTS.items():
+        total = count.get(call, 0)
+        for number in sorted({0, 1, total // 2, total - 2, total - 1}.intersection(range(total))):
+            for effect in effects:
+                with bench.step(f"flash {call.value} {number + 1} of {total} {effect.value}"):
+                    _fail(bench, faults, FlashFault(call, number, effect))
 
 
 # -- the cuts -------------------------------------------------------------------------------------
@@ -488,3 +527,49 @@ def _check_cuts(
         bench.collect(bench.waits.burst_s)
         bench.check_image(upgrade.new)
     return was_cut
+
+
+# -- a failing flash ------------------------------------------------------------------------------
+
+
+def _fail(bench: Bench, faults: FlashFaults, fault: FlashFault) -> None:
+    """Attempt an upgrade with a fault of the flash, check what runs, and upgrade without it."""
+    upgrade = _InterruptedUpgrade(bench.good_image, bench.subject.second_image or bench.good_image)
+    upgrade.end_was_sent = True
+    faults.fail(fault)
+    try:
+        is_success = _attempt(bench, faults, upgrade.new)
+        if is_success and not bench.is_kept_aside(upgrade.new):
+            bench.check_stored(upgrade.new)  # before it starts
+        bench.wait(bench.waits.restart_s)
+    finally:
+        faults.fail(None)
+    bench.power_cycle(_OFF_S)
+    bench.wait_for(Reply.BOOT_VERSION)  # without one: RS-05
+    bench.collect(bench.waits.burst_s)
+    if is_success and fault.call is not FlashCall.READ:
+        bench.check_image(upgrade.new)
+        upgrade.runs = True
+    else:
+        if is_success:
+            upgrade.old = upgrade.new
+        upgrade.runs = _check_whole(bench, upgrade)
+    if not upgrade.runs:
+        bench.power_cycle(_OFF_S)
+    with bench.step("afterwards"):
+        again = bench.upgrade(bench.good_image, reset=upgrade.runs)
+        bench.require(again.ok, "the device can be upgraded", again.reason or "it was")
+        bench.check_image(bench.good_image)
+
+
+def _attempt(bench: Bench, faults: FlashFaults, image: bytes) -> bool:
+    """Upgrade the running application; True when the device reported success after the fault."""
+    bench.reset_to_bootloader()
+    bench.wait_until_listening()
+    sent = bench.send(bench.encoder.update(len(image)))
+    reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
+    if reply is None or reply.kind is not Reply.REQUEST or not bench.host.transfer(image).ok:
+        return False
+    # What fails after complete (a swap of banks) cannot change the answer.
+    answered_at = bench.now - bench.tester.wire_s(bench.encoder.end())
+    return faults.failed_at is not None and faults.failed_at < answered_at

@@ -36,13 +36,18 @@ class _ProcessHost:
         self._pipe.write(PipeMessage.FLASH_READ, pipes.RANGE.pack(offset, size_bytes))
         return _next(self._pipe)[1]
 
-    def flash_erase(self, offset: int) -> None:
+    def flash_erase(self, offset: int) -> bool:
         self._pipe.write(PipeMessage.FLASH_ERASE, pipes.PLACE.pack(self.now, offset))
-        (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
+        return self._flash_result()
 
-    def flash_write(self, offset: int, data: bytes) -> None:
+    def flash_write(self, offset: int, data: bytes) -> bool:
         self._pipe.write(PipeMessage.FLASH_WRITE, pipes.PLACE.pack(self.now, offset), data)
-        (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
+        return self._flash_result()
+
+    def _flash_result(self) -> bool:
+        result = _next(self._pipe)[1].ljust(pipes.FLASH_RESULT.size, b"\0")  # ABI 1: no error
+        self.now, error = pipes.FLASH_RESULT.unpack(result)
+        return not error
 
     def transmit_pending(self) -> int:
         return self.pending
@@ -80,8 +85,10 @@ class _Facts(ctypes.Structure):
 _HOST: Final = {
     "now_us": ctypes.CFUNCTYPE(ctypes.c_uint64),
     "flash_read": ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32),
-    "flash_erase": ctypes.CFUNCTYPE(None, ctypes.c_uint32),
-    "flash_write": ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32),
+    "flash_erase": ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_uint32),
+    "flash_write": ctypes.CFUNCTYPE(
+        ctypes.c_int, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32
+    ),
     "transmit_pending": ctypes.CFUNCTYPE(ctypes.c_uint32),
     "start_application": ctypes.CFUNCTYPE(None),
     "reset": ctypes.CFUNCTYPE(None),
@@ -119,13 +126,21 @@ class _Library:
         def read(offset: int, data: int, size: int) -> None:
             ctypes.memmove(data, host.flash_read(offset, size), size)
 
-        def write(offset: int, data: int, size: int) -> None:
-            host.flash_write(offset, ctypes.string_at(data, size))
+        def erase(offset: int) -> int:
+            return not host.flash_erase(offset)
+
+        def write(offset: int, data: int, size: int) -> int:
+            return not host.flash_write(offset, ctypes.string_at(data, size))
 
         def log(text: bytes) -> None:
             host.log(text.decode(errors="replace"))
 
-        own: dict[str, Callable[..., Any]] = {"flash_read": read, "flash_write": write, "log": log}
+        own: dict[str, Callable[..., Any]] = {
+            "flash_read": read,
+            "flash_erase": erase,
+            "flash_write": write,
+            "log": log,
+        }
         calls = [made(own.get(name) or getattr(host, name)) for name, made in _HOST.items()]
         self._table = _HostTable(*calls)
         self._library.flasher_dut_start(ctypes.byref(self._table), cause)

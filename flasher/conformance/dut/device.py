@@ -8,6 +8,7 @@ from struct import Struct
 from typing import Final
 
 from flasher.conformance.dut import CanFrame, pipes
+from flasher.conformance.dut.failing_flash import FailingFlash
 from flasher.conformance.dut.pipes import PipeMessage
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.errors import FlasherError
@@ -77,6 +78,7 @@ class CompiledDevice(Machine):
             page_size_bytes=facts.sector_bytes,
             program_unit_bytes=facts.write_bytes,
         )
+        self.flash_faults = FailingFlash(self.flash)
         profile = DeviceProfile()
         application = Application(target.node, DIALECTS[profile.dialect])
         if target.node is Node.BMS:
@@ -100,6 +102,7 @@ class CompiledDevice(Machine):
         self._busy_until = -inf
         """Until then the processor executes a call or waits for the flash."""
         self._tick_at = inf
+        self._called_at = 0.0
         self._handled_bytes = 0
         """Bytes that the current call has read, erased, written and logged."""
         self._operations = 0
@@ -260,6 +263,7 @@ class CompiledDevice(Machine):
 
     def _call(self, kind: PipeMessage, number: int, now: float, frame: bytes = b"") -> None:
         self._handled_bytes = 0
+        self._called_at = now
         try:
             answer = self._process.call(
                 kind, pipes.TURN.pack(round(now * _US), number), frame, during=self._hardware
@@ -313,7 +317,8 @@ class CompiledDevice(Machine):
         if asked is PipeMessage.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
             self._count_bytes(size_bytes)
-            return self.flash.read(self.flash.start + offset, size_bytes)
+            address = self.flash.start + offset
+            return self.flash_faults.read(address, size_bytes, self._called_at)
         now_us, offset = pipes.PLACE.unpack_from(data)
         content = None if asked is PipeMessage.FLASH_ERASE else data[pipes.PLACE.size :]
         operation = Operation(self.flash.start + offset, content)
@@ -329,8 +334,10 @@ class CompiledDevice(Machine):
             self.power_cut(now_us / _US)
             self._due_at = (now_us + share * takes_us) / _US + off_s
             return None
-        self.flash.execute(operation)
-        return pipes.TIME.pack(now_us + takes_us)
+        is_done = self.flash_faults.execute(operation, now_us / _US)
+        if self.facts.abi < pipes.ABI_WITH_ERRORS:
+            return pipes.TIME.pack(now_us + takes_us)
+        return pipes.FLASH_RESULT.pack(now_us + takes_us, not is_done)
 
     def _count_bytes(self, size_bytes: int) -> None:
         self._handled_bytes += size_bytes

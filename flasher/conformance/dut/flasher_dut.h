@@ -25,7 +25,9 @@
 extern "C" {
 #endif
 
-#define FLASHER_DUT_ABI 1u
+/* 2: flash_erase and flash_write report errors. What was built with 1 is tested too, but its flash
+ * never fails. */
+#define FLASHER_DUT_ABI 2u
 
 /* Number of frames that the CAN controller can hold before the first one is on the bus, like its
  * mailboxes. Further frames wait in the memory of the bootloader. */
@@ -60,16 +62,21 @@ enum { FLASHER_POWER_ON = 0, FLASHER_RESET = 1 };
 
 /* Hardware functions. Offsets count from the start of the flash of `flasher_dut_facts`. Accesses that
  * the flash does not allow fail the case: an address outside, a start or size that is not a multiple
- * of a sector or of `write_bytes`, writing to flash that is not erased. */
+ * of a sector or of `write_bytes`, writing to flash that is not erased.
+ *
+ * The suite makes some calls fail (case PW-04), as flash memory does that is worn out. A call that
+ * reports an error has changed nothing; it may succeed when it is repeated. What is written to a
+ * sector after an erase of it failed is combined with its old content (AND), without an error. A bit
+ * that stays 1 when it is written, and one that is read wrong, are not reported. */
 typedef struct {
     uint64_t (*now_us)(void);
     void (*flash_read)(uint32_t offset, void *data, uint32_t size);
-    void (*flash_erase)(uint32_t offset); /* the sector at this offset */
-    void (*flash_write)(uint32_t offset, const void *data, uint32_t size);
-    uint32_t (*transmit_pending)(void);   /* frames in the controller that are not yet on the bus */
-    void (*start_application)(void);      /* does not return; pending frames are lost */
-    void (*reset)(void);                  /* likewise */
-    void (*log)(const char *text);        /* a line for the report of a failure */
+    int (*flash_erase)(uint32_t offset); /* the sector at this offset; 0, else the flash reports an error */
+    int (*flash_write)(uint32_t offset, const void *data, uint32_t size); /* likewise */
+    uint32_t (*transmit_pending)(void);  /* frames in the controller that are not yet on the bus */
+    void (*start_application)(void);     /* does not return; pending frames are lost */
+    void (*reset)(void);                 /* likewise */
+    void (*log)(const char *text);       /* a line for the report of a failure */
 } flasher_host;
 
 /* -- functions of the bootloader -------------------------------------------------------------- */

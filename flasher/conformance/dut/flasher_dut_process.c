@@ -10,7 +10,8 @@
  *                              'R' received: uint64 now, uint32 pending, frame
  *                              'T' tick: uint64 now, uint32 pending
  *   program to suite, during:  'r' read: uint32 offset, uint32 size; answered by 'd' data
- *                              'e' erase: uint64 now, uint32 offset; answered by 'k' uint64 now
+ *                              'e' erase: uint64 now, uint32 offset; answered by 'k' uint64 now,
+ *                                  uint32 error (0: none; missing where the ABI is 1)
  *                              'w' write: uint64 now, uint32 offset, data; answered by 'k'
  *                              'l' log: text
  *                              'a' start the application, 'z' reset: uint64 now; end the program
@@ -102,12 +103,15 @@ static void flash_read(uint32_t offset, void *data, uint32_t size)
     read_exactly(data, size);
 }
 
-static void await_flash(void)
+static int flash_result(void)
 {
     uint8_t type;
-    if (next_message(&type) != sizeof now)
+    uint32_t error;
+    if (next_message(&type) != sizeof now + sizeof error)
         abort();
     read_exactly(&now, sizeof now);
+    read_exactly(&error, sizeof error);
+    return error != 0;
 }
 
 typedef struct {
@@ -117,18 +121,18 @@ typedef struct {
 
 enum { FLASH_PLACE_BYTES = 12 };
 
-static void flash_erase(uint32_t offset)
+static int flash_erase(uint32_t offset)
 {
     const flash_place place = {now, offset};
     tell('e', &place, FLASH_PLACE_BYTES, NULL, 0);
-    await_flash();
+    return flash_result();
 }
 
-static void flash_write(uint32_t offset, const void *data, uint32_t size)
+static int flash_write(uint32_t offset, const void *data, uint32_t size)
 {
     const flash_place place = {now, offset};
     tell('w', &place, FLASH_PLACE_BYTES, data, size);
-    await_flash();
+    return flash_result();
 }
 
 static uint32_t transmit_pending(void)

@@ -10,7 +10,10 @@ from typing import Final
 
 from flasher.conformance.dut import CanFrame, Facts
 
-ABI: Final = 1
+ABI: Final = 2
+"""FLASHER_DUT_ABI of the header."""
+ABI_WITH_ERRORS: Final = 2
+"""The first one whose flash operations report errors."""
 TRANSMIT_FRAMES: Final = 3
 """FLASHER_TRANSMIT_FRAMES of the header."""
 HEADER: Final = Struct("<B3xI")
@@ -20,10 +23,13 @@ FRAME: Final = Struct("<IBBBx8s")
 RANGE: Final = Struct("<II")
 PLACE: Final = Struct("<QI")
 TIME: Final = Struct("<Q")
+FLASH_RESULT: Final = Struct("<QI")
 DONE: Final = Struct("<QQ")
 NEVER: Final = 0xFFFF_FFFF_FFFF_FFFF
 """Next tick of a bootloader that only waits for frames."""
 _READ_SIZE: Final = 1 << 16
+_SIZES: Final = tuple(Facts.__dataclass_fields__)[:8]
+"""Fields of the facts that are numbers."""
 
 
 class PipeMessage(Enum):
@@ -99,8 +105,8 @@ def unpack_frame(data: bytes) -> CanFrame:
 
 
 def pack_facts(facts: Facts) -> bytes:
-    *numbers, _ = astuple(facts)
-    return FACTS.pack(ABI, *numbers) + facts.name.encode()
+    numbers = astuple(facts)[: len(_SIZES)]
+    return FACTS.pack(facts.abi, *numbers) + facts.name.encode()
 
 
 def unpack_facts(data: bytes) -> Facts:
@@ -108,9 +114,9 @@ def unpack_facts(data: bytes) -> Facts:
     if len(data) < FACTS.size:
         raise ValueError("the facts are truncated")
     abi, *numbers = FACTS.unpack_from(data)
-    if abi != ABI:
-        raise ValueError(f"it was built with version {abi} of flasher_dut.h instead of {ABI}")
-    names = list(Facts.__dataclass_fields__)
-    return Facts(
-        **dict(zip(names, numbers, strict=False)), name=data[FACTS.size :].decode(errors="replace")
-    )
+    if not 1 <= abi <= ABI:
+        raise ValueError(
+            f"it was built with version {abi} of flasher_dut.h, and this flasher has version {ABI}"
+        )
+    sizes = dict(zip(_SIZES, numbers, strict=True))
+    return Facts(**sizes, name=data[FACTS.size :].decode(errors="replace"), abi=abi)

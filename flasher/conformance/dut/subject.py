@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Final
 
 from flasher.conformance.dut.device import CompiledDevice, application_image
+from flasher.conformance.dut.pipes import ABI_WITH_ERRORS
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.simulated import SimulatedSubject
@@ -40,6 +41,8 @@ class CompiledSubject(SimulatedSubject[CompiledDevice]):
             second_image=second_image,
         )
         self.bus.attach(device)
+        if device.facts.abi >= ABI_WITH_ERRORS:
+            self.flash_faults = device.flash_faults
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         self.device.set_cut(operation, share, off_s)
