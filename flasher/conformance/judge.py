@@ -37,6 +37,7 @@ class TimeName:
     LATE: Final = "pause to boot version, beyond the shortest one"
     REQUEST: Final = "update command to request transfer"
     ANSWER: Final = "packet to ACK"
+    REJECTED: Final = "bad packet to NAK"
     COMPLETE: Final = "end of transfer to complete"
     RESTARTED: Final = "complete to boot version"
     START: Final = "complete to an application that answers"
@@ -159,10 +160,10 @@ class Judge:
     def expect_silence(
         self, for_s: float | None = None, *, ignoring: Sequence[Reply] = (), why: str = "no answer"
     ) -> bool:
-        """Check that no message arrives for `for_s` (default: `Waits.silence_s`), except the kinds
-        `ignoring`.
+        """Check that no message arrives for `for_s` (default: `Waits.silence_in_transfer_s`),
+        except the kinds `ignoring`.
         """
-        silence_s = self._tester.waits.silence_s if for_s is None else for_s
+        silence_s = self._tester.waits.silence_in_transfer_s if for_s is None else for_s
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
 

@@ -18,6 +18,8 @@ _WINDOW_MAX_S: Final = 1.0
 _INCOMPLETE: Final = 2
 """A device waits for the rest of a message at most this many times the gap that it accepts."""
 _LATE_VERSION: Final = 4
+_NO_PAUSE: Final = 0.75
+"""This share of limits.pause_s is no pause, even if a few messages take their time before it."""
 _STALL_LEAST_S: Final = 0.005
 """A scheduler gives other programs about this much time."""
 _FRAME_BITS: Final = 135
@@ -72,6 +74,13 @@ class Waits:
     def silence_s(self) -> float:
         """How long the bus must be quiet to count as silent: any answer would have arrived."""
         return max(self._limit("silence_s"), self._limit("feedback_s"), self.settle_s)
+
+    @property
+    def silence_in_transfer_s(self) -> float:
+        """The same in a transfer, which must not become a pause that ends it (tx_12)."""
+        if self._profile.choice("tx_12") == "waits":
+            return self.silence_s
+        return min(self.silence_s, _NO_PAUSE * self._limit("pause_s"))
 
     @property
     def packet_s(self) -> float:

@@ -13,7 +13,7 @@ import pytest
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, ask_device
-from flasher.conformance.init.answers import Trial, decide, limit_answer
+from flasher.conformance.init.answers import MARGINS, Trial, decide, limit_answer
 from flasher.conformance.mock import (
     GOOD_IMAGE,
     MOCK_PROFILE,
@@ -33,9 +33,11 @@ from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.campaigns.profiles import AREA_BYTES, faults
+from tests.campaigns.right_devices import answers_late, right_device
 from tests.cli.conftest import Flasher
 from tests.conformance.bench import DeafDevice
 from tests.conformance.test_other_device import (
+    IMAGE,
     BurstAnnouncer,
     ChoosyDevice,
     LateListener,
@@ -61,7 +63,7 @@ CHOICES: Final = {
 }
 """Key of the profile to the option of the device model."""
 OTHER_WORDS: Final = {"general_feedback": "feedback", ("up_08", "ignored"): "rejected"}
-OPEN: Final = {"en_04", "limits.inter_frame_s", "limits.refused_s", "limits.silence_s"} | {
+OPEN: Final = {"en_04", "limits.refused_s", "limits.silence_s"} | {
     "device.application_bytes",
     "device.application_address",
 }
@@ -151,6 +153,21 @@ class LatePages(LateListener, PageDevice):
     """Both in one."""
 
 
+class OldPages(PageDevice):
+    """Erases a page when it is written: the flash holds the old image beyond it."""
+
+    @property
+    def image(self) -> bytes:
+        return super().image + IMAGE[len(super().image) :]
+
+
+class SlowPages(ScriptedDevice):
+    """Writes a page of 2 KiB before the ACK of the packet that fills it."""
+
+    def _ack(self, number: int, at: float) -> None:
+        super()._ack(number, at + (0.2 if number % 16 == 0 else 0.0))
+
+
 class SlowBursts(SlowDevice, BurstAnnouncer):
     """Both in one."""
 
@@ -200,7 +217,8 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
                 "fr_07": "ignored",
                 "up_02": "nak",
                 "tx_08": "rejected",
-                "tm_02": "either",
+                "limits.inter_frame_s": 0.043,
+                "tm_02": "accepted",
             },
         ),
         (
@@ -253,11 +271,73 @@ def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
     assert found["limits.window_s"] == pytest.approx(0.32, abs=0.002)
 
 
+@pytest.mark.slow
+def test_acknowledged_bytes_that_are_not_written_are_seen_though_the_flash_holds_the_same() -> None:
+    paged = values(ask_device(bench(OldPages("bms", capacity_bytes=12288)), ConformanceProfile()))
+    assert paged["device.buffer_bytes"] == 768
+
+
+@pytest.mark.slow
+@each(
+    "make",
+    (
+        lambda: bench(SlowPages("bms", capacity_bytes=12288)),
+        lambda: mock(answers_late(Nak=0.2)),
+        lambda: mock(answers_late(Nak=0.2), bad_packet="silence", repeated_packet="nak_next"),
+        lambda: mock(answers_late(Nak=0.2), bad_packet="silence", older_packet="nak"),
+    ),
+)
+def test_the_limit_of_an_answer_holds_for_the_slowest_one(make: Callable[[], Subject]) -> None:
+    assert values(ask_device(make(), ConformanceProfile()))["limits.ack_s"] >= 0.6
+
+
+@pytest.mark.slow
+def test_the_longest_gap_in_a_packet_is_found() -> None:
+    timings = replace(DEFAULT_TIMINGS, inter_frame_timeout_s=0.3)
+
+    class Patient(MockDevice):
+        def __init__(self, *given: Any, **named: Any) -> None:
+            super().__init__(*given, **{**named, "timings": timings})
+
+    assert values(ask_device(mock(Patient), ConformanceProfile()))["limits.inter_frame_s"] == 0.26
+
+
+@pytest.mark.slow
+@each(
+    "seed, wanted",
+    (
+        (3, {"device.largest_image_bytes": 31744, "up_08": "rejected"}),
+        (
+            11,
+            {
+                "rs_02": "restarts",
+                "up_05": "once",
+                "up_08": "rejected",
+                "fr_07": "ignored",
+                "limits.pause_s": 2.5,
+            },
+        ),
+    ),
+)
+def test_a_device_may_take_longer_for_an_answer_than_a_pause_lasts(
+    seed: int, wanted: dict[str, Any]
+) -> None:
+    device = right_device(seed, at_limits=True)
+    subject = MockSubject(device.target, profile=device.choices, make_device=device.make)
+    found = values(ask_device(subject, ConformanceProfile()))
+    assert {key: found[key] for key in wanted} == wanted
+
+
 def test_a_limit_has_its_margin_and_says_it() -> None:
     found = limit_answer("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
     assert found.value == 0.64
     assert found.seen.startswith("measured 2 times, at most 210.0 ms; ")
     assert limit_answer("limits.ack_s", [], 0.1, 0.0).value is None
+
+
+def test_the_document_states_the_margins() -> None:
+    document = Path(__file__).parents[2] / "docs/how-to/conformance_profile.md"
+    assert MARGINS in document.read_text(encoding="utf-8")
 
 
 def test_what_differs_is_either_or_stays_open() -> None:

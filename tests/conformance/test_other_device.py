@@ -24,7 +24,7 @@ from tests.loops import each
 from tests.peers.scripted_device import ScriptedDevice
 
 _AREA_BYTES: Final = 12 * 1024
-_IMAGE: Final = b"V1r2r3_20220512." + random.Random(7).randbytes(9 * 128 - 3)
+IMAGE: Final = b"V1r2r3_20220512." + random.Random(7).randbytes(9 * 128 - 3)
 _PROFILE: Final[dict[str, Value]] = {
     "fr_01": "either",  # wants the whole header in its first frame
     "fr_02": "lost",
@@ -117,7 +117,7 @@ def bench(device: ScriptedDevice) -> RealSubject:
 
     port = RealPort(bus.link(), clock, WELLING.bitrate_bps)
     return RealSubject(
-        port, "bms", _IMAGE, name="another", power=power, readback=lambda: device.image
+        port, "bms", IMAGE, name="another", power=power, readback=lambda: device.image
     )
 
 

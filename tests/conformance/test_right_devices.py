@@ -110,6 +110,17 @@ def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> N
     assert blamed(case_id, kind=kind, device=device) == []
 
 
+@each("case_id", ("UP-08", "TX-13", "CO-02", "CO-04"))
+def test_silence_in_a_transfer_is_no_pause(case_id: str) -> None:
+    """The suite waits for silence as long as general feedback may take (limits.feedback_s)."""
+    device = dataclasses.replace(MOCK_PROFILE, update_in_transfer="ignored", transfer_timeout_s=2.5)
+    assert blamed(case_id, device=device, given={"limits.feedback_s": 3.0}) == []
+
+
+def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() -> None:
+    assert faults_of(21, Selection(cases=("UP-05",)), at_limits=True) == []
+
+
 @each("choice", ("once", "either"))
 @each("request_s, ack_s", ((0.3, 0.2), (0.05, 0.45), (2.4, 0.49)))
 def test_a_repeated_update_command_may_be_answered_late(

@@ -169,7 +169,7 @@ def two_upgrades(bench: Bench) -> None:
             # A device that wrongly takes this for its own end of transfer fails here.
             bench.send(other.end())
             bench.send(other.answer(COMPLETE, bytes(2)))
-            bench.expect_silence(bench.waits.silence_s)
+            bench.expect_silence()
             bench.end_transfer()
             bench.check_image(image)
 

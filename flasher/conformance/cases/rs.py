@@ -245,5 +245,7 @@ def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
         bench.send(frames)
         bench.judge.note_stimulus()
         bench.expect_silence(
-            ignoring=(Reply.FEEDBACK, Reply.OTHER, Reply.VERSION_INFORMATION), why="no restart"
+            bench.waits.silence_s,
+            ignoring=(Reply.FEEDBACK, Reply.OTHER, Reply.VERSION_INFORMATION),
+            why="no restart",
         )

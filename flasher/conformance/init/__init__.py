@@ -12,7 +12,7 @@ from typing import Final
 
 from flasher.conformance.init import entry_questions, transfer_questions
 from flasher.conformance.init.answers import Findings, Trial, decide, limit_answer
-from flasher.conformance.init.session import InitSession
+from flasher.conformance.init.session import ANSWER_S, InitSession
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
 from flasher.conformance.restore import restore
@@ -41,8 +41,9 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (entry_questions.application, ("up_03",)),
     (entry_questions.feedback, ("fr_10",)),
     (entry_questions.update_twice, ("up_05",)),
-    (transfer_questions.repeated_packet, ("tx_02",)),
     (transfer_questions.pause, ("tx_12", "limits.pause_s")),
+    (transfer_questions.frame_gap, ("limits.inter_frame_s",)),
+    (transfer_questions.repeated_packet, ("tx_02",)),
     (transfer_questions.reset_again, ("tx_13",)),
     (transfer_questions.update_again, ("up_08",)),
     (transfer_questions.bad_packet, ("tx_01",)),
@@ -57,8 +58,8 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (transfer_questions.end_again, ("en_02",)),
     (entry_questions.old_application, ("rs_03_old",)),
     (entry_questions.without_application, ("rs_03",)),
-    (transfer_questions.buffer, ("device.buffer_bytes",)),
     (entry_questions.largest_image, ("device.largest_image_bytes",)),
+    (transfer_questions.buffer, ("device.buffer_bytes",)),
 )
 """Questions in order, with the keys that each one answers; later ones use earlier answers."""
 LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
@@ -69,13 +70,12 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
     ),
     "limits.start_s": (1.0, (TimeName.START, TimeName.START_AGAIN)),
     "limits.erase_s": (0.5, (TimeName.REQUEST,)),
-    "limits.ack_s": (0.1, (TimeName.ANSWER,)),
+    "limits.ack_s": (0.1, (TimeName.ANSWER, TimeName.REJECTED)),
     "limits.complete_s": (0.5, (TimeName.COMPLETE,)),
 }
 """Smallest value of a limit in seconds, and the measured times that determine it."""
 NOT_ASKED: Final = {
     "en_04": "needs a transfer with a wrong checksum; enter what the product has",
-    "limits.inter_frame_s": "it is the input of the question about tm_02 (R12)",
     "limits.refused_s": "needs an image that is rejected",
     "limits.silence_s": "it is a setting of the suite, not of the device",
     "device.application_address": "no message reports it",
@@ -87,7 +87,7 @@ _PATIENCE: Final[dict[str, Value]] = {
     "limits.first_version_s": 10.0,
     "limits.start_s": 20.0,
     "limits.erase_s": 60.0,
-    "limits.ack_s": 5.0,
+    "limits.ack_s": ANSWER_S,
     "limits.complete_s": 60.0,
     "limits.window_s": 2.0,
 }

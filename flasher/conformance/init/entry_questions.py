@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import ceil
 from statistics import median
 from typing import Final
 
-from flasher.conformance.init.answers import Findings, Trial
+from flasher.conformance.init.answers import Findings, Trial, tolerance_answer
 from flasher.conformance.init.session import REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
 from flasher.conformance.patient_host import UPDATE_SPACING_S
-from flasher.conformance.restore import needs_power
 from flasher.conformance.results import KeyAnswer
 from flasher.conformance.wire import IMAGE_BYTES_MAX, WRITE, RawFrame, Received, Reply, packet_count
 
@@ -20,6 +18,8 @@ _TOLERANCE_S: Final = 0.005
 _WINDOW_MAX_S: Final = 10.0
 _RESTART_S: Final = 5.0
 """How long to wait for a restart after complete."""
+_NAK_WATCHED_S: Final = 2.0
+"""How long to wait for a first NAK: four times the default of limits.ack_s."""
 _RESOLUTION_S: Final = 0.001
 _SILENT_S: Final = 5.0
 """A bootloader without a boot version for this long is assumed to listen silently."""
@@ -69,13 +69,10 @@ def burst(session: InitSession) -> Findings:
     spacing_s = round(median(gaps_s), 3)
     seen = f"{len(gaps_s)} times, from {min(gaps_s) * 1000:.1f} to {max(gaps_s) * 1000:.1f} ms"
     off_s = max(abs(gap_s - spacing_s) for gap_s in gaps_s)
-    tolerance_s = max(_TOLERANCE_S, _rounded_up(2 * off_s + 2 * bench.port.uncertainty_s))
+    off_s += bench.port.uncertainty_s
     yield KeyAnswer("limits.version_spacing_s", spacing_s, f"measured {seen}; the median")
-    yield KeyAnswer(
-        "limits.version_spacing_tolerance_s",
-        tolerance_s,
-        f"measured {seen}; twice the largest deviation, at least {_TOLERANCE_S * 1000:g} ms",
-    )
+    key = "limits.version_spacing_tolerance_s"
+    yield tolerance_answer(key, off_s, _TOLERANCE_S, f"measured {seen}")
 
 
 def upgrade(session: InitSession) -> Findings:
@@ -83,6 +80,7 @@ def upgrade(session: InitSession) -> Findings:
     bench = session.bench
     for _ in range(REPEATS):
         session.begin()
+        _measure_naks(session)
         session.packets()
         bench.end_transfer()
         complete_at = bench.now
@@ -95,6 +93,26 @@ def upgrade(session: InitSession) -> Findings:
         session.await_application(TimeName.START, complete_at)
         last = session.enter(bench.number("versions"))
         session.await_application(TimeName.START_AGAIN, last.at)
+
+
+def _measure_naks(session: InitSession) -> None:
+    """Measure the time to a NAK, which is a part of all waits for answers to packets."""
+    bench = session.bench
+    stimuli = (
+        bench.encoder.damaged_packet_of(session.image, 1),
+        session.packet(1),  # the last one stored
+        session.packet(1),  # an older one
+    )
+    for stored, frames in enumerate(stimuli[: session.total]):
+        session.packets(stored)
+        bench.forget()
+        sent = bench.send(frames)
+        kinds = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
+        reply = bench.wait_for(*kinds, within_s=_NAK_WATCHED_S)
+        if reply is not None and reply.kind is Reply.NAK:
+            bench.measure(TimeName.REJECTED, reply.at - sent.left_at)
+        elif reply is not None and reply.kind is Reply.BOOT_VERSION:  # it was a pause
+            session.update()
 
 
 def _first_sign(session: InitSession) -> Received | None:
@@ -167,12 +185,8 @@ def window(session: InitSession) -> Findings:
         f"rejected from {high_s * 1000:.1f} ms on, by bisection"
     )
     yield KeyAnswer("limits.window_s", window_s, f"{seen}; the middle")
-    half_s = _rounded_up(
-        (high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2
-    )
-    yield KeyAnswer(
-        "limits.window_tolerance_s", half_s, f"{seen}; half of that plus the uncertainty"
-    )
+    off_s += (high_s - low_s) / 2 + bench.port.uncertainty_s
+    yield tolerance_answer("limits.window_tolerance_s", off_s, _RESOLUTION_S, seen)
     stimulus = f"update command {(high_s + resolution_s) * 1000:.0f} ms after the last boot version"
     for _, taken in outside:
         answer = "request transfer" if taken else "no request transfer"
@@ -209,7 +223,9 @@ def reset_in_bootloader(session: InitSession) -> Findings:
     for _ in range(REPEATS):
         session.enter(place)
         bench.send(bench.encoder.reset())
-        more = len(session.more_versions())
+        # A restart may take as long as that of the application.
+        first = bench.wait_for(Reply.BOOT_VERSION)
+        more = 0 if first is None else 1 + len(session.more_versions())
         value = {count - place: "ignored", count: "restarts"}.get(more, "")
         stimulus = f"reset after boot version {place} of {count}"
         yield Trial(value, f"{more} more boot versions", stimulus, "after")
@@ -265,13 +281,17 @@ def update_twice(session: InitSession) -> Findings:
         session.enter()
         bench.wait_for_window()
         bench.send(update + update)
-        first = bench.wait_for(Reply.REQUEST)
-        more = [] if first is None else bench.collect(bench.limit("erase_s"))
-        count = (first is not None) + sum(one.kind is Reply.REQUEST for one in more)
+        count, reply = 0, bench.wait_for(Reply.REQUEST)
+        kinds, within_s = (Reply.REQUEST, Reply.BOOT_VERSION), bench.limit("erase_s")
+        while reply is not None and reply.kind is Reply.REQUEST:
+            count += 1
+            reply = bench.wait_for(*kinds, within_s=within_s)
         value = {1: "once", 2: "each"}.get(count, "")
         answer = f"request transfer {count} times"
         yield Trial(value, answer, "two update commands in a row")
         session.stored = 0
+        if reply is not None:  # it was a pause
+            session.update()
         session.finish() if count else session.await_application()
 
 
@@ -301,22 +321,10 @@ def _choice_for(replies: list[Received]) -> str:
 # -- without an application -----------------------------------------------------------------------
 
 
-def _why_no_exit(session: InitSession) -> str:
-    """Why no transfer of this device can be ended early; "" when one can."""
-    if needs_power(session.bench.profile) and not session.bench.subject.has_power:
-        return "only a power cycle ends a transfer, and the bench cannot switch power"
-    can_leave = (
-        session.bench.choice("tx_13") == "restarts" or session.bench.choice("tx_12") == "announces"
-    )
-    if not (can_leave or session.bench.subject.has_power):
-        return "neither reset nor pause ends a transfer, and the bench cannot switch power"
-    return ""
-
-
 def old_application(session: InitSession) -> Findings:
     """Determine whether the old application runs after a transfer that was broken off."""
     bench = session.bench
-    why = _why_no_exit(session)
+    why = session.why_no_exit()
     if why:
         yield why
         return
@@ -335,7 +343,7 @@ def old_application(session: InitSession) -> Findings:
 def without_application(session: InitSession) -> Findings:
     """Determine what a bootloader without an application does."""
     bench = session.bench
-    why = _why_no_exit(session)
+    why = session.why_no_exit()
     if why:
         yield why
         return
@@ -366,7 +374,7 @@ def largest_image(session: InitSession) -> Findings:
     bench = session.bench
     keeps_old = bench.profile.allows("rs_03_old", "kept")
     restarts_at_once = bench.choice("up_08") == "starts_over"
-    why = "" if restarts_at_once else _why_no_exit(session)
+    why = "" if restarts_at_once else session.why_no_exit()
     if why:
         yield why
         return
@@ -419,9 +427,6 @@ def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float
             bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
             return True
         versions += reply.at > sent.left_at + UPDATE_SPACING_S
+    if versions:  # a late NAK would be taken for the answer to the next size
+        bench.collect(bench.waits.settle_s)
     return False
-
-
-def _rounded_up(value_s: float) -> float:
-    """Round up to tenths of a millisecond."""
-    return ceil(value_s * 10_000 - 1e-6) / 10_000

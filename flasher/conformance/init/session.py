@@ -11,6 +11,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import PacketTransfer
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.waits import Waits
@@ -18,6 +19,8 @@ from flasher.conformance.wire import DeviceDecoder, RawFrame, Received, Reply, d
 
 REPEATS: Final = 3
 """How often to repeat a trial."""
+ANSWER_S: Final = 5.0
+"""How long to wait for the answer to a packet before its limit is known."""
 _UPGRADES_MAX: Final = 200
 """More than any question takes, at the limits of the profile."""
 _ASK_S: Final = 0.05
@@ -109,6 +112,17 @@ class InitSession(PacketTransfer):
         """Get request transfer from a listening bootloader."""
         self.bench.update(len(self.image))
         self.stored = 0
+
+    def why_no_exit(self) -> str:
+        """Why no transfer of this device can be ended early; "" when one can."""
+        bench = self.bench
+        if bench.subject.has_power:
+            return ""
+        if needs_power(bench.profile):
+            return "only a power cycle ends a transfer, and the bench cannot switch power"
+        if bench.choice("tx_13") != "restarts" and bench.choice("tx_12") != "announces":
+            return "neither reset nor pause ends a transfer, and the bench cannot switch power"
+        return ""
 
     # -- the transfer -----------------------------------------------------------------------------
 

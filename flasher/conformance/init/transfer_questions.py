@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from math import floor
 from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
-from flasher.conformance.init.answers import Findings, Trial
-from flasher.conformance.init.session import REPEATS, InitSession, answer_text
+from flasher.conformance.init.answers import Findings, Trial, gap_answer, pause_answer
+from flasher.conformance.init.session import ANSWER_S, REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import choice_words
 from flasher.conformance.results import KeyAnswer
@@ -17,6 +16,7 @@ from flasher.conformance.wire import (
     RawFrame,
     Reply,
     joined,
+    packet_count,
     packet_payload,
     padded_to_frame,
 )
@@ -24,11 +24,15 @@ from flasher.conformance.wire import (
 _LOST_FRAMES: Final = (1, 9, 17)
 _RANDOM_SPLITS: Final = 4
 _SHARES: Final = (0.1, 0.25, 0.5, 0.75, 0.9)
+_FIRST_GAP_S: Final = 0.05
+_GAP_WATCHED_S: Final = 1.6
+_GAP_RESOLUTION_S: Final = 0.002
 _LATER_S: Final = 0.5
 _PAUSE_WATCHED_S: Final = 30.0
 _BEFORE_PAUSE: Final = 0.9
 _END_ANSWERS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
-_PACKETS_READ_BACK: Final = 33
+_SEVERAL_PAGES: Final = 65
+"""Packets, one more than 8 KiB."""
 
 
 # -- repetitions and bad packets ------------------------------------------------------------------
@@ -204,9 +208,6 @@ def _offer_form(session: InitSession, form: PacketForm, key: str) -> Trial:
 def padded(session: InitSession) -> Findings:
     """Determine whether padded update commands and ends of transfer are accepted."""
     bench = session.bench
-    within_s = bench.limit("complete_s")
-    if bench.choice("tx_12") == "announces":  # while the transfer still lasts
-        within_s = min(within_s, bench.limit("pause_s") / 2)
     for byte in PADDINGS:
         session.enter()
         bench.wait_until_listening()
@@ -221,14 +222,47 @@ def padded(session: InitSession) -> Findings:
         session.packets()
         bench.forget()
         sent = bench.send(padded_to_frame(bench.encoder.end(), byte))
-        reply = bench.wait_for(Reply.COMPLETE, within_s=within_s)
-        yield _accepted_trial(reply is not None, f"end {form}", "ignored", "rejected")
-        if reply is None:
-            bench.forget()
-            bench.end_transfer()
-        else:
+        # Without complete, the transfer lasts, or ends by a pause.
+        reply = bench.wait_for(Reply.COMPLETE, Reply.BOOT_VERSION)
+        taken = reply is not None and reply.kind is Reply.COMPLETE
+        yield _accepted_trial(taken, f"end {form}", "ignored", "rejected")
+        if reply is not None and taken:
             bench.measure(TimeName.COMPLETE, reply.at - sent.left_at)
-        session.await_application()
+            session.await_application()
+            continue
+        if reply is not None:
+            session.update()
+        session.finish()
+
+
+def frame_gap(session: InitSession) -> Findings:
+    """Determine the longest gap between two frames of a packet that is accepted, by bisection."""
+    bench = session.bench
+    low_s, high_s = 0.0, 0.0
+    longest_s = _GAP_WATCHED_S
+    if bench.choice("tx_12") == "announces":
+        longest_s = min(longest_s, bench.limit("pause_s") / 2)
+    resolution_s = max(_GAP_RESOLUTION_S, 2 * bench.port.uncertainty_s)
+    session.begin()
+    while not high_s or high_s - low_s > resolution_s:
+        if low_s >= longest_s:
+            yield f"frames {low_s:.2f} s apart are accepted; the default is kept"
+            break
+        asked_s = (low_s + high_s) / 2 if high_s else min(max(2 * low_s, _FIRST_GAP_S), longest_s)
+        session.reach(0, 1)
+        taken = session.offer(session.frames(), gap_s=asked_s, gaps=1)
+        low_s, high_s = (asked_s, high_s) if taken else (low_s, asked_s)
+    else:
+        # The device counts from the end of a frame to the end of the next one.
+        low_s, high_s = (
+            each_s + bench.tester.wire_s(session.packet(1)[:1]) for each_s in (low_s, high_s)
+        )
+        seen = (
+            f"a frame accepted {low_s * 1000:.0f} ms after the previous one, rejected after "
+            f"{high_s * 1000:.0f} ms, by bisection"
+        )
+        yield gap_answer("limits.inter_frame_s", low_s, seen, bench.port.uncertainty_s)
+    session.finish()
 
 
 def gaps(session: InitSession) -> Findings:
@@ -264,14 +298,22 @@ def update_again(session: InitSession) -> Findings:
             session.reach(3, 1)
             stored = session.stored
             bench.forget()
-            taken = session.offer_update(bench.encoder.update(len(session.image) - size))
+            sent = bench.send(bench.encoder.update(len(session.image) - size))
+            reply = bench.wait_for(
+                Reply.REQUEST, Reply.BOOT_VERSION, within_s=bench.limit("erase_s")
+            )
+            taken = reply is not None and reply.kind is Reply.REQUEST
             answer = "request transfer" if taken else "no request transfer"
             stimulus = f"update command for {step} after packet {stored}"
             yield Trial("starts_over" if taken else "rejected", answer, stimulus)
-            if taken and size:
-                session.update()
-            elif not taken:
+            if reply is None:
                 session.deliver_packet()
+                continue
+            if taken:
+                bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
+                session.stored = 0
+            if size or not taken:  # the other size, or it was a pause
+                session.update()
         session.finish()
 
 
@@ -297,12 +339,9 @@ def pause(session: InitSession) -> Findings:
         why = f"no boot version in a pause of {_PAUSE_WATCHED_S:g} s; the default is kept"
         yield KeyAnswer("limits.pause_s", None, why)
         return
-    digit = 10 if min(found_s) >= 1 else 100
-    shortest_s = floor(min(found_s) * digit + 1e-6) / digit
     for one_s in found_s:
-        bench.measure(TimeName.LATE, one_s - shortest_s)
-    seen = f"a boot version after pauses of {min(found_s):.3f} to {max(found_s):.3f} s"
-    yield KeyAnswer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
+        bench.measure(TimeName.LATE, one_s - min(found_s))
+    yield pause_answer("limits.pause_s", found_s, bench.port.uncertainty_s)
 
 
 def reset_again(session: InitSession) -> Findings:
@@ -348,20 +387,40 @@ def end_again(session: InitSession) -> Findings:
 
 
 def buffer(session: InitSession) -> Findings:
-    """Determine how many acknowledged bytes are not yet in the flash."""
+    """Determine how many acknowledged bytes are not yet in the flash, and measure ACKs across
+    several flash pages. The transfer is not ended, and of random bytes: the flash may still hold
+    the good image.
+    """
     bench = session.bench
-    if not bench.subject.has_readback:
-        yield "the bench has no readback"
+    why = "" if bench.choice("up_08") == "starts_over" else session.why_no_exit()
+    if why:
+        yield why
         return
-    lacking, count = 0, min(session.total - 1, _PACKETS_READ_BACK)
-    session.begin()
-    for number in range(1, count + 1):
-        session.packets(number)
-        wanted = session.image[: number * PACKET_BYTES]
-        same = bench.difference(wanted)
-        lacking = max(lacking, 0 if same is None else len(wanted) - same)
+    image = bench.filler(_SEVERAL_PAGES)[: bench.number("largest_image_bytes")]
+    bench.start_transfer(len(image))
+    total, lacking, written = packet_count(len(image)), 0, False
+    for number in range(1, total + 1):
+        left_at = bench.send_packet(image, number).left_at
+        reply = bench.expect(Reply.ACK, within_s=ANSWER_S, number=number)
+        bench.measure(TimeName.ANSWER, reply.at - left_at)
+        if bench.subject.has_readback and not why:
+            stored = image[: number * PACKET_BYTES]
+            if number == 1 and bench.is_kept_aside(stored):
+                why = "the device keeps its old application until complete"
+                continue
+            same = bench.difference(stored)
+            lacking = max(lacking, 0 if same is None else len(stored) - same)
+            written = written or same is None or same >= PACKET_BYTES
+    bench.restart_transfer(len(session.image))
+    session.stored = 0
     session.finish()
+    if why or not bench.subject.has_readback:
+        yield why or "the bench has no readback"
+        return
     # The last packet may still be being written when its ACK arrives (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
-    seen = f"after ACK 1 to {count} at most {lacking} bytes were not in the flash"
+    seen = f"after ACK 1 to {total} at most {lacking} bytes were not in the flash"
+    if not written:
+        held = bench.number("largest_image_bytes")
+        seen += ", none was in it: all of an image may be buffered"
     yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may still be being written")
