@@ -129,9 +129,7 @@ class DeviceFacts(TomlTable):
 
 
 class ProfileKeys(TomlTable):
-    """Keys of a profile file without rationales. Keys named after a case (`tx_02`) are the choices
-    that the catalogue marks P.
-    """
+    """Keys of a profile file without rationales. Keys named after a case (`tx_02`) are choices."""
 
     fr_01: Literal["either", "accepted", "rejected"] = "either"
     """A message in CAN frames of 1 to 7 bytes (other than 8 and a rest)."""
@@ -205,6 +203,20 @@ def profile_keys() -> dict[str, Key]:
     return {path: key for path, key in _READER.keys.items() if path != DEVIATIONS}
 
 
+def unstated() -> str:
+    """What holds for a choice that a profile does not state, for people."""
+    others = {
+        path: key.default
+        for path, key in profile_keys().items()
+        if key.choices and key.default != "either"
+    }
+    named = " and ".join(f"{path} is {value}" for path, value in others.items())
+    return (
+        "A choice that the profile does not state is either: each behaviour listed for it is "
+        f"right, and may change from time to time. Only {named}."
+    )
+
+
 def choice_words(name: str) -> list[str]:
     """Values of a choice besides `either`."""
     return [word for word in profile_keys()[name].choices if word != "either"]
@@ -260,7 +272,7 @@ class ConformanceProfile:
         """The whole profile as a TOML file with the help of every key; defaults are comments.
         `remarks` explain why keys stay open.
         """
-        lines: list[str] = []
+        lines = [f"# {unstated()}", ""]
         table = ""
         for path, key in profile_keys().items():
             its_table, _, name = path.rpartition(".")

@@ -519,7 +519,7 @@ class KeyAnswer:
     """Observation, or why the key stays open."""
 
 
-@json_keys("subject target answers toml file stopped")
+@json_keys("subject target answers report toml file stopped")
 @dataclass(frozen=True)
 class InitResult:
     """Profile determined from a device."""
@@ -532,6 +532,8 @@ class InitResult:
     # An interrupted run must not be used.
     was_brought_up: bool = True
     """False when the good image could not be flashed before the first question."""
+    report: RunReport | None = None
+    """The quick cases, judged by this profile; null when they were not run."""
     toml: str = ""
     """The profile file's content; empty when none is written."""
     file: str = ""

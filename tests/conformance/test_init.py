@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +12,10 @@ from typing import Any, Final, get_args, get_type_hints
 
 import pytest
 
-from flasher.conformance.catalogue import Selection
+from flasher.conformance.bench import Bench
+from flasher.conformance.catalogue import CASES, QUICK, Selection
 from flasher.conformance.dut.subject import open_subject
-from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, ask_device
+from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, UPGRADES, ask_device
 from flasher.conformance.init.answers import MARGINS, Trial, decide, limit_answer
 from flasher.conformance.mock import (
     GOOD_IMAGE,
@@ -21,7 +24,7 @@ from flasher.conformance.mock import (
     device_maker,
     profile_of_mock,
 )
-from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
+from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys, unstated
 from flasher.conformance.results import InitResult
 from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
@@ -335,9 +338,10 @@ def test_a_limit_has_its_margin_and_says_it() -> None:
     assert limit_answer("limits.ack_s", [], 0.1, 0.0).value is None
 
 
-def test_the_document_states_the_margins() -> None:
+def test_the_document_states_the_margins_and_what_holds_without_a_value() -> None:
     document = Path(__file__).parents[2] / "docs/how-to/conformance_profile.md"
     assert MARGINS in document.read_text(encoding="utf-8")
+    assert unstated() in document.read_text(encoding="utf-8")
 
 
 def test_what_differs_is_either_or_stays_open() -> None:
@@ -418,6 +422,9 @@ def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_p
     assert ran.code == 0
     assert "tx_02" in ran.out
     assert "ACK 1 to packet 1 again, 3 of 3 times" in ran.out
+    passed = f"quick cases by this profile: {len(QUICK)} pass"
+    assert passed in ran.out.splitlines()
+    assert MARGINS in ran.out
     profile = load_profile(path)
     assert profile.rationales["tx_02"].startswith("ACK 1 to packet 1 again, 3 of 3 times")
     own = profile_of_mock(replace(MOCK_PROFILE, window_s=0.1)).limit("window_s")
@@ -425,6 +432,7 @@ def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_p
     assert profile.limit("window_s") != own  # it was seen, and not known
     text = path.read_text(encoding="utf-8")
     assert f"# open: {NOT_ASKED['en_04']}" in text
+    assert {f"# {passed}", f"# Margins: {MARGINS}.", f"# {unstated()}"} <= set(text.splitlines())
     assert flasher("conformance", *model, "--profile", str(path), "--quick").code == 0
     written = path.read_bytes()
     again = flasher("conformance", "init", *model, "-o", str(path))
@@ -437,6 +445,57 @@ def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_p
     assert document["toml"] == path.read_text(encoding="utf-8")
     found = {one["key"]: one["value"] for one in document["answers"]}
     assert (found["tx_02"], found["en_04"]) == ("ack", None)
+    assert document["report"]["passed"]
+
+
+@pytest.mark.slow
+def test_what_does_not_pass_by_the_profile_is_beside_its_keys(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "p.toml"
+    wrong = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K", "--variant")
+    ran = flasher("conformance", "init", *wrong, "no-crc-check", "-o", str(path))
+    assert ran.code == 12
+    *_, failure, key, _, _ = ran.out.splitlines()
+    assert failure.startswith("FAIL TX-01 damaged packet: packet 1, wrong CRC: expected ")
+    assert key.startswith(
+        "    tx_01 = either (either, nak_expected, nak_received, silence): no value"
+    )
+    assert f"# {failure}\n# {key}\n" in path.read_text(encoding="utf-8")
+    assert load_profile(path).choice("tx_02") == "ack"
+
+
+@pytest.mark.slow
+def test_no_file_is_written_when_the_quick_cases_are_broken_off(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, case = tmp_path / "p.toml", CASES["TX-02"]
+
+    def interrupted(bench: Bench) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        case.run(bench)
+
+    monkeypatch.setitem(CASES, case.id, replace(case, run=interrupted))
+    model = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K")
+    ran = flasher("conformance", "init", *model, "-o", str(path))
+    assert ran.code == 130
+    assert "no profile is written: the run was stopped" in ran.err
+    assert not path.exists()
+
+
+@pytest.mark.slow
+def test_the_user_is_told_how_often_the_device_is_erased() -> None:
+    class Counting(MockDevice):
+        erased = 0
+
+        def _erase(self, now: float) -> str:
+            type(self).erased += 1
+            return super()._erase(now)
+
+    subject, start = mock(Counting), ConformanceProfile()
+    profile = ask_device(subject, start).profile(start)
+    run(subject, profile, selection=Selection(quick=True))
+    assert pytest.approx(UPGRADES, rel=0.25) == Counting.erased
 
 
 def test_no_file_is_written_for_a_device_that_does_not_answer(
@@ -456,4 +515,4 @@ def test_a_device_on_a_bus_is_asked_about(flasher: Flasher, tmp_path: Path) -> N
     bus = ("-i", "virtual", "-c", "init", "--good-image", "README.md")
     ran = flasher("conformance", "init", "-t", "bms", *bus, "-o", str(tmp_path / "p.toml"))
     assert ran.code == 2
-    assert "erase and write the device about 100 times" in ran.err
+    assert "erase and write the device about 180 times" in ran.err

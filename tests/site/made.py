@@ -22,7 +22,7 @@ from flasher.cli import schema
 from flasher.cli.framework import CommandEntry, Program
 from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
-from flasher.conformance.profile import profile_keys
+from flasher.conformance.profile import profile_keys, unstated
 from flasher.settings import bus, device_model, manifest, profile
 from flasher.settings.toml_reader import Key, Reader
 from flasher.station import codes, config, operators, recipe
@@ -189,7 +189,7 @@ _FILES: Final[Mapping[str, Callable[[], _Lines]]] = {
     "recipe": lambda: _file(recipe.Recipe),
     "station": lambda: _file(config.StationConfig),
     "badges": lambda: _file(operators.BadgeTable),
-    "conformance": lambda: _keys(profile_keys()),
+    "conformance": lambda: iter([_prose(unstated()), "", *_keys(profile_keys())]),
     "mock": lambda: _keys(device_model.reader().keys),
 }
 

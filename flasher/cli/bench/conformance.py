@@ -34,6 +34,7 @@ from flasher.cli.bench.conformance_init import init
 from flasher.cli.bench.conformance_replay import replay
 from flasher.cli.bench.conformance_serve import serve
 from flasher.cli.bench.conformance_text import (
+    FAILED,
     ListedCase,
     difference_lines,
     gap_lines,
@@ -106,10 +107,6 @@ _FILES: Final = {
     for name in ("junit", "json_report", "html", "badge", "summary", "matrix")
 }
 """Report files: their field names in the options, and their options."""
-_FAILED: Final = frozenset(
-    {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.NOT_RUN}
-)
-"""Verdicts of the cases that --rerun-failed selects."""
 _RUN_OPTIONS: Final = frozenset(
     {
         *("--list", "--case", "--group", "--exclude", "--rerun-failed", "--quick"),
@@ -355,7 +352,7 @@ def _only_failed(chosen: Choices, path: Path, target: str) -> Choices:
             where="--rerun-failed",
             remedy=f"Write -t {report.target}, or name another report.",
         )
-    failed = [case_id for case_id, each in verdicts_of(report).items() if each in _FAILED]
+    failed = [case_id for case_id, each in verdicts_of(report).items() if each in FAILED]
     if not failed:
         raise UsageError(
             f"No case of {printable(str(path))} failed: there is nothing to run again.",

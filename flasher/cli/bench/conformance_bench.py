@@ -90,7 +90,7 @@ bench_options: Final = option_set(
     target_option(required=False),
     _bench(
         "--profile", metavar="FILE", type=values.FilePath("toml"), brief=True,
-        help="the product's choices and limits (TOML)",
+        help="the product's choices and limits (TOML); see `flasher conformance profile`",
     ),
     _image("--good-image", brief=True, help="an image that runs on the device"),
     _image("--second-image", help="another one, smaller, of another version"),

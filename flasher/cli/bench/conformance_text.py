@@ -21,6 +21,7 @@ from flasher.conformance.results import (
     CaseVerdict,
     CheckOutcome,
     Gap,
+    InitResult,
     RunReport,
     Times,
     count_text,
@@ -31,6 +32,10 @@ from flasher.protocol.text import printable
 _TEXT_LIMIT: Final = 160
 _CELL: Final = 40
 _NOTES_SHOWN: Final = 12
+FAILED: Final = frozenset(
+    {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.NOT_RUN}
+)
+"""Verdicts of cases that did not pass."""
 _TOLD: Final = (
     CaseVerdict.FAIL,
     CaseVerdict.ERROR,
@@ -126,6 +131,32 @@ def _case_lines(
             yield printable(f"    also: {_short(str(one))}")
     elif len(failed) > 1:
         yield f"    and {counted(len(failed) - 1, 'more failed check')}"
+
+
+def tried_lines(report: RunReport, asked: InitResult) -> Iterator[str]:
+    """The cases that did not pass by a profile that was just determined, each with the keys that
+    decide it and what was observed about them; in one line when all passed.
+    """
+    from flasher.conformance.profile import profile_keys  # noqa: PLC0415  loads pydantic
+
+    bad = [(text, result) for text, result in report.by_case() if result.verdict in FAILED]
+    headline = f"quick cases by this profile: {report.headline}"
+    if not (bad or report.remarks()):
+        yield headline
+        return
+    keys, seen = profile_keys(), {one.key: one.seen for one in asked.answers}
+    yield f"{headline}. What does not pass is a fault of the device, or of a key:"
+    for text, result in bad:
+        yield printable(f"{result.verdict.text.upper()} {text.id} {text.title}: {result.reason}")
+        failure = result.first_failure
+        judged_by = {} if failure is None else failure.judged_by
+        for key, value in judged_by.items():
+            shown = value if isinstance(value, str) else f"{value:g}"
+            choices = f" ({keys[key].allowed})" if keys[key].choices else ""
+            yield printable(f"    {key} = {shown}{choices}: {_short(seen[key])}")
+        if not judged_by:
+            yield "    no key allows this"
+    yield from (printable(f"note: {line}") for line in report.remarks())
 
 
 def _not_judged(report: RunReport) -> Iterator[str]:

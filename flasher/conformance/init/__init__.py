@@ -19,8 +19,8 @@ from flasher.conformance.restore import restore
 from flasher.conformance.results import CaseEnded, InitResult, KeyAnswer, RunStopped
 from flasher.conformance.subject import Subject
 
-UPGRADES: Final = 100
-"""Approximate number of erases: about forty upgrades, size tests and retries."""
+UPGRADES: Final = 180
+"""Approximate number of erases, with those of the quick cases."""
 Question = Callable[[InitSession], Findings]
 QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (
