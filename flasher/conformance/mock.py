@@ -7,8 +7,9 @@ import them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Any, Final, get_args, get_type_hints
 
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.simulated import SimulatedSubject
@@ -154,3 +155,15 @@ def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     given["device.application_bytes"] = device.application_area_bytes
     given["device.largest_image_bytes"] = device.image_limit_bytes
     return ConformanceProfile(given, source="the mock's own choices")
+
+
+def model_of_profile(profile: ConformanceProfile) -> DeviceProfile:
+    """Make the options of a device model that follows a conformance profile as far as it can."""
+    choices: dict[str, Any] = {}
+    kinds = get_type_hints(DeviceProfile)
+    for key, (option, renamed) in _MODEL_OPTIONS.items():
+        names = {given: name for name, given in renamed.items()}
+        value = names.get(profile.choice(key), profile.choice(key))
+        if value in get_args(kinds[option]):
+            choices[option] = value
+    return replace(MOCK_PROFILE, transfer_timeout_s=profile.limit("pause_s"), **choices)

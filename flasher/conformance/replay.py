@@ -82,7 +82,7 @@ def replay(
     compare the device's messages. The good image is flashed again at the end, also after a stop.
     Raises BusError.
     """
-    player = _Player(subject, max(map(profile.limit, _LIMITS)), stopped)
+    player = Player(subject, max(map(profile.limit, _LIMITS)), stopped)
     trouble = ""
     try:
         done = restore(subject, profile, flash=True, stopped=stopped)
@@ -111,7 +111,7 @@ def _answer_ids(target: Target) -> set[int]:
     return {can_id(target.node, to) for to in (None, *Node) if to != target.node}
 
 
-class _Player:
+class Player:
     """Sends frames at their times, later where the device is slower than the recorded one."""
 
     def __init__(
@@ -129,8 +129,11 @@ class _Player:
         """Messages that the device has sent since the last frame to it."""
         self.answers: list[TraceEntry] = []
         self.frames_sent = 0
+        self.sent_at = 0.0
+        """Time of the last frame to the device."""
 
-    def play(self, recorded: Sequence[TraceEntry]) -> None:
+    def play(self, recorded: Sequence[TraceEntry], tail_s: float = _TAIL_S) -> None:
+        """Send the frames; listen for `tail_s` after the last one."""
         late_s = self._port.now() - recorded[0].at_s
         decoder, wanted = Decoder(), 0
         for entry in recorded:
@@ -138,10 +141,11 @@ class _Player:
                 wanted += len(decoder.feed(Frame(*entry.frame), entry.at_s))
                 continue
             late_s += self._await(wanted, entry.at_s + late_s)
+            self.sent_at = self._port.now()
             self._port.send(entry.frame)
             self.frames_sent += 1
             wanted = self._messages = 0
-        self._await(wanted, recorded[-1].at_s + late_s + _TAIL_S)
+        self._await(wanted, recorded[-1].at_s + late_s + tail_s)
 
     def _await(self, wanted: int, due_at: float) -> float:
         """Receive until this time, and longer until the device has sent so many messages. Returns

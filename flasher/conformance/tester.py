@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.profile_time import limits_of
-from flasher.conformance.results import CaseLimitReached, RunStopped, TraceEntry
+from flasher.conformance.results import CaseLimitReached, DeviceCrashed, RunStopped, TraceEntry
 from flasher.conformance.subject import BusPort
 from flasher.conformance.waits import Waits
 from flasher.conformance.wire import (
@@ -305,7 +305,12 @@ class BusTester:
             raise RunStopped("the run was stopped")
         self._note_stall(self._left_port_at)
         until = float(min(deadline, self.ends_at, now + _POLL_S))
-        arrival = self.port.receive(until)
+        try:
+            arrival = self.port.receive(until)
+        except DeviceCrashed:
+            while (arrival := self.port.receive(self.port.now())) is not None:
+                self._record(arrival.at, arrival.frame, sent=arrival.is_echo)
+            raise
         self._left_port_at = self.port.now()
         if arrival is None:
             self._note_stall(max(now, until))

@@ -10,7 +10,7 @@ import pytest
 
 from tests.campaigns.planted_bugs import DUT, plant, read_bugs
 from tests.cli.conftest import Flasher
-from tests.examples.bootloader import PROFILE, emulated, make, missing
+from tests.examples.bootloader import PROFILE, SOURCE, emulated, make, missing
 
 pytestmark = pytest.mark.slow
 
@@ -102,6 +102,51 @@ def test_a_flash_that_fails_is_no_trouble_for_the_example(flasher: Flasher, tmp_
     assert ran.code == 0, ran.out
     (result,) = ran.document["report"]["results"]
     assert result["checks"]["passed"] > 30 * 3  # faults; what runs, a later upgrade and its image
+
+
+@pytest.mark.parametrize(
+    ("number", "action"),
+    [
+        ("24", ("--case", "TX-03")),  # an answer
+        ("36", ("--case", "TX-03")),  # a write to flash that is not erased
+        ("17", ("--case", "UP-08")),  # an image
+        ("24", ("explore", "--replay", "reset update=300 packets=4 packet-beyond")),
+    ],
+)
+def test_what_failed_is_a_test_in_c_that_only_the_right_bootloader_passes(
+    number: str, action: tuple[str, ...], flasher: Flasher, tmp_path: Path
+) -> None:
+    _need("make", "gcc", "patch")
+    (bug,) = [bug for bug in read_bugs() if bug.name.startswith(number)]
+    wrong = plant(bug, tmp_path)
+    make("host", tmp_path, f"DUT={DUT}", source=wrong)
+    test = tmp_path / "exported.c"
+    ran = flasher(
+        *("conformance", *action, "-t", "bms", "--subject", tmp_path / "libboot.so"),
+        *("--profile", PROFILE, "--export-test", test),
+    )
+    assert ran.code == 12
+    strict = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+    sanitizers = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    codes = []
+    for source in (wrong, SOURCE):
+        files = [source / f"{name}.c" for name in ("boot", "store", "message", "crc")]
+        files += [source / "host" / "hal_host.c", test]
+        program = tmp_path / "exported"
+        command: list[str | Path] = [
+            "gcc",
+            *strict,
+            *sanitizers,
+            f"-I{DUT}",
+            f"-I{source}",
+            *files,
+            "-o",
+            program,
+        ]
+        subprocess.run(command, check=True)
+        done = subprocess.run([program], capture_output=True, text=True, check=False)
+        codes.append((done.returncode, done.stdout.partition(":")[0], done.stderr))
+    assert codes == [(1, "FAIL", ""), (0, "PASS", "")]
 
 
 def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ from flasher.cli.bench.conformance_bench import (
     set_option,
 )
 from flasher.cli.bench.conformance_explore import explore
+from flasher.cli.bench.conformance_export import NAME as EXPORT_TEST
+from flasher.cli.bench.conformance_export import check_export, export, export_option
 from flasher.cli.bench.conformance_init import init
 from flasher.cli.bench.conformance_replay import replay
 from flasher.cli.bench.conformance_serve import serve
@@ -112,6 +114,7 @@ _RUN_OPTIONS: Final = frozenset(
         *("--list", "--case", "--group", "--exclude", "--rerun-failed", "--quick"),
         *("--seed", "--repeat", "--jobs", "--timeout"),
         *_FILES.values(),
+        EXPORT_TEST,
         _TRACE_DIR,
         *OUTPUT_OPTIONS,
     }
@@ -250,6 +253,7 @@ class Choices:
     matrix: Annotated[Path | None, _report(
         "--matrix", help="each clause with its cases and their verdicts (.csv or .html)",
     )]  # fmt: skip
+    export_test: Annotated[Path | None, export_option]
     trace_dir: Annotated[Path | None, option(
         _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
         help="folder for a trace file (candump) of each case that does not pass",
@@ -281,6 +285,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     if chosen.is_list:
         return _list(chosen.selection, output)
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
+    from flasher.conformance.dut.exported_test import export_case  # noqa: PLC0415
     from flasher.conformance.runner import SuiteOptions, run  # noqa: PLC0415
 
     bench = described(bench, bus)
@@ -290,6 +295,7 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
             cause="there is one device on a bus",
         )
     _check_files(chosen)
+    check_export(chosen.export_test, bench)
     if chosen.rerun_failed is not None:
         chosen = _only_failed(chosen, chosen.rerun_failed, bench.device.name)
     wear = chosen.selection.wears(chosen.upgrades)
@@ -329,6 +335,18 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
                 observer=observer,
                 stopped=stopped,
             )
+        export(
+            chosen.export_test,
+            (
+                (result.case_id, partial(
+                    export_case, result, case_text(result.case_id, profile).title,
+                    subject, profile, stopped=stopped,
+                ))
+                for result in report.results
+                if result.verdict is CaseVerdict.FAIL
+            ),
+            output,
+        )  # fmt: skip
         was_stopped = stopped()
     code = exit_code(report, was_stopped=was_stopped)
     _tell(report, chosen, output, started_at, code)

@@ -21,6 +21,8 @@ from flasher.cli.bench.conformance_bench import (
     described,
     opened,
 )
+from flasher.cli.bench.conformance_export import NAME as EXPORT_TEST
+from flasher.cli.bench.conformance_export import check_export, export, export_option
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line, typed_values
 from flasher.cli.options import Bus, adapter_options
@@ -47,7 +49,7 @@ _STEPS: Final = 2000
 _WALKS_PER_STEP: Final = 1 / 12
 _ERASES_A_WALK: Final = 2
 _REPLACED: Final = frozenset(
-    {"--steps", "--for", "--seed", "--replay", _TRACE_FILE, "--yes", *OUTPUT_OPTIONS}
+    {"--steps", "--for", "--seed", "--replay", _TRACE_FILE, EXPORT_TEST, "--yes", *OUTPUT_OPTIONS}
 )
 
 
@@ -78,6 +80,7 @@ _what = partial(option, panel="what is run, and how")
     _TRACE_FILE, type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
     help="the frames of the walk that found something (candump)",
 )  # fmt: skip
+@export_option
 @adapter_options
 def explore(
     output: Output,
@@ -90,14 +93,17 @@ def explore(
     replay: str | None,
     yes: bool,
     trace_file: Path | None,
+    export_test: Path | None,
 ) -> int:
     """Walk through valid and invalid messages in any order until the device breaks a rule, and
     find the shortest walk that breaks it.
     """
-    from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
+    from flasher.conformance.dut.exported_test import export_walk  # noqa: PLC0415  much is loaded
+    from flasher.conformance.explore import Explorer  # noqa: PLC0415
 
     bench = described(bench, bus)
     check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
+    check_export(export_test, bench)
     most = steps or (_STEPS if for_s is None else inf)
     if not (bench.is_simulated or replay):
         if most < inf:
@@ -133,6 +139,9 @@ def explore(
             if replay is None
             else explorer.replay(replay.split())
         )
+        finding = explored.finding
+        make = partial(export_walk, explored, subject, profile, stopped=stopped)
+        export(export_test, [("the walk", make)] if finding is not None else [], output)
         was_stopped = stopped()
     code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
     if was_stopped and explored.finding is None:

@@ -22,6 +22,7 @@ from flasher.conformance.results import (
     Unsupported,
     WalkFinding,
 )
+from flasher.conformance.shrink import shrink
 from flasher.conformance.subject import Subject
 from flasher.conformance.waits import Waits
 from flasher.errors import BusError
@@ -162,24 +163,23 @@ class Explorer:
         """Shrink the walk by leaving out steps while it still violates the same rule. Returns the
         best result so far when the run is stopped or the adapter fails.
         """
-        best, rule = list(taken), found[0].rule
-        size, tries = max(len(best) // 2, 1), 0
+        best, rule, is_lost = list(taken), found[0].rule, False
+
+        def attempt(shorter: list[WalkStep]) -> list[WalkStep] | None:
+            nonlocal best, found, is_lost
+            again_taken: list[WalkStep] = []
+            again = self._walk(shorter, again_taken)
+            if again is None:
+                return None
+            is_shown = again[0].rule == rule
+            if is_shown:
+                best, found = again_taken, again
+            is_lost = self._cannot_restore()
+            return again_taken if is_shown else None
+
         with suppress(RunStopped, BusError):
-            while size and tries < SHRINK_TRIES and not self._cannot_restore():
-                start, was_shorter = 0, False
-                while start < len(best) and tries < SHRINK_TRIES:
-                    shorter = best[:start] + best[start + size :]
-                    again_taken: list[WalkStep] = []
-                    tries += 1
-                    again = self._walk(shorter, again_taken) if shorter or rule else None
-                    if again is not None and again[0].rule == rule:
-                        best, found, was_shorter = again_taken, again, True
-                    else:
-                        start += size
-                    if again is not None and self._cannot_restore():
-                        break
-                if not was_shorter:
-                    size //= 2
+            if not self._cannot_restore():
+                shrink(best, attempt, tries=SHRINK_TRIES, is_over=lambda: is_lost)
         return self._finding(found, best, taken)
 
     def _cannot_restore(self) -> bool:
