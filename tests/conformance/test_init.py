@@ -310,6 +310,7 @@ def test_the_longest_gap_in_a_packet_is_found() -> None:
     "seed, wanted",
     (
         (3, {"device.largest_image_bytes": 31744, "up_08": "rejected"}),
+        (9, {"device.largest_image_bytes": 2348, "rs_03_old": "kept"}),
         (
             11,
             {

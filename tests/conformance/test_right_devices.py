@@ -121,6 +121,20 @@ def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() ->
     assert faults_of(21, Selection(cases=("UP-05",)), at_limits=True) == []
 
 
+@each("case_id", ("CR-01", "CR-03"))
+def test_waits_for_late_answers_to_damage_add_up_to_no_pause(case_id: str) -> None:
+    """Two of them take longer than the pause, one does not."""
+    device = dataclasses.replace(MOCK_PROFILE, transfer_timeout_s=2.5, bad_packet="nak_received")
+    given: dict[str, Value] = {"limits.ack_s": 1.5, "limits.inter_frame_s": 0.14, "tx_01": "either"}
+    kind = type("Right", (CountsFromPackets, answers_late(Nak=0.488)), {})
+    assert blamed(case_id, kind=kind, device=device, given=given) == []
+
+
+def test_an_application_starts_after_the_announcements_also_without_a_bus() -> None:
+    device = dataclasses.replace(MOCK_PROFILE, reset_delay_s=3.0)
+    assert blamed("BU-02", device=device, given={"limits.start_s": 1.0}) == []
+
+
 @each("choice", ("once", "either"))
 @each("request_s, ack_s", ((0.3, 0.2), (0.05, 0.45), (2.4, 0.49)))
 def test_a_repeated_update_command_may_be_answered_late(

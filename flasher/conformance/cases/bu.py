@@ -148,7 +148,7 @@ def bus_off(bench: Bench) -> None:
         if not bench.subject.has_power:
             bench.unsupported("the application starts", "needs power control")
             return
-        off_s = bench.waits.burst_s + bench.limit("start_s")
+        off_s = bench.waits.restart_s
         bench.power_cycle()
         bench.subject.bus_off(off_s)
         bench.wait(off_s / 2)
