@@ -9,15 +9,17 @@ single steps of an upgrade, check the answer, and end the case when it is wrong.
 from __future__ import annotations
 
 import random
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from math import inf
 from types import MappingProxyType
 from typing import Final
 
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.judge import Judge, TimeName
 from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import Unsupported
+from flasher.conformance.results import CheckOutcome, Unsupported
 from flasher.conformance.subject import BY_BUS, SIMULATED_BUS, Subject, readback_source
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import (
@@ -34,6 +36,7 @@ from flasher.conformance.wire import (
 
 _PIECES: Final = 64
 """Pieces of a large image that are read over the bus; takes about a second."""
+_CHECKSUM_BYTES: Final = 4
 _EDGE_S: Final = 0.001
 QUIET_S: Final = 0.1
 """A second answer to the same message would arrive within this time."""
@@ -69,6 +72,9 @@ class Bench:
         """Number of upgrades for a case that wears the flash."""
         self.is_off = False
         """True while the case keeps the device switched off."""
+        self.update_tries = 0
+        """How often the last `update` sent its command."""
+        self._good_since = inf
         self.continued_at = -inf
         """When the transfer last went on: the last packet that was acknowledged was sent, or
         request transfer arrived. A pause may count from there (TX-12).
@@ -94,6 +100,13 @@ class Bench:
         return self.port.now()
 
     @property
+    def is_restored(self) -> bool:
+        """True when `check_image` saw the good image run, by its version or in the flash, and
+        nothing was sent to the device afterwards.
+        """
+        return not self.is_off and self.tester.left_at <= self._good_since < inf
+
+    @property
     def is_in_virtual_time(self) -> bool:
         """True when waiting takes no time."""
         return self.port.timestamp_source == SIMULATED_BUS
@@ -109,6 +122,23 @@ class Bench:
         if image is None:
             raise Unsupported("the bench has no second good image")
         return image
+
+    @property
+    def firmware(self) -> Firmware:
+        """The largest images that the bench has, for cases about content and size."""
+        return self.subject.firmware or Firmware(self.good_image, self.subject.second_image)
+
+    def padded(self, size_bytes: int) -> bytes:
+        """The good image padded with FF to `size_bytes`, with a new checksum where the product's
+        images have one (en_04). Unchanged when it does not fit.
+        """
+        image = self.good_image
+        if self.choice("en_04") == "none":
+            return image.ljust(size_bytes, b"\xff")
+        if len(image) > size_bytes - _CHECKSUM_BYTES:
+            return image
+        body = image.ljust(size_bytes - _CHECKSUM_BYTES, b"\xff")
+        return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
     def filler(self, packets: int) -> bytes:
         """Random bytes by the seed, for a transfer that is never ended."""
@@ -165,7 +195,8 @@ class Bench:
         """Send the update command, repeated at every boot version (R2), until request transfer."""
         limit_s = self.limit("erase_s")
         reply: Received | None = None
-        for _ in range(UPDATES_MAX):
+        for tries in range(1, UPDATES_MAX + 1):
+            self.update_tries = tries
             sent = self.send(self.encoder.update(size_bytes))
             reply = self.host.request_or_version(sent.left_at, limit_s)
             if reply is None or reply.kind is Reply.REQUEST:
@@ -279,6 +310,20 @@ class Bench:
         reply = self.expect(Reply.COMPLETE)
         self.measure(TimeName.COMPLETE, reply.at - sent.left_at)
 
+    def end_padded_transfer(self) -> bool:
+        """End the transfer of a `padded` image and require complete. False, recorded as
+        unsupported, when the device rejects the image.
+        """
+        self.send(self.encoder.end())
+        within_s = self.limit("complete_s")
+        reply = self.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
+        if reply is not None and reply.kind is Reply.NAK:
+            why = "the device rejects the padded good image by a check of its own"
+            self.unsupported("the padded image runs", why)
+            return False
+        self.require_received(reply, Reply.COMPLETE.value, within_s)
+        return True
+
     def finish(self, image: bytes, first: int = 1) -> None:
         """Send the packets from `first` on and the end of transfer; check that the image runs."""
         self.packets(image, first)
@@ -310,8 +355,15 @@ class Bench:
 
     def check_image(self, image: bytes) -> None:
         """Check that the application of `image` runs and that the flash holds it."""
+        before = len(self.judge.checks)
         self._check_runs(image)
         self.check_stored(image, runs=True)
+        outcomes = {check.outcome for check in self.judge.checks[before:]}
+        knows = reported_version(self.subject.target, image) is not None or outcomes == {
+            CheckOutcome.PASS
+        }
+        is_good = image == self.good_image and knows and CheckOutcome.FAIL not in outcomes
+        self._good_since = self.now if is_good else inf
 
     def check_application(self, image: bytes | None = None) -> None:
         """Check that the application of `image` (default: the good image) runs. Where it reports no
@@ -407,6 +459,7 @@ class Bench:
 
     def power_off(self) -> None:
         """Switch the device off. Raises Unsupported."""
+        self._good_since = inf
         self.subject.power(on=False)
         self.tester.forgive_stall()
         self.is_off = True

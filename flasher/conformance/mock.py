@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final, get_args, get_type_hints
 
+from flasher.conformance.firmware import GOOD, SECOND
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.simulated import SimulatedSubject
 from flasher.mock.faults import FaultInjector, InOperation, PowerCut
@@ -36,13 +37,16 @@ _WINDOW_TOLERANCE_S: Final = 0.0005
 """The model's clock is exact; only the announcement's time on the wire is rounded."""
 
 
-def model_image(version: str, size_bytes: int) -> bytes:
-    """Make an image for the device model, with `version` and its own checksum in it."""
-    return with_checksum(f"conformance {version}".encode("ascii") + b"\0", size_bytes)
+def model_image(version: str, size_bytes: int, content: bytes = b"") -> bytes:
+    """Make an image of `content` (default: filler) for the device model, with `version` in its head
+    and its own checksum.
+    """
+    head = f"conformance {version}".encode("ascii") + b"\0"
+    return with_checksum(head, size_bytes, content)
 
 
-GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)
-SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
+GOOD_IMAGE: Final = model_image(*GOOD)
+SECOND_IMAGE: Final = model_image(*SECOND)
 
 
 class MockSubject(SimulatedSubject[MockDevice]):
@@ -51,6 +55,8 @@ class MockSubject(SimulatedSubject[MockDevice]):
     `make_device` gets the target's name and the profile (`variant_maker` for a variant). `others`
     are further engines on the same bus.
     """
+
+    has_own_clock = False
 
     def __init__(
         self,
@@ -66,7 +72,9 @@ class MockSubject(SimulatedSubject[MockDevice]):
         super().__init__(
             (make_device or device_maker(MockDevice))(target, profile),
             target,
-            (GOOD_IMAGE, SECOND_IMAGE),
+            model_image,
+            sector_bytes=profile.page_size_bytes,
+            area_bytes=profile.image_limit_bytes,
             name=name,
             good_image=good_image,
             second_image=second_image,

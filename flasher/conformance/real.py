@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.bus.link import Clock, Link, StampingLink
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Arrival, FlashFaults
 from flasher.conformance.wire import RawFrame
@@ -62,6 +63,7 @@ class RealPort:
         self.timestamp_source = f"{source}, sent frames by echo" if echoes else source
         self._last_at = clock.now()
         self._own: deque[Frame] = deque(maxlen=_OWN_FRAMES)
+        self._has_echoed = False
 
     def now(self) -> float:
         return self._clock.now()
@@ -71,6 +73,9 @@ class RealPort:
         if frame.is_error:
             raise Unsupported("an adapter sends no error frames")
         made = Frame(*frame)
+        if not (self.echoes or self._has_echoed) and len(self._own) == _OWN_FRAMES:
+            # None was echoed: an equal frame that arrives from now on is another node's (BU-06).
+            self._own = deque(maxlen=0)
         self._own.append(made._replace(data=b"") if made.is_remote else made)
         self._link.send(made)
 
@@ -94,6 +99,7 @@ class RealPort:
             return True
         if self._own and frame == self._own[0]:
             self._own.popleft()
+            self._has_echoed = True
             return True
         return False
 
@@ -101,9 +107,11 @@ class RealPort:
 class RealSubject:
     """A device on an open adapter, by default without power control and readback."""
 
+    has_own_clock = True
     has_bus_off = False
     has_timed_cuts = False
     flash_faults: FlashFaults | None = None
+    firmware: Firmware | None = None
 
     def __init__(
         self,

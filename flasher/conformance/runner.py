@@ -273,10 +273,12 @@ class SuiteRun:
         return result, bench.judge.stall
 
     def restore_after(self, what: str, bench: Bench, *, flash: bool) -> str:
-        """Restore the device after a case or a user's test that used `bench`; flashes the good
-        image if `flash` is set or it may have been erased. Returns what was wrong with the device,
-        or "".
+        """Restore the device after a case or a user's test that used `bench`, unless that left it
+        restored; flashes the good image if `flash` is set or it may have been erased. Returns what
+        was wrong with the device, or "".
         """
+        if bench.is_restored:
+            return ""
         erased = flash or bench.tester.update_was_sent
         return self._restore(f"after {what}", flash=erased, case_id=what, is_off=bench.is_off)
 

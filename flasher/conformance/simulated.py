@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.firmware import GOOD, SECOND, ImageMaker, make_firmware
 from flasher.conformance.results import DeviceCrashed
 from flasher.conformance.subject import SIMULATED_BUS, Arrival, FlashFaults
 from flasher.conformance.wire import RawFrame
@@ -81,8 +82,11 @@ DeviceT = TypeVar("DeviceT", bound="MockDevice | CompiledDevice")
 
 
 class SimulatedSubject(Generic[DeviceT]):
-    """A simulated device as a subject. Without `good_image` it uses both images of `own`."""
+    """A simulated device as a subject. Without `good_image` it uses images made by `make_image`,
+    some of which look like firmware for the device's erase sectors and application area.
+    """
 
+    has_own_clock: bool
     has_power = has_readback = has_bus_off = has_timed_cuts = True
     flash_faults: FlashFaults | None = None
 
@@ -90,8 +94,10 @@ class SimulatedSubject(Generic[DeviceT]):
         self,
         device: DeviceT,
         target: str,
-        own: tuple[bytes, bytes],
+        make_image: ImageMaker,
         *,
+        sector_bytes: int,
+        area_bytes: int,
         name: str,
         good_image: bytes | None,
         second_image: bytes | None,
@@ -99,8 +105,10 @@ class SimulatedSubject(Generic[DeviceT]):
         self.name = name
         self.target = target
         self.device = device
-        self.good_image = good_image or own[0]
-        self.second_image = second_image or (None if good_image else own[1])
+        self.good_image = good_image or make_image(*GOOD, b"")
+        self.second_image = second_image or (None if good_image else make_image(*SECOND, b""))
+        makes = not (good_image or second_image)
+        self.firmware = make_firmware(make_image, sector_bytes, area_bytes) if makes else None
         self.port = SimulatedPort(WELLING.bitrate_bps)
         self.bus = self.port.bus
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.wire import Encoder, RawFrame
 
 if TYPE_CHECKING:  # the profile needs the validation library, which the list of cases does not
@@ -100,6 +101,10 @@ class Subject(Protocol):
     """An image that runs on the device."""
     second_image: bytes | None
     """Another such image, smaller and of another version."""
+    firmware: Firmware | None
+    """Larger images, which cases about content and size use; None: the two above."""
+    has_own_clock: bool
+    """True when the device counts time by itself, so that its counters can overflow."""
     has_power: bool
     """True when `power` works; likewise the following."""
     has_readback: bool

@@ -34,8 +34,11 @@ def checksum_fits(image: bytes) -> bool:
     return len(image) > _CHECKSUM.size and _CHECKSUM.pack(zlib.crc32(body)) == image[len(body) :]
 
 
-def with_checksum(body: bytes, size_bytes: int) -> bytes:
-    """Fill `body` up to `size_bytes` with varying bytes and the checksum of R7 at the end."""
+def with_checksum(head: bytes, size_bytes: int, content: bytes = b"") -> bytes:
+    """Put `head` at the beginning of `content`, fill it up to `size_bytes` with varying bytes, and
+    put the checksum of R7 at the end.
+    """
+    body = head + content[len(head) : size_bytes - _CHECKSUM.size]
     body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM.size))
     return body + _CHECKSUM.pack(zlib.crc32(body))
 

@@ -41,7 +41,7 @@ def bare(target: str) -> MockSubject:
     subject = MockSubject(target, profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES))
     subject.has_power = subject.has_readback = False
     subject.has_bus_off = subject.has_timed_cuts = False
-    subject.second_image = None
+    subject.second_image = subject.firmware = None
     subject.port.sends_error_frames = False
     send = subject.port.send
 

@@ -79,6 +79,22 @@ def test_own_frames_that_come_back_are_not_taken_for_others() -> None:
     assert arrival.frame.data == b"\x03"
 
 
+def test_an_adapter_that_echoes_nothing_hides_no_frame_that_the_bench_has_sent_too() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    port, device = RealPort(bus.link(), clock, WELLING.bitrate_bps), bus.link()
+    request = RawFrame(0x725, b"\x33\x71\x42\xf8\xf0")
+    for number in range(600):
+        is_request = number == 600 - 256
+        port.send(request if is_request else RawFrame(0x752, number.to_bytes(2, "little")))
+    while device.receive(clock.now() + 1.0) is not None:
+        pass
+    device.send(Frame(*request))
+    arrival = port.receive(2.0)
+    assert arrival is not None
+    assert arrival.frame == request
+
+
 def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock, collides=False)

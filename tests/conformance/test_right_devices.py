@@ -84,7 +84,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
 
 
 def test_many_updates_in_a_row_may_erase_to_the_limit_each() -> None:
-    slow = dataclasses.replace(MOCK_PROFILE, erase_time_s=9.9 / 2)
+    slow = dataclasses.replace(MOCK_PROFILE, erase_time_s=9.9 / 4)  # a record and three pages
     assert blamed("UP-08", device=slow, given={"up_08": "either"}) == []
 
 

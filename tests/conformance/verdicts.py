@@ -36,7 +36,7 @@ def verdicts(
     make_device = None if variant is None else variant_maker(variant)
     subject = MockSubject(target, profile=profile, make_device=make_device)
     if not with_second_image:
-        subject.second_image = None
+        subject.second_image = subject.firmware = None
     if not with_power:
         subject.has_power = False
     # A variant includes choices of its own.

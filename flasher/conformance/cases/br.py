@@ -16,7 +16,7 @@ from flasher.conformance.catalogue import BRING_UP, DESTRUCTIVE, case
     requires={DESTRUCTIVE},
 )
 def two_plain_upgrades(bench: Bench) -> None:
-    second = bench.subject.second_image
-    for image in (second or bench.good_image, bench.good_image):
-        with bench.step("to the good image" if image is bench.good_image else "to the second one"):
+    good, second, _ = bench.firmware
+    for image in (second or good, good):
+        with bench.step("to the good image" if image is good else "to the second one"):
             bench.check_upgrade(image)

@@ -11,6 +11,12 @@ from flasher.conformance.wire import END, WRITE, Received, Reply, describe, pack
 
 _RESET_PERIOD_S: Final = 0.2
 """Interval at which a tool repeats a command (4.3)."""
+_SECTOR_BYTES: Final = 8192
+"""Padded images are as large as whole sectors of this size, or of a smaller one."""
+_LIFETIME: Final = 260
+"""More upgrades than a counter of 8 bits counts."""
+_COUNTED: Final = 256
+"""A counter of 8 bits is 0 again."""
 _MARK: Final = 0x04
 _FLIPPED_MARKS: Final = tuple(_MARK ^ 1 << bit for bit in range(8))
 _WRONG_MARKS: Final = (
@@ -28,15 +34,19 @@ _UPGRADE_KINDS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Re
     "EN-01",
     "end of transfer",
     clause="Welling 5.1, figure 2 (end); Welling 5.2, table 9 (C502); R19",
-    stimulus="all packets, then end of transfer; a restart afterwards",
+    stimulus="all packets, then end of transfer; a restart afterwards; images of one packet, of "
+    f"whole erase sectors, a byte more and a byte less; in virtual time {_LIFETIME} upgrades, and "
+    f"{_COUNTED} transfers without a restart in between",
     expectation="complete within the limit, then the new application, directly or through the "
     "bootloader (en_03), and again after the restart",
     requires={DESTRUCTIVE},
     choices=("en_03",),
+    upgrades=300,
 )
 def end(bench: Bench) -> None:
-    image = bench.subject.second_image or bench.good_image
-    if image is bench.good_image:
+    good, second, sizes = bench.firmware
+    image = second or good
+    if second is None:
         bench.unsupported(
             "an image other than the current one", "the bench has no second good image"
         )
@@ -54,6 +64,34 @@ def end(bench: Bench) -> None:
         bench.reset_to_bootloader()
         bench.collect(bench.waits.burst_s)
         bench.check_application(image)
+    for image in (good, *sizes):
+        with bench.step(f"an image of {len(image)} bytes"):
+            bench.start_transfer(len(image))
+            bench.finish(image)
+    if sizes and bench.is_in_virtual_time:
+        with bench.step(f"{_LIFETIME} upgrades in a row"):
+            for number in range(1, _LIFETIME + 1):
+                done = bench.upgrade(sizes[0])
+                runs = done.ok and bench.application_runs()
+                bench.require(runs, f"upgrade {number} succeeds", done.reason or "no application")
+            bench.check_image(sizes[0])
+        with bench.step(f"update command number {_COUNTED} since a restart"):
+            bench.check_upgrade(good)
+            bench.start_transfer(len(good))
+            for _ in range(_COUNTED - 1 if bench.choice("up_08") == "starts_over" else 0):
+                bench.packet(good, 1)
+                bench.update(len(good))
+            bench.finish(good)
+    whole = len(good) + -len(good) % _SECTOR_BYTES
+    for size in () if sizes else (whole, whole + 1, whole - 1):
+        image = bench.padded(size)
+        if len(good) < len(image) <= bench.number("largest_image_bytes"):
+            with bench.step(f"the good image padded to {size} bytes"):
+                bench.start_transfer(size)
+                bench.packets(image)
+                if not bench.end_padded_transfer():
+                    return
+                bench.check_image(image)
 
 
 @case(
@@ -212,11 +250,11 @@ def wrong_checksum(bench: Bench) -> None:
     requires={DESTRUCTIVE},
 )
 def in_a_row(bench: Bench) -> None:
-    second = bench.subject.second_image
+    good, second, _ = bench.firmware
     if second is None:
         bench.unsupported("a smaller image", "the bench has no second good image")
-        second = bench.good_image
-    images = (bench.good_image, second, bench.good_image)
+        second = good
+    images = (good, second, good)
     bench.reset_to_bootloader()
     for turn, image in enumerate(images, 1):
         with bench.step(f"upgrade {turn}, {len(image)} bytes"):
@@ -252,7 +290,8 @@ def in_a_row(bench: Bench) -> None:
 )
 def version(bench: Bench) -> None:
     before = bench.application_version(bench.limit("start_s"))
-    for image in (bench.second_image(), bench.good_image):
+    good, second, _ = bench.firmware
+    for image in (second or bench.second_image(), good):
         wanted = version_in(image)
         if wanted is None:
             bench.unsupported("the version of the image", "no version text is in it")

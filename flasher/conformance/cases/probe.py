@@ -143,7 +143,7 @@ class Probe(PacketTransfer):
             is_version = found is not None and found.kind is Reply.BOOT_VERSION
             bench.require(is_version, expected, found or "nothing")
         bench.update(len(self.image))
-        bench.judge.note_listening()
+        bench.judge.note_listening(listens=bench.update_tries == 1)
         self.stored = 0
 
     def frames(self) -> list[RawFrame]:

@@ -117,7 +117,8 @@ def no_update(bench: Bench) -> None:
             why = "the device keeps its old application until complete (rs_03_old)"
             bench.unsupported("a bootloader without an application", why)
             return
-        stay_s = _LONG_STAY_S if bench.is_in_virtual_time else _STAY_S
+        can_stay = bench.is_in_virtual_time and bench.subject.has_own_clock
+        stay_s = _LONG_STAY_S if can_stay else _STAY_S
         if bench.choice("rs_03") == "either":
             more = _versions(bench.collect(stay_s))
             bench.info(f"without an application, {more + 1} boot versions in {stay_s:g} s")

@@ -151,7 +151,7 @@ def _send_slowly_until(
     choices=("up_08",),
 )
 def noise(bench: Bench) -> None:
-    image = transfer_image(bench)
+    image = transfer_image(bench, bench.good_image)
     with bench.step("the application"):
         _send_noise(bench)
         bench.check_application()

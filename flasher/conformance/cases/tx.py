@@ -4,7 +4,6 @@ and resets during a transfer.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
@@ -35,7 +34,11 @@ _NUMBER_IN: Final = 1
 _BUFFER_BYTES: Final = 4096
 """Bytes that a device that writes whole pages may hold back until end of transfer."""
 _REPEATS: Final = 2
+_PAGE_ENDS: Final = (8, 16, 32)
+"""Last packets of pages of 1, 2 and 4 KiB."""
 _NUMBER_MAX: Final = 0xFFFF
+_PAST_WRAP: Final = 257
+"""The low byte of its number is that of packet 1."""
 _STORED: Final = 3
 """Packets stored before packets with a wrong header are sent."""
 _START_BYTES: Final = (0x00, 0x02, 0x04, 0x10, 0x81, 0xFF)
@@ -45,15 +48,16 @@ _SHORT: Final = 0.5
 """Share of limits.pause_s that does not count as a pause."""
 _LONG: Final = 1.5
 _JUST_NOT: Final = 0.9
-_CHECKSUM_BYTES: Final = 4
 _WRAP_S: Final = 66.0
 """Longer than 65.536 s, the range of a 16-bit millisecond counter."""
 _APART_S: Final = 3.0
 
 
-def transfer_image(bench: Bench) -> bytes:
-    """The good image, for transfers with faults. Raises Unsupported when it is too small."""
-    image = bench.good_image
+def transfer_image(bench: Bench, chosen: bytes | None = None) -> bytes:
+    """An image for transfers with faults, by default one that looks like firmware. Raises
+    Unsupported when it is too small.
+    """
+    image = bench.firmware.good if chosen is None else chosen
     if packet_count(len(image)) < _PACKETS_MIN:
         raise Unsupported(f"the good image has fewer than {_PACKETS_MIN} packets")
     return image
@@ -144,7 +148,8 @@ def damaged(bench: Bench) -> None:
     "TX-02",
     "ACK lost",
     clause="Welling 5.1, figure 2 (packets); R10",
-    stimulus="first, second and last packet sent again after their ACK, twice each",
+    stimulus="first, second and last packet, and the last one of a page, sent again after their "
+    "ACK, twice each",
     expectation="ACK n again (tx_02), one answer per copy; nothing is written twice",
     requires={DESTRUCTIVE},
     choices=("tx_02",),
@@ -157,7 +162,8 @@ def repeated(bench: Bench) -> None:
     "TX-05",
     "repeated number with other data",
     clause="R10",
-    stimulus="first, second and last packet again, with other data and a right CRC",
+    stimulus="first, second and last packet, and the last one of a page, again, with other data "
+    "and a right CRC",
     expectation="answered as a repetition (tx_02); the first data are kept",
     requires={DESTRUCTIVE},
     choices=("tx_02",),
@@ -170,7 +176,8 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     """Transfer with repeated packets whose data are the `changed` data of the first copy."""
     image, choice = transfer_image(bench), bench.choice("tx_02")
     total = packet_count(len(image))
-    for number in bench.transfer_in_parts(image, (1, 2, total)):
+    ends = (number for number in _PAGE_ENDS if number < total)
+    for number in bench.transfer_in_parts(image, (1, 2, *ends, total)):
         payload = changed(packet_payload(image, number))
         allowed = bench.repetition_answers(number)
         # After the last packet there is no next packet to request.
@@ -287,8 +294,8 @@ def wrong_start_byte(bench: Bench) -> None:
     "TX-07",
     "many packets",
     clause="Welling 5.2, table 8 (A385); R4; R9",
-    stimulus="the largest image, all its packets: across 255/256, up to the last one; then "
-    "the good image padded with FF, including end of transfer",
+    stimulus="the largest image, begun anew after packet 257; all its packets: across 255/256, up "
+    "to the last one; then the good image padded with FF, including end of transfer",
     expectation="every packet is accepted and stored at its place; the second image runs",
     requires={DESTRUCTIVE, LONG},
     largest=2,
@@ -302,6 +309,10 @@ def many_packets(bench: Bench) -> None:
     size = bench.number("largest_image_bytes")
     image = bench.random.randbytes(size)
     bench.start_transfer(size)
+    if packet_count(size) > _PAST_WRAP:
+        if not _send_all(bench, image, _PAST_WRAP):
+            return
+        bench.restart_transfer(size)
     if not _send_all(bench, image):
         return
     # Not ended, since the image cannot run; skip what may still be buffered.
@@ -312,24 +323,19 @@ def many_packets(bench: Bench) -> None:
         bench.unsupported("the flash holds the image", "all of it may still be buffered")
     with bench.step("once more, to its end"):
         bench.leave_transfer()
-        whole = _largest_valid_image(bench, size)
+        whole = bench.padded(size)
         bench.update(len(whole))
         if not _send_all(bench, whole):
             return
-        bench.send(bench.encoder.end())
-        within_s = bench.limit("complete_s")
-        reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
-        if reply is not None and reply.kind is Reply.NAK:
-            why = "the device rejects the padded good image by a check of its own"
-            bench.unsupported("the largest image runs", why)
-            return
-        bench.require_received(reply, Reply.COMPLETE.value, within_s)
-        bench.check_image(whole)
+        if bench.end_padded_transfer():
+            bench.check_image(whole)
 
 
-def _send_all(bench: Bench, image: bytes) -> bool:
-    """Send all packets and record one check, as up to 65535 would be too many; False on failure."""
-    total = packet_count(len(image))
+def _send_all(bench: Bench, image: bytes, last: int | None = None) -> bool:
+    """Send all packets, or those up to `last`, and record one check, as up to 65535 would be too
+    many; False on failure.
+    """
+    total = last or packet_count(len(image))
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
         reply = bench.next_message(bench.limit("ack_s"))
@@ -339,19 +345,6 @@ def _send_all(bench: Bench, image: bytes) -> bool:
         bench.measure(TimeName.ANSWER, reply.at - sent.left_at)
     bench.succeed(f"ACK 1 to {total}", "all of them")
     return True
-
-
-def _largest_valid_image(bench: Bench, size: int) -> bytes:
-    """The good image padded with FF to `size` bytes, with a new checksum where the product's images
-    have one.
-    """
-    image = bench.good_image
-    if bench.choice("en_04") == "none":
-        return image.ljust(size, b"\xff")
-    if len(image) > size - _CHECKSUM_BYTES:
-        return image
-    body = image.ljust(size - _CHECKSUM_BYTES, b"\xff")
-    return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
 
 @case(

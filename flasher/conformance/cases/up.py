@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from flasher.conformance.bench import Bench
+from flasher.conformance.cases.probe import Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import (
@@ -174,8 +175,8 @@ def repeated(bench: Bench) -> None:
     "update command that is not for this device",
     clause="Welling 5.2, table 8 (A10B); Welling 2.2.2, table 2",
     stimulus="names of other targets, each letter another one, small letters; payload too short, "
-    "too long, longer than the command states; as a read",
-    expectation="rejected; the old application starts",
+    "too long, longer than the command states; as a read; a valid one after other targets' names",
+    expectation="rejected; the old application starts; the valid one is accepted",
     requires={DESTRUCTIVE},
     choices=("up_02",),
 )
@@ -197,6 +198,11 @@ def wrong_names(bench: Bench) -> None:
     ):
         stimuli[step] = encoder.message(mode, command, data)
     check_updates_rejected(bench, stimuli)
+    with bench.step("names of other targets, then a valid update command"):
+        others = (encoder.update(size, other.update_text) for other in encoder.others())
+        probe = Probe(bench)
+        probe.enter_after_rejected(*others)
+        probe.send_next()
 
 
 @case(
@@ -210,7 +216,7 @@ def wrong_names(bench: Bench) -> None:
     choices=("up_08",),
 )
 def in_transfer(bench: Bench) -> None:
-    image = bench.good_image
+    image = bench.firmware.good
     total = packet_count(len(image))
     if total <= _FIRST_PACKETS:
         bench.unsupported("a transfer of 4 packets or more", "the good image is too small")
@@ -246,7 +252,7 @@ def _starts_over(bench: Bench) -> bool:
     """True when an update command during a transfer of the same image starts it over. Ends with the
     application running.
     """
-    image, number = bench.good_image, _FIRST_PACKETS + 1
+    image, number = bench.firmware.good, _FIRST_PACKETS + 1
     bench.start_transfer(len(image))
     bench.packets(image, 1, _FIRST_PACKETS)
     bench.send(bench.encoder.update(len(image)))

@@ -42,12 +42,12 @@ _FLASH_PASSES_MAX: Final = 16
 """A call may read, erase, write and log this many times the size of the flash."""
 
 
-def application_image(version: str, size_bytes: int) -> bytes:
-    """Make an image that the simulated application runs: it starts like a Cortex-M program and
-    contains its size and checksum.
+def application_image(version: str, size_bytes: int, content: bytes = b"") -> bytes:
+    """Make an image of `content` (default: filler) that the simulated application runs: it starts
+    like a Cortex-M program and contains its size and checksum.
     """
-    body = _HEAD.pack(_STACK, _ENTRY, _MAGIC, size_bytes) + version.encode("ascii") + b"\0"
-    return with_checksum(body, size_bytes)
+    head = _HEAD.pack(_STACK, _ENTRY, _MAGIC, size_bytes) + version.encode("ascii") + b"\0"
+    return with_checksum(head, size_bytes, content)
 
 
 def _is_incomplete(area: bytes) -> bool:

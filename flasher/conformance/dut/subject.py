@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
-from typing import Final
 
 from flasher.conformance.dut.device import CompiledDevice, application_image
 from flasher.conformance.dut.pipes import ABI_WITH_ERRORS
@@ -14,14 +13,13 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.simulated import SimulatedSubject
 from flasher.protocol.spec import TARGETS, WELLING
 
-_GOOD: Final = ("V2r0r1_20240131", 10 * 128 - 3)
-_SECOND: Final = ("V1r9r0_20230517", 6 * 128)
-
 
 class CompiledSubject(SimulatedSubject[CompiledDevice]):
     """A device with the bootloader of `process`. Without `good_image` it uses images that the
     simulated application runs.
     """
+
+    has_own_clock = True
 
     def __init__(
         self,
@@ -35,7 +33,9 @@ class CompiledSubject(SimulatedSubject[CompiledDevice]):
         super().__init__(
             device,
             target,
-            (application_image(*_GOOD), application_image(*_SECOND)),
+            application_image,
+            sector_bytes=device.facts.sector_bytes,
+            area_bytes=device.facts.application_bytes,
             name=f"{device.facts.name or 'the bootloader'} ({process.subject})",
             good_image=good_image,
             second_image=second_image,
