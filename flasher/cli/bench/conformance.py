@@ -211,7 +211,7 @@ class Choices:
     )]  # fmt: skip
     quick: Annotated[bool, _what(
         "--quick", is_flag=True, brief=True,
-        help="some of every group, in under a minute on a real bus",
+        help="some of every group, in under a minute on a real bus with an image of a few KiB",
     )]  # fmt: skip
     seed: Annotated[str, _what(
         "--seed", default="1", metavar="SEED", help="decides all that is left to chance",
