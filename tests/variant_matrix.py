@@ -119,8 +119,6 @@ def document(rows: Iterable[Row]) -> str:
         caught = ", ".join(row.variant for row in rows if case_id in row.fails)
         caught = NOT_OF_MODEL.get(case_id, caught)
         lines.append(f"| {case_id} | {CASES[case_id].title} | {caught} |")
-    lines += ["", "## Not seen", ""]
-    lines += [f"- {name}: {one.unseen}." for name, one in VARIANTS.items() if one.unseen]
     if NOT_IMPLEMENTED:
         lines += ["", "## Not done in software", ""]
         lines += [f"- {case_id}: {reason}" for case_id, reason in NOT_IMPLEMENTED.items()]

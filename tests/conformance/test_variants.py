@@ -14,7 +14,7 @@ from tests.loops import each
 from tests.variant_matrix import NOT_OF_MODEL, Row, groups_passed, listed_rows, row_of
 
 LISTED = listed_rows()
-_NAMES = [name for name, variant in VARIANTS.items() if not variant.unseen]
+_NAMES = list(VARIANTS)
 SAMPLE = [
     _NAMES[0],
     *_NAMES[4:-1:8],
@@ -42,7 +42,7 @@ def test_the_table_has_every_variant() -> None:
 
 def test_every_variant_fails_the_case_of_its_clause() -> None:
     missed = [name for name, fails in LISTED.items() if VARIANTS[name].clause not in fails]
-    assert missed == [name for name, variant in VARIANTS.items() if variant.unseen]
+    assert missed == []
 
 
 def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:

@@ -47,8 +47,6 @@ class Variant:
     # may fail as well.
     everywhere: bool = False
     """Every transfer triggers the fault, so that any case with one may fail."""
-    unseen: str = ""
-    """Reason why no case detects it on a bench."""
     upgrade_works: bool = True
     """False when not even an undisturbed upgrade to an ordinary image succeeds."""
     # Ordinary: of some 1000 bytes, no multiple of 128. Well: with that image running.

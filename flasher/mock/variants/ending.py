@@ -72,7 +72,11 @@ class KeepsLongerRest(PlainStore):
         return [operation for operation in operations if operation.address != kept]
 
 
-@variant("reports-old-version", "EN-08", also="EN-01 EN-07")
+@variant(
+    "reports-old-version",
+    "EN-08",
+    also="UP-08 TX-01 TX-02 TX-03 TX-04 TX-05 TX-06 TX-13 EN-01 EN-02 EN-07 SE-04",
+)
 class ReportsOldVersion(MockDevice):
     """Reports the version from before the upgrade until power is cut (a BMS). Reads the version of
     its application at power-up only.
@@ -263,8 +267,7 @@ class AnyEndByte(MockDevice):
 
 @variant(
     "single-packet-image-fails",
-    "UP-01",
-    unseen="it takes an image of one packet that runs; a part of one is never ended",
+    "EN-01",
 )
 class SinglePacketImageFails(MockDevice):
     """Refuses the end of transfer of an image of one packet. Looks for the last packet where one is

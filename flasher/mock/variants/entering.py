@@ -152,7 +152,12 @@ class SilentPowerUp(MockDevice):
         return detail
 
 
-@variant("full-last-packet-fails", "UP-01", also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12")
+@variant(
+    "full-last-packet-fails",
+    "UP-01",
+    also="UP-08 TX-01 TX-02 TX-03 TX-04 TX-05 TX-06 TX-07 TX-12 TX-13 EN-01 EN-02 EN-07 EN-08 "
+    "PW-01 PW-02 SE-01 SE-04",
+)
 class FullPacketsFail(ReceivedTransfer):
     """Expects one packet more when the size is a multiple of 128."""
 
@@ -356,7 +361,7 @@ class SixteenBitSize(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("hangs-at-20th-update", "UP-08", also="FR-07 UP-05 UP-06 TX-12 TM-05 PW-01")
+@variant("hangs-at-20th-update", "UP-08", also="FR-07 TX-12 EN-01 BU-01 PW-01")
 class HangsAt20thUpdate(HangingDevice):
     """Hangs at the 20th update command since power-up until power is cut. Allocates a buffer for
     each transfer, and frees none.

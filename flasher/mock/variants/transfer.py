@@ -362,7 +362,11 @@ class AcksTwice(MockDevice):
         return detail
 
 
-@variant("blank-packet-unanswered", "FR-03", also="TX-07")
+@variant(
+    "blank-packet-unanswered",
+    "FR-03",
+    also="UP-08 TX-01 TX-02 TX-03 TX-04 TX-05 TX-06 TX-07 TX-13 EN-01 EN-02 EN-07 EN-08 SE-04",
+)
 class BlankPacketUnanswered(MockDevice):
     """Acknowledges a packet of FF bytes only when it is repeated. Has no data to program for a
     blank packet, and forgets to answer it.
