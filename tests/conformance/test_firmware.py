@@ -75,12 +75,10 @@ def test_a_case_that_leaves_the_good_image_running_needs_no_restore() -> None:
 
 def test_what_is_sent_after_the_check_of_the_image_makes_a_restore_necessary() -> None:
     bench = Bench(subject(), profile_of_mock(), limit_s=100.0)
-    bench.check_upgrade()
-    assert bench.is_restored
-    bench.power_cycle()
-    assert not bench.is_restored
-    bench.check_upgrade()
-    bench.send(bench.encoder.reset())
-    assert not bench.is_restored
+    seen: list[bool] = []
+    for later in (lambda: None, bench.power_cycle, lambda: bench.send(bench.encoder.reset())):
+        bench.check_upgrade()
+        later()
+        seen.append(bench.is_restored)
     bench.check_upgrade(SECOND_IMAGE)
-    assert not bench.is_restored
+    assert [*seen, bench.is_restored] == [True, False, False, False]

@@ -46,7 +46,8 @@ class ImpatientWithGaps(MockDevice):
 @variant(
     "slow-sixteenth-packet",
     "TM-05",
-    also="UP-08 TX-01 TX-02 TX-03 TX-04 TX-05 TX-06 TX-07 TX-12 TX-13 EN-01 EN-02 EN-07 EN-08 SE-04",
+    also="UP-08 TX-01 TX-02 TX-03 TX-04 TX-05 TX-06 TX-07 TX-12 TX-13 EN-01 EN-02 EN-07 EN-08 "
+    "SE-04",
 )
 class SlowSixteenth(MockDevice):
     """Acknowledges packets 16, 32, ... after 0.6 s."""
