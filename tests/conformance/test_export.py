@@ -42,7 +42,7 @@ class IgnoresAnEarlyEnd(PythonBootloader):
 
 class SpoilsSmallImages(PythonBootloader):
     def _end(self) -> None:
-        if self._size == 6 * 128:
+        if self._size == 128:
             self.host.flash_erase(0x1000)
             self.host.flash_write(0x1000, bytes(8))
         super()._end()
@@ -113,8 +113,8 @@ def test_an_image_has_to_be_in_the_flash() -> None:
     made = exported(_FLAWS + "SpoilsSmallImages", "EN-01")
     text = made.code.decode("ascii")
     assert "CHECK_IMAGE = 1," in text or "CHECK_STARTED = 1," in text
-    assert len(lines(made, "image")) == 6 * 128 // 16
-    assert made.messages == 2 + 6 + 1
+    assert len(lines(made, "image")) == 128 // 16
+    assert made.messages == 2 + 1 + 1
 
 
 @pytest.mark.slow
