@@ -16,6 +16,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.dut.subject import CompiledSubject
 from flasher.conformance.mock import MockSubject, model_of_profile
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.replay import Player
 from flasher.conformance.restore import restore
@@ -238,7 +239,9 @@ def _sent_image(trace: Sequence[TraceEntry], subject: Subject, encoder: Encoder)
         for entry in trace
         if entry.sent and entry.frame.can_id == encoder.to_device
     )
-    images = [image for image in (subject.second_image, subject.good_image) if image is not None]
+    good, second, sizes = subject.firmware or Firmware(subject.good_image, subject.second_image)
+    known = (subject.second_image, subject.good_image, good, second, *sizes)
+    images = [image for image in known if image is not None]
     places = {
         image: sent.rfind(b"".join(frame.data for frame in encoder.update(len(image))))
         for image in images
