@@ -15,8 +15,8 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.dut.subject import CompiledSubject
-from flasher.conformance.mock import MockSubject, model_of_profile
 from flasher.conformance.firmware import Firmware
+from flasher.conformance.mock import MockSubject, model_of_profile
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.replay import Player
 from flasher.conformance.restore import restore
