@@ -319,6 +319,14 @@ class RightDevice(NamedTuple):
             timings=dataclasses.replace(DEFAULT_TIMINGS, **self.timings),  # type: ignore[arg-type]
         )
 
+    def subject(self) -> MockSubject:
+        """It on its bench."""
+        made = MockSubject(self.target, profile=self.choices, make_device=self.make)
+        if self.is_bare:
+            for ability in ("has_power", "has_readback", "has_bus_off", "has_timed_cuts"):
+                setattr(made, ability, False)
+        return made
+
     def __str__(self) -> str:
         mro = self.device_type.__mro__
         kinds = [kind.__name__ for kind in mro[1 : mro.index(MockDevice)]]
@@ -479,10 +487,7 @@ def faults_of(
     device = right_device(seed, at_limits=at_limits)
     found: list[str] = []
     for name, profile in device.profiles.items():
-        subject = MockSubject(device.target, profile=device.choices, make_device=device.make)
-        if device.is_bare:
-            for ability in ("has_power", "has_readback", "has_bus_off", "has_timed_cuts"):
-                setattr(subject, ability, False)
+        subject = device.subject()
         report = run(subject, profile, selection=selection)
         found += [
             f"{seed} {name} {result.case_id} {result.verdict.value}: {result.reason}"

@@ -524,10 +524,7 @@ def reset(bench: Bench) -> None:
             if choice == "ignored":
                 bench.expect_silence(why="silence, no restart")
                 continue
-            reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_restart_s(bench))
-            if reply is None and bench.limit("first_version_s") > _restart_s(bench):
-                reply = _restarts_later(bench, image, stored)
-                done += reply is None and stored < total
+            reply, done = restarted(bench, image, stored)
             if choice == "restarts":
                 within_s = bench.limit("first_version_s")
                 bench.require_received(reply, Reply.BOOT_VERSION.value, within_s)
@@ -538,6 +535,17 @@ def reset(bench: Bench) -> None:
     with bench.step("a new upgrade"):
         bench.start_transfer(len(image))
         bench.finish(image)
+
+
+def restarted(bench: Bench, image: bytes, stored: int) -> tuple[Received | None, int]:
+    """After a reset with `stored` packets stored: the boot version of a restart, or None, and how
+    many packets are stored then. Raises CaseStopped for a device that does not answer.
+    """
+    reply = bench.wait_for(Reply.BOOT_VERSION, within_s=_restart_s(bench))
+    if reply is not None or bench.limit("first_version_s") <= _restart_s(bench):
+        return reply, stored
+    reply = _restarts_later(bench, image, stored)
+    return reply, stored + (reply is None and stored < packet_count(len(image)))
 
 
 def _restart_s(bench: Bench) -> float:

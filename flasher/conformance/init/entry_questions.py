@@ -90,9 +90,15 @@ def upgrade(session: InitSession) -> Findings:
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
             yield Trial("starts", "no boot version", "complete", "after")
-        session.await_application(TimeName.START, complete_at)
+        has_query = bench.encoder.has_version_query
+        session.await_application(TimeName.START if has_query else "", complete_at)
         last = session.enter(bench.number("versions"))
         session.await_application(TimeName.START_AGAIN, last.at)
+        if not has_query:  # above, the wait for a boot version outlasted the start
+            session.begin()
+            session.packets()
+            bench.end_transfer()
+            session.await_application(TimeName.START, bench.now)
 
 
 def _measure_naks(session: InitSession) -> None:
@@ -383,16 +389,23 @@ def largest_image(session: InitSession) -> Findings:
         bench.leave_transfer()
     erase_s = max(one.value_s for one in bench.judge.measurements if one.name == TimeName.REQUEST)
 
+    in_transfer = restarts_at_once
+
     def is_taken(size_bytes: int) -> bool:
-        if keeps_old and not restarts_at_once:  # it announces itself
+        nonlocal in_transfer
+        if keeps_old and not in_transfer:
             bench.wait_until_listening()
         share = packet_count(size_bytes) / session.total
         within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
-        taken = _is_size_taken(session, bench.encoder.update(size_bytes), within_s)
+        reply = _answer_to_size(session, bench.encoder.update(size_bytes), within_s)
+        taken = reply is not None and reply.kind is Reply.REQUEST
         if taken and not restarts_at_once:
             bench.leave_transfer()
+        in_transfer = restarts_at_once and (
+            taken or (in_transfer and reply is not None and reply.kind is Reply.NAK)
+        )
         within_s = bench.waits.burst_s + bench.limit("start_s")
-        if not taken and keeps_old and bench.application_runs(within_s):
+        if keeps_old and not (taken or in_transfer) and bench.application_runs(within_s):
             session.enter()  # its announcements ended meanwhile
         return taken
 
@@ -414,12 +427,15 @@ def largest_image(session: InitSession) -> Findings:
     yield KeyAnswer("device.largest_image_bytes", low, seen)
 
 
-def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float) -> bool:
-    """True when request transfer follows, False after a NAK or further announcements."""
+def _answer_to_size(
+    session: InitSession, frames: list[RawFrame], within_s: float
+) -> Received | None:
+    """Return request transfer, NAK, the last of several further announcements, or None."""
     bench = session.bench
     bench.forget()
     sent = bench.send(frames)
     deadline, versions = sent.left_at + within_s, 0
+    reply: Received | None = None
     kinds = (Reply.REQUEST, Reply.NAK, Reply.BOOT_VERSION)
     while versions < 3:
         reply = bench.wait_for(*kinds, within_s=deadline - bench.now)
@@ -427,8 +443,8 @@ def _is_size_taken(session: InitSession, frames: list[RawFrame], within_s: float
             break
         if reply.kind is Reply.REQUEST:
             bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
-            return True
+            return reply
         versions += reply.at > sent.left_at + UPDATE_SPACING_S
     if versions:  # a late NAK would be taken for the answer to the next size
         bench.collect(bench.waits.settle_s)
-    return False
+    return reply

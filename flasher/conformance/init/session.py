@@ -12,7 +12,7 @@ from flasher.conformance.cases.probe import PacketTransfer
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.restore import needs_power
-from flasher.conformance.results import Unsupported
+from flasher.conformance.results import CaseStopped, Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.waits import Waits
 from flasher.conformance.wire import DeviceDecoder, RawFrame, Received, Reply, describe
@@ -60,12 +60,9 @@ class InitSession(PacketTransfer):
         within_s = bench.limit("start_s") + bench.waits.burst_s
         if not bench.encoder.has_version_query:
             # The only query would be a reset, which restarts the bootloader.
-            self.settle()
             if name:
-                runs = bench.application_runs()
-                bench.require(runs, "an application that answers", "no answer")
-                bench.measure(name, bench.now - since)
-                self.settle()
+                bench.measure(name, self._reset_answered(within_s) - since)
+            self.settle()
             return
         reply = bench.host.version_answer(within_s, every_s=_ASK_S)
         found = bench.require_received(reply, "an application that answers", within_s)
@@ -73,12 +70,36 @@ class InitSession(PacketTransfer):
             bench.measure(name, found.at - since)
         bench.forget()
 
+    def _reset_answered(self, within_s: float) -> float:
+        """Reset until the application answers by general feedback; returns when that was sent."""
+        bench = self.bench
+        deadline = bench.now + within_s
+        while True:
+            # In its announcements, a reset may restart the bootloader.
+            while bench.wait_for(Reply.BOOT_VERSION, within_s=_BURST_GAP_S) is not None:
+                pass
+            with bench.tester.collecting_feedback():
+                sent = bench.send(bench.encoder.reset())
+                reply = bench.wait_for(Reply.FEEDBACK)
+            if reply is not None or bench.now >= deadline:
+                bench.require_received(reply, "an application that answers", within_s)
+                return sent.at
+
     # -- the bootloader ---------------------------------------------------------------------------
 
     def enter(self, version: int = 1) -> Received:
-        """Reset the application and return boot version number `version` of the burst."""
-        bench = self.bench
-        found = bench.reset_measured(bench.limit("first_version_s"))
+        """Reset the application and return boot version number `version` of the burst. Where there
+        is no version query, the application may still be starting, and the reset is repeated.
+        """
+        bench, within_s = self.bench, self.bench.limit("first_version_s")
+        give_up_at = bench.now + bench.limit("start_s")
+        found: Received | None = None
+        while found is None:
+            try:
+                found = bench.reset_measured(within_s)
+            except CaseStopped:
+                if bench.encoder.has_version_query or bench.now > give_up_at:
+                    raise
         for _ in range(version - 1):
             found = bench.await_message(Reply.BOOT_VERSION, within_s=_BURST_GAP_S)
         return found

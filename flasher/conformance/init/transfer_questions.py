@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
+from flasher.conformance.cases.tx import restarted
 from flasher.conformance.init.answers import Findings, Trial, gap_answer, pause_answer
 from flasher.conformance.init.session import ANSWER_S, REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
@@ -29,8 +30,7 @@ _GAP_WATCHED_S: Final = 1.6
 _GAP_RESOLUTION_S: Final = 0.002
 _LATER_S: Final = 0.5
 _PAUSE_WATCHED_S: Final = 30.0
-_BEFORE_PAUSE: Final = 0.9
-_END_ANSWERS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE, Reply.FEEDBACK)
+_END_ANSWERS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE)
 _SEVERAL_PAGES: Final = 65
 """Packets, one more than 8 KiB."""
 
@@ -43,6 +43,7 @@ def _repeat_trial(
 ) -> Iterator[Trial]:
     """Send `frames` several times; `words` maps answers to values, with "NAK" for any other NAK."""
     for _ in range(REPEATS):
+        session.bench.stay_before(session.image, session.number)
         session.bench.forget()
         session.bench.send(frames)
         replies = session.bench.answers()
@@ -347,16 +348,12 @@ def pause(session: InitSession) -> Findings:
 def reset_again(session: InitSession) -> Findings:
     """Determine the effect of a reset before, between and after the packets."""
     bench = session.bench
-    within_s = bench.limit("first_version_s")
-    if bench.choice("tx_12") == "announces":
-        # Later than that, the pause ends the transfer.
-        within_s = min(within_s, _BEFORE_PAUSE * bench.limit("pause_s"))
     for stored in (0, 1, session.total):
         session.begin()
         session.packets(stored)
         bench.forget()
         bench.send(bench.encoder.reset())
-        reply = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+        reply, session.stored = restarted(bench, session.image, stored)
         stimulus = f"reset after packet {stored}" if stored else "reset before packet 1"
         value, answer = ("restarts", "boot version") if reply else ("ignored", "no boot version")
         yield Trial(value, answer, stimulus, "after")
@@ -375,13 +372,11 @@ def end_again(session: InitSession) -> Findings:
         session.begin()
         session.packets()
         bench.end_transfer()
-        with bench.tester.collecting_feedback():
-            bench.send(bench.encoder.end())
-            replies = bench.collect(bench.limit("ack_s"))
+        bench.send(bench.encoder.end())
+        replies = bench.collect(bench.limit("ack_s"))
         replies = [one for one in replies if one.kind in _END_ANSWERS]
         kinds = [one.kind for one in replies]
-        # A running application may send general feedback to an unknown message (R17).
-        words = {(): "silence", (Reply.FEEDBACK,): "silence", (Reply.COMPLETE,): "same_answer"}
+        words = {(): "silence", (Reply.COMPLETE,): "same_answer"}
         yield Trial(words.get(tuple(kinds), ""), answer_text(replies), "end of transfer again")
         session.await_application()
 
