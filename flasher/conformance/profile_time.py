@@ -23,6 +23,10 @@ class ProfileTime(float):
         found.limits = limits
         return found
 
+    def __reduce__(self) -> tuple[type[ProfileTime], tuple[float, dict[str, float]]]:
+        # For reports of other processes, and for copies.
+        return ProfileTime, (float(self), dict(self.limits))
+
     def _computed(self, value_s: float, other: float) -> ProfileTime:
         return ProfileTime(value_s, {**self.limits, **limits_of(other)})
 
