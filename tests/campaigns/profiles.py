@@ -48,12 +48,14 @@ def faults(seed: int, selection: Selection = Selection()) -> list[str]:  # noqa:
 def _wrong_answers(device: RightDevice, asked: InitResult) -> Iterator[str]:
     """Answers that are not the device's, and keys that stay open without need."""
     own = device.profiles["fitting"]
+    can_leave = own.choice("tx_12") == "announces" or own.choice("tx_13") == "restarts"
     keeps_old = own.given["rs_03_old"] == "kept"
     may_be_open = {
         *NOT_ASKED,
         *(("limits.pause_s",) if own.choice("tx_12") == "waits" else ()),
         *(("rs_03", "device.buffer_bytes") if keeps_old else ()),
         *(("device.buffer_bytes",) if device.is_bare else ()),
+        *(("rs_03", "rs_03_old") if device.is_bare and not can_leave else ()),
     }
     for one in asked.answers:
         if one.value is None:

@@ -549,11 +549,13 @@ def restarted(bench: Bench, image: bytes, stored: int) -> tuple[Received | None,
 
 
 def _restart_s(bench: Bench) -> float:
-    """How long to wait for a restart: no longer than a transfer lasts without a packet."""
-    within_s = bench.limit("first_version_s")
+    """How long to wait for a restart: the next packet has to be answered before a pause that ends
+    the transfer.
+    """
+    within_s, pause_s = bench.limit("first_version_s"), bench.limit("pause_s")
     if bench.choice("tx_12") == "waits":
         return within_s
-    return min(within_s, _JUST_NOT * bench.limit("pause_s"))
+    return min(within_s, max(_JUST_NOT * pause_s - bench.limit("ack_s"), pause_s / 2))
 
 
 def _restarts_later(bench: Bench, image: bytes, stored: int) -> Received | None:
