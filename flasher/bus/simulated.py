@@ -149,6 +149,11 @@ class SimulatedBus:
         self._hosts.append(host)
         return SimulatedLink(self, host, queue_frames)
 
+    @property
+    def is_idle(self) -> bool:
+        """True when no frame is on the wire, or waits for it."""
+        return self._sending is None and not any(node.outbox for node in self._nodes)
+
     def advance(self, limit: float) -> None:
         """Advance to the next event on the bus, at latest to `limit`."""
         clock, faults = self.clock, self.faults

@@ -41,7 +41,12 @@ class SimulatedPort:
         self._arrived: deque[tuple[Frame, float]] = deque()
         self._pending: deque[tuple[Frame, RawFrame]] = deque()
         """Frames that have not left yet."""
+        self._receives_until = _AT_ONCE
         self.now = self.bus.clock.now
+
+    def quiet_until(self) -> float:
+        """Time until which nothing is sent unless something is received: while `receive` waits."""
+        return self._receives_until if self.bus.is_idle else _AT_ONCE
 
     def send(self, frame: RawFrame) -> None:
         made = Frame(*frame)
@@ -51,11 +56,15 @@ class SimulatedPort:
 
     def receive(self, deadline: float) -> Arrival | None:
         if not self._arrived:
-            with REPORT_CRASHES:
-                while not self._arrived and self.now() < deadline:
-                    self.bus.advance(deadline)
-                    if not self._arrived:
-                        self._take_reports()
+            self._receives_until = deadline
+            try:
+                with REPORT_CRASHES:
+                    while not self._arrived and self.now() < deadline:
+                        self.bus.advance(deadline)
+                        if not self._arrived:
+                            self._take_reports()
+            finally:
+                self._receives_until = _AT_ONCE
             if not self._arrived:
                 return None
         frame, at = self._arrived.popleft()

@@ -12,11 +12,13 @@ import sys
 import zlib
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut import CanFrame, Facts, Host
+from flasher.conformance.dut.device import CompiledDevice
 from flasher.conformance.dut.pipes import ABI, FACTS, HEADER, PipeMessage
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, RunReport
@@ -223,6 +225,60 @@ def test_one_that_ignores_errors_of_its_flash_fails_and_one_that_compares_passes
     assert "flash erase 1 of" in _failures(_run(_FLAWS + "ClaimsToHandleErrors", "PW-04"))
     report = _run(_FLAWS + "HandlesErrors", "PW-04")
     assert report.ok, _failures(report)
+
+
+class RunsEachMillisecond(PythonBootloader):
+    """Names no due time, like a main loop without timers, and polls the time in each pass."""
+
+    def tick(self, now_us: int) -> int:
+        super().tick(now_us)
+        return self.host.now_us()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "cases", [("RS-01", "RS-05", "UP-04"), ("EN-01", "TX-12"), ("BU-02", "PW-02")]
+)
+def test_idle_passes_in_its_own_process_change_nothing(
+    cases: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same frames at the same times, with far fewer calls."""
+    calls: list[int] = []
+    called = CompiledDevice._call
+
+    def call(self: CompiledDevice, kind: PipeMessage, *more: Any) -> None:
+        calls[-1] += kind is PipeMessage.TICK
+        called(self, kind, *more)
+
+    monkeypatch.setattr(CompiledDevice, "_call", call)
+    traces = []
+    for is_alone in (True, False):
+        if not is_alone:
+            monkeypatch.setattr(CompiledDevice, "_quiet_until", lambda *_: 0.0)
+        calls.append(0)
+        report = _run(_FLAWS + "RunsEachMillisecond", *cases)
+        assert report.ok
+        traces.append([result.trace for result in report.results])
+    assert traces[0] == traces[1]
+    assert calls[0] < calls[1] / 2
+
+
+class SaysNothingEachMillisecond(PythonBootloader):
+    def tick(self, now_us: int) -> int:
+        return now_us
+
+    def next_frame(self) -> None:
+        return None
+
+
+def test_the_passes_of_one_call_are_few_enough_for_the_watchdog(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.conformance.dut.process.WATCHDOG_S", 0.2)
+    subject = _FLAWS + "SaysNothingEachMillisecond"
+    with open_subject(subject, "bms", None, good_image=None, second_image=None) as (device, _):
+        assert device.port.receive(1500.0) is None
+        assert device.port.now() == 1500.0
 
 
 def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_flash() -> None:

@@ -26,21 +26,27 @@ class _ProcessHost:
     def __init__(self, pipe: Pipe) -> None:
         self._pipe = pipe
         self.now = 0
+        self.pass_began = 0
         self.pending = 0
+        self.is_idle = True
+        """Nothing was sent to the suite in this pass."""
 
     def now_us(self) -> int:
         self.now += 1  # so that a loop that waits for a time ends
         return self.now - 1
 
     def flash_read(self, offset: int, size_bytes: int) -> bytes:
+        self.is_idle = False
         self._pipe.write(PipeMessage.FLASH_READ, pipes.RANGE.pack(offset, size_bytes))
         return _next(self._pipe)[1]
 
     def flash_erase(self, offset: int) -> bool:
+        self.is_idle = False
         self._pipe.write(PipeMessage.FLASH_ERASE, pipes.PLACE.pack(self.now, offset))
         return self._flash_result()
 
     def flash_write(self, offset: int, data: bytes) -> bool:
+        self.is_idle = False
         self._pipe.write(PipeMessage.FLASH_WRITE, pipes.PLACE.pack(self.now, offset), data)
         return self._flash_result()
 
@@ -53,14 +59,15 @@ class _ProcessHost:
         return self.pending
 
     def start_application(self) -> None:
-        self._pipe.write(PipeMessage.APPLICATION, pipes.TIME.pack(self.now))
+        self._pipe.write(PipeMessage.APPLICATION, pipes.TIME.pack(self.pass_began))
         os._exit(0)
 
     def reset(self) -> None:
-        self._pipe.write(PipeMessage.RESET, pipes.TIME.pack(self.now))
+        self._pipe.write(PipeMessage.RESET, pipes.TIME.pack(self.pass_began))
         os._exit(0)
 
     def log(self, text: str) -> None:
+        self.is_idle = False
         self._pipe.write(PipeMessage.LOG, text.encode(errors="replace"))
 
 
@@ -198,18 +205,33 @@ def serve(subject: str, pipe: Pipe) -> Never:
     while True:
         kind, data = _next(pipe)
         host.now, number = pipes.TURN.unpack_from(data)
+        host.pass_began, until = host.now, 0
         if kind is PipeMessage.START:
             bootloader.start(host, number)
         else:
             host.pending = number
             if kind is PipeMessage.RECEIVE:
                 bootloader.receive(pipes.unpack_frame(data[pipes.TURN.size :]))
+            elif len(data) == pipes.TICK.size:
+                until = pipes.TICK.unpack(data)[2]
+        pipe.write(PipeMessage.DONE, *_turn(bootloader, host, until))
+
+
+def _turn(bootloader: Bootloader, host: _ProcessHost, until: int) -> list[bytes]:
+    """Make a pass of the main loop, and further ones until `until` as long as nothing happens in
+    them; returns times and frames.
+    """
+    while True:
+        host.is_idle = True
         wanted = bootloader.tick(host.now)
+        due = pipes.NEVER if wanted is None else wanted
         frames: list[bytes] = []
         while host.pending + len(frames) < pipes.TRANSMIT_FRAMES:
             frame = bootloader.next_frame()
             if frame is None:
                 break
             frames.append(pipes.pack_frame(frame))
-        done = pipes.DONE.pack(host.now, pipes.NEVER if wanted is None else wanted)
-        pipe.write(PipeMessage.DONE, done, *frames)
+        following = due if due > host.now else host.now + pipes.TURN_US
+        if not host.is_idle or frames or following > until:
+            return [pipes.DONE.pack(host.now, due), *frames]
+        host.pass_began = host.now = following

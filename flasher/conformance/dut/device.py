@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from math import inf
 from struct import Struct
 from typing import Final
@@ -30,9 +31,10 @@ from flasher.protocol.wire import Damage, Message
 
 POWER_ON: Final = 0
 RESET: Final = 1
-_TICK_S: Final = 0.001
 _RESTART_S: Final = 0.01
 """From a reset or watchdog to the first instruction."""
+_IDLE_S: Final = 1.0
+"""Passes of so much time may be made in one call, which the watchdog times."""
 _US: Final = 1_000_000
 _MAGIC: Final = b"FLASHERA"
 _HEAD: Final = Struct("<II8sI")
@@ -89,7 +91,11 @@ class CompiledDevice(Machine):
             bitrate_bps=bitrate_bps,
             timings=DEFAULT_TIMINGS,
         )
+        self.quiet_until: Callable[[], float] = lambda: -inf
+        """Time until which no frame to the device is sent, and nobody acts on it."""
+        self._skips_idle_passes = facts.abi >= pipes.ABI_WITH_ERRORS or not process.is_program
         self._has_power = False
+        self._is_starting_application = False
         self._received: deque[CanFrame] = deque()
         self._to_send: deque[tuple[Frame, float]] = deque()
         """Frames in the controller, which sends them while the processor waits for the flash, and
@@ -198,7 +204,7 @@ class CompiledDevice(Machine):
         self._process.kill()
         if self._runs_application:
             self.application.stop()
-        self._runs_application = False
+        self._runs_application = self._is_starting_application = False
         self._lose_memory()
         self._received.clear()
         self._to_send.clear()
@@ -210,6 +216,9 @@ class CompiledDevice(Machine):
     def _expire(self, now: float) -> None:
         """Start the bootloader after a reset or power-up."""
         self._due_at = inf
+        if self._is_starting_application:
+            self._start_application(now)
+            return
         if self._runs_application:
             self._restart(RESET, now)
             self._due_at = inf
@@ -256,17 +265,26 @@ class CompiledDevice(Machine):
             frame = pipes.pack_frame(self._received.popleft())
             self._call(PipeMessage.RECEIVE, self._pending(now), now, frame)
         if self._process.is_running and now >= self._next_turn_at:
-            self._call(PipeMessage.TICK, self._pending(now), now)
+            until_us = max(0, int(self._quiet_until(now) * _US) - 1)
+            until = pipes.TIME.pack(until_us) if self._skips_idle_passes else b""
+            self._call(PipeMessage.TICK, self._pending(now), now, until)
+
+    def _quiet_until(self, now: float) -> float:
+        """Until then the bootloader is on its own: passes in which nothing happens need no call."""
+        due = super().deadline()
+        if self._pending(now) or self._received or self.is_off_bus:
+            return 0.0
+        return max(0.0, min(self.quiet_until(), now + _IDLE_S, inf if due is None else due))
 
     def _pending(self, now: float) -> int:
         return len(self._to_send) + (now < self._left_at)
 
-    def _call(self, kind: PipeMessage, number: int, now: float, frame: bytes = b"") -> None:
+    def _call(self, kind: PipeMessage, number: int, now: float, more: bytes = b"") -> None:
         self._handled_bytes = 0
-        self._called_at = now
+        self._called_at = called_at = now
         try:
             answer = self._process.call(
-                kind, pipes.TURN.pack(round(now * _US), number), frame, during=self._hardware
+                kind, pipes.TURN.pack(round(now * _US), number), more, during=self._hardware
             )
         except FlasherError as error:
             self._restart(RESET, now + _RESTART_S)
@@ -279,7 +297,12 @@ class CompiledDevice(Machine):
         if answer is None:
             return
         how, data = answer
-        if how is PipeMessage.APPLICATION:
+        if how is not PipeMessage.DONE and self._skips_idle_passes:
+            now = max(now, pipes.TIME.unpack(data)[0] / _US)
+        if how is PipeMessage.APPLICATION and now > called_at:
+            self._restart(RESET, now)
+            self._is_starting_application = True
+        elif how is PipeMessage.APPLICATION:
             self._start_application(now)
         elif how is PipeMessage.RESET:
             self._restart(RESET, now + _RESTART_S)
@@ -289,7 +312,7 @@ class CompiledDevice(Machine):
             self._tick_at = inf
             if wanted_us != pipes.NEVER:
                 is_later = wanted_us > left_us
-                self._tick_at = wanted_us / _US if is_later else self._busy_until + _TICK_S
+                self._tick_at = (wanted_us if is_later else left_us + pipes.TURN_US) / _US
             size = pipes.FRAME.size
             for at in range(pipes.DONE.size, len(data), size):
                 made = pipes.unpack_frame(data[at : at + size])

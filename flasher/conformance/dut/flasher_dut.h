@@ -92,7 +92,8 @@ void flasher_dut_start(const flasher_host *host, uint32_t cause);
 void flasher_dut_receive(const flasher_frame *frame);
 
 /* One pass of the main loop. Returns the latest time of the next one; UINT64_MAX when only a frame
- * can change anything. A time that is not later than `now_us` means 1 ms from now. */
+ * can change anything. A time that is not later than `now_us` means 1 ms from now. Idle passes, which
+ * neither use the flash nor log nor send, are made in a row and cost little. */
 uint64_t flasher_dut_tick(uint64_t now_us);
 
 /* Fills `frame` with the next frame to send and returns 1, or returns 0. Called after each pass until

@@ -8,13 +8,16 @@
  *   program to suite, first:   'f' facts: nine uint32 in the order of flasher_dut_facts, name
  *   suite to program:          'S' start: uint64 now, uint32 cause
  *                              'R' received: uint64 now, uint32 pending, frame
- *                              'T' tick: uint64 now, uint32 pending
+ *                              'T' tick: uint64 now, uint32 pending, uint64 until: no frame comes
+ *                                  until then, so idle passes are repeated here (missing where
+ *                                  the ABI is 1)
  *   program to suite, during:  'r' read: uint32 offset, uint32 size; answered by 'd' data
  *                              'e' erase: uint64 now, uint32 offset; answered by 'k' uint64 now,
  *                                  uint32 error (0: none; missing where the ABI is 1)
  *                              'w' write: uint64 now, uint32 offset, data; answered by 'k'
  *                              'l' log: text
- *                              'a' start the application, 'z' reset: uint64 now; end the program
+ *                              'a' start the application, 'z' reset: uint64 start of the pass; end
+ *                                  the program
  *   program to suite, at last: '.' done: uint64 now, uint64 next tick, frames to send
  */
 #define _POSIX_C_SOURCE 200809L
@@ -32,7 +35,9 @@
 
 static int to_suite;
 static uint64_t now;
+static uint64_t pass_began;
 static uint32_t pending;
+static int is_idle; /* nothing was sent to the suite in this pass */
 
 static void read_exactly(void *data, size_t size)
 {
@@ -71,6 +76,7 @@ static void write_coverage(uint8_t type)
 static void tell(uint8_t type, const void *one, size_t one_size, const void *two, size_t two_size)
 {
     write_coverage(type);
+    is_idle = 0;
     const header head = {type, {0, 0, 0}, (uint32_t)(one_size + two_size)};
     const struct iovec parts[] = {
         {(void *)&head, sizeof head}, {(void *)one, one_size}, {(void *)two, two_size}};
@@ -142,13 +148,13 @@ static uint32_t transmit_pending(void)
 
 static void start_application(void)
 {
-    tell('a', &now, sizeof now, NULL, 0);
+    tell('a', &pass_began, sizeof pass_began, NULL, 0);
     _exit(0);
 }
 
 static void reset(void)
 {
-    tell('z', &now, sizeof now, NULL, 0);
+    tell('z', &pass_began, sizeof pass_began, NULL, 0);
     _exit(0);
 }
 
@@ -163,14 +169,22 @@ static const flasher_host host = {
 
 /* -- the suite's calls ------------------------------------------------------------------------ */
 
-static void turn(void)
+/* A pass of the main loop, and further ones until `until` as long as nothing happens in them. */
+static void turn(uint64_t until)
 {
     flasher_frame frames[FLASHER_TRANSMIT_FRAMES];
     size_t count = 0;
     uint64_t times[2];
-    times[1] = flasher_dut_tick(now);
-    while (pending + count < FLASHER_TRANSMIT_FRAMES && flasher_dut_next_frame(&frames[count]))
-        ++count;
+    for (;;) {
+        is_idle = 1;
+        times[1] = flasher_dut_tick(now);
+        while (pending + count < FLASHER_TRANSMIT_FRAMES && flasher_dut_next_frame(&frames[count]))
+            ++count;
+        const uint64_t next = times[1] > now ? times[1] : now + 1000;
+        if (!is_idle || count > 0 || next > until)
+            break;
+        pass_began = now = next;
+    }
     times[0] = now;
     tell('.', times, sizeof times, frames, count * sizeof frames[0]);
 }
@@ -186,9 +200,13 @@ int main(void)
         uint8_t type;
         flasher_frame frame;
         uint32_t number;
+        uint64_t until = 0;
         uint32_t size = next_message(&type);
         read_exactly(&now, sizeof now);
         read_exactly(&number, sizeof number);
+        pass_began = now;
+        if (size == sizeof now + sizeof number + sizeof until)
+            read_exactly(&until, sizeof until);
         if (size == sizeof now + sizeof number + sizeof frame)
             read_exactly(&frame, sizeof frame);
         if (type == 'S') {
@@ -198,6 +216,6 @@ int main(void)
             if (type == 'R')
                 flasher_dut_receive(&frame);
         }
-        turn();
+        turn(until);
     }
 }

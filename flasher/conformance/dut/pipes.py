@@ -23,8 +23,11 @@ FRAME: Final = Struct("<IBBBx8s")
 RANGE: Final = Struct("<II")
 PLACE: Final = Struct("<QI")
 TIME: Final = Struct("<Q")
+TICK: Final = Struct("<QIQ")
 FLASH_RESULT: Final = Struct("<QI")
 DONE: Final = Struct("<QQ")
+TURN_US: Final = 1000
+"""Time of the next pass of a bootloader that names none."""
 NEVER: Final = 0xFFFF_FFFF_FFFF_FFFF
 """Next tick of a bootloader that only waits for frames."""
 _READ_SIZE: Final = 1 << 16

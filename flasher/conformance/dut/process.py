@@ -70,6 +70,11 @@ class BootloaderProcess:
         self._watchdog_s = WATCHDOG_S
 
     @property
+    def is_program(self) -> bool:
+        """True for a program, which contains the code that answers the suite."""
+        return self._is_program
+
+    @property
     def is_running(self) -> bool:
         return self._process is not None
 

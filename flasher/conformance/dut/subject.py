@@ -41,6 +41,7 @@ class CompiledSubject(SimulatedSubject[CompiledDevice]):
             second_image=second_image,
         )
         self.bus.attach(device)
+        device.quiet_until = self.port.quiet_until
         if device.facts.abi >= ABI_WITH_ERRORS:
             self.flash_faults = device.flash_faults
 
