@@ -99,6 +99,22 @@ def upgrade(session: InitSession) -> Findings:
             session.packets()
             bench.end_transfer()
             session.await_application(TimeName.START, bench.now)
+    _measure_larger_image(session)
+
+
+def _measure_larger_image(session: InitSession) -> None:
+    """Measure an upgrade to the larger image that the cases use, and put the good image back."""
+    bench = session.bench
+    image, query = bench.firmware.good, bench.encoder.has_version_query
+    if len(image) <= len(session.image):
+        return
+    session.enter()
+    bench.update(len(image))
+    bench.packets(image)
+    bench.end_transfer()
+    session.await_application(TimeName.START if query else "", bench.now)
+    session.begin()
+    session.finish()
 
 
 def _measure_naks(session: InitSession) -> None:
