@@ -15,6 +15,7 @@ from typing import Final
 from flasher.conformance import cases  # noqa: F401  registers them
 from flasher.conformance.catalogue import CASES, catalogue_order
 from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, ClauseReading, clause_texts
+from flasher.conformance.profile import unstated
 
 ROOT: Final = Path(__file__).parents[1]
 DOCUMENT: Final = ROOT / "docs" / "explanation" / "readings.md"
@@ -143,18 +144,22 @@ HOLDERS: Final = {
 }
 """Tests of the host, the reader and the device model that hold a reading."""
 
-_INTRODUCTION: Final = """\
+_INTRODUCTION: Final = f"""\
 # Readings of the documents
 
 What `flasher conformance` judges a bootloader by: the clauses of the vendor's document, and R1 to
 R28, how this project reads the places where the documents are silent or contradict themselves. Each
-reading is a default. Drawn from `flasher/conformance/clauses.py` by
-`python -m tests.readings_document`; a test keeps it so, and that the tests named here exist.
+reading is the default of flasher's host and of its device model. Drawn from
+`flasher/conformance/clauses.py` by `python -m tests.readings_document`; a test keeps it so, and
+that the tests named here exist.
 
 Options that change a reading stand in three places: the suite's profile
 ([profile of the suite](../reference/conformance_profile.md)), the host's profile
 ([profile](../reference/profile.md)),
 and the choices of the device model (`flasher mock --set`).
+
+The suite requires a reading that is a choice of its profile only where the profile states it.
+{unstated()}
 """
 
 
