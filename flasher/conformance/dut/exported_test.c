@@ -28,12 +28,12 @@ enum {
     ANSWER_ID = $answer_id,
     BITRATE_BPS = $bitrate_bps,
     FLASH_BYTES = $flash_bytes,
-    PATIENCE_US = $patience_us,       /* for an awaited answer */
-    WAIT_US = $wait_us,               /* for answers to the last frame */
     CHECK_IMAGE = $checks_image,      /* 1: `image` is in the flash and runs in the end */
     CHECK_STARTED = $checks_started,  /* 1: only `old_image` or `image` may be started */
     NONE = 255,
 };
+static const uint64_t patience_us = $patience_us; /* for an awaited answer */
+static const uint64_t wait_us = $wait_us;         /* for answers to the last frame */
 
 typedef struct {
     uint8_t size; /* 0: silence; NONE: end of the list */
@@ -68,7 +68,7 @@ $flash_parts
 };
 
 typedef struct {
-    uint32_t after_us; /* after the frame before */
+    uint64_t after_us; /* after the frame before */
     uint16_t answers;  /* messages of the device to await before */
     uint8_t is_reset;  /* 1: last frame of a reset, which the application obeys */
     flasher_frame frame;
@@ -275,7 +275,7 @@ static void take_step(void)
     const step *one = &steps[w->next_step];
     const uint64_t due = w->arrived + one->after_us;
     run_until(due);
-    while (w->answers < one->answers && w->now < due + PATIENCE_US)
+    while (w->answers < one->answers && w->now < due + patience_us)
         run_until(w->now + 1000);
     w->waiting = w->now > due && one->answers == 0 ? w->waiting + 1 : 0;
     w->arrived = w->waiting ? due : w->now;
@@ -294,7 +294,7 @@ _Noreturn static void run_bootloader(uint32_t cause)
     turn();
     while (w->next_step < STEPS)
         take_step();
-    run_until(w->arrived + WAIT_US);
+    run_until(w->arrived + wait_us);
     _exit(ENDED);
 }
 
