@@ -148,7 +148,8 @@ def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     for key, (option, renamed) in _MODEL_OPTIONS.items():
         value = str(getattr(device, option))
         given[key] = renamed.get(value, value)
-    if device.start_delay_s < _SOON_S:  # its application may run by then
+    # Its application may run by then, or it may have restarted after a refused image.
+    if min(device.start_delay_s, device.refused_hold_s) < _SOON_S:
         given["en_02"] = "either"
     # The model's window starts when it queues an announcement, the suite's when it has arrived.
     target = TARGETS["bms"]

@@ -229,31 +229,36 @@ class PatientHost:
             return one.kind is Reply.ACK and one.number != number
 
         last, tries, requests = "no answer", 0, 0
+        unanswered = 0
         while tries < PACKET_TRIES and requests < UPDATES_MAX:
             tries += 1
-            self.send_packet(image, number)
+            unanswered += 1
+            sent = self.send_packet(image, number)
             # A repeated update command may cause a second erase (R25, R16).
             kinds = (*_PACKET_ANSWERS, Reply.REQUEST) if number == 1 else _PACKET_ANSWERS
             reply = self._tester.wait_for(*kinds, unlike=is_stale)
             if reply is None and number == 1 and tries == PACKET_TRIES - 1:
                 erase_s = self._profile.limit("erase_s")
-                self._tester.wait_for(Reply.REQUEST, within_s=erase_s)
+                reply = self._tester.wait_for(Reply.REQUEST, within_s=erase_s)
             if reply is not None and reply.kind is Reply.REQUEST:
                 requests += 1
-                tries -= 1  # not an answer to the packet
+                tries = 0  # the device erased instead of receiving
                 continue
             if reply is None:
                 continue
             last = str(reply)
+            unanswered -= 1
             if reply.kind is Reply.BOOT_VERSION:
                 return last
             is_next = reply.kind is Reply.NAK and reply.number == number + 1
             by_profile = is_next and tries + requests > 1 and self._profile.choice("tx_02") != "ack"
             if not by_profile and reply.kind is not Reply.ACK:
                 continue
-            # Wait until the answers to all copies have arrived.
-            quiet_after = PACKET_TRIES if tries + requests > 1 else 0
-            while quiet_after and self._tester.next_message(_QUIET_S) is not None:
-                quiet_after -= 1
+            # An answer to another copy may come as late as any.
+            answers_until = sent.left_at + self._profile.limit("ack_s")
+            while unanswered > 0 and self._tester.next_message(answers_until - self._tester.now):
+                unanswered -= 1
+            if tries + requests > 1:  # one copy may be answered twice, or by a stray message
+                self._tester.collect(_QUIET_S)
             return ""
         return f"{last} after {PACKET_TRIES} tries"

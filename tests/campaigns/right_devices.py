@@ -458,7 +458,8 @@ def _strained(
         GeneralFeedbackMessage=drawn(_LIMITS.feedback_s),
         RequestTransfer=drawn(_LIMITS.erase_s, erase_s),
         Ack=drawn(_LIMITS.ack_s, program_s),
-        Nak=drawn(_LIMITS.ack_s),
+        # A refused image is reported before the restart.
+        Nak=min(drawn(_LIMITS.ack_s), changed.refused_hold_s),
         Complete=drawn(_LIMITS.complete_s, program_s),
     )
     found: list[tuple[type[MockDevice], dict[str, Value]]] = [(late, {})]

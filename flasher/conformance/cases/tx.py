@@ -476,7 +476,7 @@ def _announces_or_waits(bench: Bench) -> None:
             return
         bench.packet(image, 1)
         bench.collect(pause_s)
-        bench.update(len(image))
+        bench.update_again(len(image))
         bench.finish(image)
 
 

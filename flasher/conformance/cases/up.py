@@ -260,6 +260,8 @@ def _starts_over(bench: Bench) -> bool:
     if reply is None:
         bench.send_packet(image, number)
         reply = bench.wait_for(Reply.ACK, Reply.REQUEST, within_s=bench.limit("erase_s"))
+        if reply is not None and reply.kind is Reply.REQUEST:
+            bench.collect(bench.limit("ack_s"))  # a NAK of the packet, which came too early
     found = bench.require_received(reply, "request transfer, or the transfer continues", 0.0)
     starts_over = found.kind is Reply.REQUEST
     bench.info("the device starts over" if starts_over else "the device continues")
