@@ -13,6 +13,7 @@ from flasher.conformance.html_report import html_page
 from flasher.conformance.judge import TimeName
 from flasher.conformance.mock import profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.profile_time import limits_of
 from flasher.conformance.reports import junit_report, to_json
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
@@ -89,6 +90,29 @@ def test_a_failed_check_has_the_limits_that_it_waited_for(
     assert failure is not None
     assert failure.judged_by == keys
     assert all(f"{key} = {value:g}" in str(failure) for key, value in keys.items())
+
+
+def test_a_time_keeps_its_limits_in_sums_and_differences_and_products() -> None:
+    profile = ConformanceProfile({"limits.ack_s": 0.25, "limits.erase_s": 2.0})
+    ack_s, erase_s = profile.limit("ack_s"), profile.limit("erase_s")
+    both = {"limits.ack_s": 0.25, "limits.erase_s": 2.0}
+    for time_s, value_s, limits in (
+        (1.0 + ack_s, 1.25, {"limits.ack_s": 0.25}),
+        (erase_s - 0.5, 1.5, {"limits.erase_s": 2.0}),
+        (3.0 - erase_s, 1.0, {"limits.erase_s": 2.0}),
+        (2 * ack_s + erase_s / 2, 1.5, both),
+        (sum((ack_s, erase_s)), 2.25, both),
+        (max(ack_s, erase_s), 2.0, {"limits.erase_s": 2.0}),
+        (float(erase_s), 2.0, {}),
+    ):
+        assert (time_s, limits_of(time_s)) == (value_s, limits)
+
+
+def test_the_clock_of_the_bench_knows_no_limit() -> None:
+    """Times of the device, and of frames, would name all limits that were ever waited for."""
+    device = subject()
+    run(device, profile_of_mock(), selection=Selection(cases=("BU-02", "RS-01")))
+    assert limits_of(device.port.now()) == {}
 
 
 def test_a_passed_check_names_no_key() -> None:
