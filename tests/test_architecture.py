@@ -97,6 +97,7 @@ def calls_of_a_packet() -> Counter[tuple[str, str]]:
     return calls.of_a_packet
 
 
+@pytest.mark.slow
 def test_the_way_of_one_packet_is_as_short_as_it_is_written() -> None:
     way = TEXT[TEXT.index("## The way of one packet") : TEXT.index("## Where to add")]
     down, back = way.split("Back, when")

@@ -242,6 +242,7 @@ def test_every_call_is_that_of_the_blocking_device(
     assert awaited(wire_to(Battery(**battery)), calls, ends_after) == first
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(
     calls=st.lists(st.sampled_from(UPGRADES), min_size=1, max_size=2),

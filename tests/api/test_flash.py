@@ -95,6 +95,7 @@ def test_events_arrive_in_order_while_it_runs() -> None:
     assert events.BootVersionSeen("BMS", "V1.0.0") in seen
 
 
+@pytest.mark.slow
 def test_the_mock_takes_the_time_of_a_real_bus_unless_told_otherwise() -> None:
     began = time.perf_counter()
     outcome = flasher.flash(IMAGE, "bms", mock=True).outcome
@@ -312,6 +313,7 @@ def test_the_adapter_is_closed_when_the_block_fails() -> None:
         raise ZeroDivisionError
 
 
+@pytest.mark.slow
 def test_the_adapter_is_closed_when_it_fails_itself(fake: FakeLink) -> None:
     fake.failure = BusError("unplugged.", where="fake 0", remedy="Plug it in.")
     with pytest.raises(BusError) as caught:

@@ -646,6 +646,7 @@ def test_what_an_slcan_adapter_confirms_hides_no_answer() -> None:
 SERIAL_GOOD = b"\xaa" + bytes(4) + b"\x01" + (0x725).to_bytes(4, "little") + b"\x01\xbb"
 
 
+@pytest.mark.slow
 @each(
     "bad",
     [

@@ -36,6 +36,7 @@ if "hangs" in sys.argv:
 COMMAND = (sys.executable, "-S", "-c", CHILD)
 
 
+@pytest.mark.slow
 def test_one_back_end_that_hangs_does_not_hide_the_others() -> None:
     began = time.perf_counter()
     with Detection(["hangs", "good"], command=COMMAND, limit_s=0.5) as detection:
@@ -68,6 +69,7 @@ def test_no_process_is_left_when_nobody_collects() -> None:
     assert process.returncode is not None
 
 
+@pytest.mark.slow
 def test_who_does_not_want_to_wait_gets_what_there_is() -> None:
     began = time.perf_counter()
     with Detection(["hangs", "good"], command=COMMAND, limit_s=60.0) as detection:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import can
 import can.interfaces
+import pytest
 from hypothesis import given, strategies
 
 from flasher.bus.echoes import (
@@ -122,6 +123,7 @@ FATE = strategies.tuples(
 )
 
 
+@pytest.mark.slow
 @given(
     strategies.integers(0, 40).flatmap(
         lambda most: strategies.lists(
@@ -197,6 +199,7 @@ def test_what_the_drivers_queue_held_is_an_echo_for_the_handle_that_is_opened_an
     assert not is_echo(echoes, OWN, 101.0, is_rx=False)
 
 
+@pytest.mark.slow
 def test_every_back_end_of_python_can_that_sets_the_flag_is_in_the_table() -> None:
     """python-can's own source is the referee: one that begins to set `is_rx` has to be judged."""
     packages = {"ics_neovi": "neovi"}

@@ -310,6 +310,7 @@ def test_write_writes_nothing_where_the_battery_is_not_heard(
     assert "the BMS is there" in run.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["bms", "wmc"])
 def test_a_named_adapter_asks_nothing_more_than_before(
     flasher: Flasher, machine: Machine, target: str

@@ -168,6 +168,7 @@ def command_of(name: str | None) -> click.Command:
     return program if name is None else COMMANDS[name].load()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [None, *COMMANDS])
 def test_help_is_a_manual_page(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, command: str | None
@@ -184,6 +185,7 @@ def test_help_is_a_manual_page(
     assert len(examples_of(command_of(command))) >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_short_help_has_what_is_needed_most(flasher: Flasher, command: str) -> None:
     short, whole = (flasher(command, option).out for option in ("-h", "--help"))

@@ -26,6 +26,7 @@ OBC = SAMPLES / "obc.bin"
 """The small one, where the device does not matter."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sample", "target", "boot_version"),
     [
@@ -79,6 +80,7 @@ def test_the_paced_mock_takes_the_time_that_the_plan_says(
     assert transfer_s <= real.now_s * speed <= 2.0 * transfer_s
 
 
+@pytest.mark.slow
 def test_json_is_one_document_with_the_exit_code_in_it(flasher: Flasher) -> None:
     run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", "--json")
     document = run.document
@@ -279,6 +281,7 @@ def test_an_adapter_that_cannot_be_opened_is_exit_code_4_and_names_the_fix(
     assert "what to do:" in run.err
 
 
+@pytest.mark.slow
 def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
     began = time.perf_counter()
     run = flasher(

@@ -51,6 +51,7 @@ def test_the_code_of_a_class_has_its_exit_code() -> None:
             assert exit_code_in(each.code) == each.kind.exit_code, each
 
 
+@pytest.mark.slow
 def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
     used = set()
     for path in PACKAGE.rglob("*.py"):

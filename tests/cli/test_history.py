@@ -46,6 +46,7 @@ def latest(flasher: Flasher, *words: str) -> dict[str, Any]:
 # -- what is kept ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_good_flash_is_kept_with_its_three_claims(flasher: Flasher, file: Path) -> None:
     assert flasher("flash", BMS, "-t", "bms", *MOCK).code == ExitCode.OK
     kept = latest(flasher)
@@ -74,6 +75,7 @@ def test_what_runs_is_not_claimed_where_it_was_not_asked(flasher: Flasher) -> No
     assert "running not known" in flasher("history").out
 
 
+@pytest.mark.slow
 def test_a_flash_that_fails_is_kept_with_its_bundle_and_what_is_left(flasher: Flasher) -> None:
     run = flasher("flash", BMS, "-t", "bms", "--timeout", "2", *MOCK)
     ended = latest(flasher)["ended"]
@@ -214,6 +216,7 @@ def line_of(**changes: object) -> bytes:
     return json.dumps(values).encode() + b"\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "shown", "damaged"),
     [

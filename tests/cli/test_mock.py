@@ -190,6 +190,7 @@ def test_each_target_is_served(serve: Serve, host: Host, target: str) -> None:
     assert host.outcomes[0].ok
 
 
+@pytest.mark.slow
 def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Host) -> None:
     results: list[api.Result] = []
 
@@ -232,6 +233,7 @@ def test_ctrl_c_ends_it_with_exit_code_0(serve: Serve, host: Host) -> None:
     assert "Ctrl-C ends it" in run.err
 
 
+@pytest.mark.slow
 def test_the_device_outlives_an_adapter_that_is_lost_and_comes_back(
     serve: Serve, host: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -439,6 +441,7 @@ def test_a_named_pipe_is_written_into_and_not_replaced(
 # -- the device -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_an_application_it_announces_itself_until_it_is_upgraded(
     serve: Serve, host: Host
 ) -> None:
@@ -628,6 +631,7 @@ def serve_bootloader(flasher: Flasher, host: Host) -> Callable[[str], Run]:
     return run
 
 
+@pytest.mark.slow
 def test_a_compiled_bootloader_is_upgraded_by_the_flash_host(
     serve_bootloader: Callable[[str], Run], host: Host
 ) -> None:

@@ -67,6 +67,7 @@ def test_an_upgrade_that_cannot_be_verified_is_refused_before_the_bus_is_opened(
         flasher.flash(IMAGE, "wmc", verify="version", **bus)
 
 
+@pytest.mark.slow
 def test_an_image_is_loaded_and_planned_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -111,6 +112,7 @@ def test_the_manifest_gives_the_version_and_the_oldest_bootloader_unless_waived(
         api.prepare(IMAGE, PROFILE, identity=identity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [[], ["--force"], ["--allow-downgrade", "--allow-boot-name"]])
 @pytest.mark.parametrize("command", ["flash", "rescue"])
 def test_the_command_line_runs_what_a_program_prepares(

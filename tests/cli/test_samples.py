@@ -82,6 +82,7 @@ def refused(call: Callable[[], object]) -> None:
     assert caught.value.code is ErrorCode.IMAGE_SAMPLE
 
 
+@pytest.mark.slow
 def test_no_program_sends_one() -> None:
     image = library.load(BMS)
     bus: dict[str, Any] = {"interface": "virtual", "channel": CHANNEL}

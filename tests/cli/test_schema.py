@@ -46,6 +46,7 @@ def hold_output(schema: Mapping[str, Any], text: str, code: int) -> list[dict[st
 # -- the file --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_file_is_drawn_from_the_code() -> None:
     written = schema_document.SCHEMA.read_text(encoding="utf-8")
     drawn = schema_document.schema_document()
@@ -53,6 +54,7 @@ def test_the_file_is_drawn_from_the_code() -> None:
     assert written == drawn, "draw it anew: python -m tests.schema_document"
 
 
+@pytest.mark.slow
 def test_it_is_a_json_schema(schema: dict[str, Any]) -> None:
     checker = schema_document.validator(schema)
     checker.check_schema(schema)
@@ -148,6 +150,7 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
     monkeypatch.setattr("flasher.cli.bench.serving.drive", drive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     COMMAND_LINES,

@@ -147,6 +147,7 @@ def test_without_the_extra_the_command_for_it_is_named(
 # -- run -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_virtual_units_are_scanned_and_flashed_until_the_wanted_number(
     flasher: Flasher, recipe: Path, schema: dict[str, Any]
 ) -> None:
@@ -165,6 +166,7 @@ def test_virtual_units_are_scanned_and_flashed_until_the_wanted_number(
     assert kinds.count("RunEnded") == 3
 
 
+@pytest.mark.slow
 def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
     flasher: Flasher, recipe: Path
 ) -> None:
@@ -178,6 +180,7 @@ def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
     assert run.code == ExitCode.OK
 
 
+@pytest.mark.slow
 def test_a_file_of_scans_ends_the_station_and_a_bad_unit_is_exit_code_12(
     flasher: Flasher, recipe: Path, tmp_path: Path
 ) -> None:
@@ -200,6 +203,7 @@ def test_a_file_of_scans_ends_the_station_and_a_bad_unit_is_exit_code_12(
         assert details.run.state is RunState.FAIL
 
 
+@pytest.mark.slow
 def test_a_label_of_the_file_that_is_refused_is_exit_code_12(
     flasher: Flasher, recipe: Path, tmp_path: Path
 ) -> None:
@@ -214,6 +218,7 @@ def test_a_label_of_the_file_that_is_refused_is_exit_code_12(
     assert document["refused"][0]["code"] == "DUPLICATE"
 
 
+@pytest.mark.slow
 def test_new_virtual_units_have_new_numbers(flasher: Flasher, recipe: Path, tmp_path: Path) -> None:
     words = ("--recipe", recipe, "--database", tmp_path / "plant.sqlite", "--mock-bad", "0")
     serials: list[str] = []
@@ -224,6 +229,7 @@ def test_new_virtual_units_have_new_numbers(flasher: Flasher, recipe: Path, tmp_
     assert len(set(serials)) == 4
 
 
+@pytest.mark.slow
 def test_scans_come_from_a_pipe_and_lines_are_for_people(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,6 +243,7 @@ def test_scans_come_from_a_pipe_and_lines_are_for_people(
     assert "1 unit: 1 passed, 0 failed; yield 100 %" in run.out
 
 
+@pytest.mark.slow
 def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
     flasher: Flasher, recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,6 +264,7 @@ def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
     assert "refused  W2605002: SCANS_ENDED" in run.out
 
 
+@pytest.mark.slow
 def test_records_that_cannot_be_written_stop_the_line_and_nothing_passes(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -276,6 +284,7 @@ def test_records_that_cannot_be_written_stop_the_line_and_nothing_passes(
     assert {"RecordNotSaved", "LineStopped"} <= {line["event"] for line in lines}
 
 
+@pytest.mark.slow
 def test_sockets_that_can_never_work_end_the_station(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -350,6 +359,7 @@ def badges(recipe: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_with_badges_nothing_begins_before_one_is_scanned(
     flasher: Flasher, recipe: Path, badges: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,12 +374,14 @@ def test_with_badges_nothing_begins_before_one_is_scanned(
     assert "470815" not in run.out + run.err
 
 
+@pytest.mark.slow
 def test_without_badges_it_is_said_once(flasher: Flasher, recipe: Path) -> None:
     words = ("--mock-sockets", "1", "--units", "1", "--mock-bad", "0", "--lines", *FAST)
     run = flasher("station", "run", "--recipe", recipe, *words)
     assert run.out.count("No badge table: operator names are not checked.") == 1
 
 
+@pytest.mark.slow
 def test_a_badge_in_a_file_of_scans_is_no_label(
     flasher: Flasher, recipe: Path, badges: Path
 ) -> None:
@@ -381,6 +393,7 @@ def test_a_badge_in_a_file_of_scans_is_no_label(
     assert [unit["serial"] for unit in lines_of(run)[1]["units"]] == ["W2605002"]
 
 
+@pytest.mark.slow
 def test_the_hash_of_a_typed_pin_is_printed(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, schema: dict[str, Any]
 ) -> None:
@@ -396,6 +409,7 @@ def test_the_hash_of_a_typed_pin_is_printed(
     assert "4708x" not in run.out + run.err
 
 
+@pytest.mark.slow
 def test_a_pin_on_a_terminal_is_typed_twice_without_echo(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,6 +445,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "records.sqlite"
 
 
+@pytest.mark.slow
 def test_a_report_has_figures_on_stdout_and_files_for_others(
     flasher: Flasher, plant: Path, tmp_path: Path
 ) -> None:
@@ -461,6 +476,7 @@ def test_a_report_can_be_narrowed(flasher: Flasher, plant: Path) -> None:
     assert wrong.document["error"]["where"] == "--since"
 
 
+@pytest.mark.slow
 def test_the_whole_life_of_a_unit_with_its_traces(
     flasher: Flasher, plant: Path, tmp_path: Path
 ) -> None:
@@ -482,6 +498,7 @@ def test_the_whole_life_of_a_unit_with_its_traces(
     assert "  | verdict: completed" in full.out
 
 
+@pytest.mark.slow
 def test_json_of_the_records_is_as_described(
     flasher: Flasher, plant: Path, tmp_path: Path, schema: dict[str, Any]
 ) -> None:
@@ -576,6 +593,7 @@ def test_the_guide_shows_the_sample_recipe_and_every_word_of_a_socket() -> None:
 # -- Ctrl-C ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_ctrl_c_finishes_what_runs_and_begins_no_further_unit(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -589,6 +607,7 @@ def test_ctrl_c_finishes_what_runs_and_begins_no_further_unit(
     assert "Ctrl-C again" in run.err
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_stops_the_runs_which_are_recorded_as_aborted(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -628,6 +647,7 @@ def press_when(monkeypatch: pytest.MonkeyPatch, event: str, *, times: int) -> No
     monkeypatch.setattr(JsonLines, "refresh", refreshing)
 
 
+@pytest.mark.slow
 def test_virtual_units_stay_out_of_records_of_real_ones(flasher: Flasher, tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.make()

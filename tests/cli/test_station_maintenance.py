@@ -42,6 +42,7 @@ def place(bench: Bench) -> tuple[str, ...]:
     return ("--database", str(bench.path), "--keys", str(bench.keys))
 
 
+@pytest.mark.slow
 def test_verify_says_what_the_records_were_held_against(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
 ) -> None:
@@ -82,6 +83,7 @@ def test_verify_says_what_the_records_were_held_against(
     assert "no head of these records is stored" in named.out
 
 
+@pytest.mark.slow
 def test_a_unit_whose_records_were_changed_gets_no_page(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -109,6 +111,7 @@ def test_a_unit_whose_records_were_changed_gets_no_page(
     assert [path.name for path in (tmp_path / "pages").iterdir()] == [f"{SERIAL}.html"]
 
 
+@pytest.mark.slow
 def test_a_certificate_is_checked(
     flasher: Flasher,
     bench: Bench,
@@ -134,6 +137,7 @@ def test_a_certificate_is_checked(
     assert "contains no signed certificate" in none.err
 
 
+@pytest.mark.slow
 def test_a_key_is_shown_rotated_and_replaced(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
 ) -> None:
@@ -184,6 +188,7 @@ def test_which_station_is_meant_has_to_be_clear(
     assert named.out.startswith("line-3: key ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("back_end", ["sqlite", "postgresql"])
 def test_records_of_an_older_schema_are_upgraded_once(
     flasher: Flasher,

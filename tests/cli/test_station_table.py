@@ -334,6 +334,7 @@ def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
     assert "2 units: 2 passed, 0 failed; yield 100 %" in behind
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
 @pytest.mark.parametrize("more", [(), ("--lines",)])
 def test_a_pin_is_not_shown_on_the_terminal(

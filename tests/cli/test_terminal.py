@@ -80,6 +80,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "cp437", "utf-8"])
 def test_no_encoding_of_a_stream_ends_a_command(
     encoding: str,

@@ -37,6 +37,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("stage")
 @each("words", [("info",), ("read", "version-information"), ("read", "serial-number"), ("scan",)])
 def test_what_asks_warns_and_names_the_fields_that_differ(

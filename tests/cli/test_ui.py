@@ -87,6 +87,7 @@ def _in_browser(monkeypatch: pytest.MonkeyPatch, do: Callable[[_Browser], None])
     monkeypatch.setattr(webbrowser, "open", opened)
 
 
+@pytest.mark.slow
 def test_an_upgrade_that_went_through_ends_well(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -64,6 +64,7 @@ def test_a_good_end_says_what_runs_and_is_green_only_where_nothing_is_unknown(
     assert "check: passed" not in run.err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("colours")
 @pytest.mark.parametrize(
     ("words", "line"),
@@ -101,6 +102,7 @@ def test_what_makes_the_last_line_long_stands_in_the_error_alone(
     assert "--allow-implausible" in run.err
 
 
+@pytest.mark.slow
 def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
     flasher: Flasher, short_bms: Path
 ) -> None:

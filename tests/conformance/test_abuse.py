@@ -97,6 +97,7 @@ def test_a_deaf_device_was_never_judged() -> None:
     assert exit_code(report, was_stopped=False) is ExitCode.NO_ANSWER
 
 
+@pytest.mark.slow
 def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
     report = run(
         MockSubject("bms", make_device=device_maker(MoodyDevice)), PROFILE, selection=SELECTION
@@ -134,6 +135,7 @@ def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end(
     assert report.count(CaseVerdict.PASS) == 0
 
 
+@pytest.mark.slow
 @each("case_id", ["RS-01", "RS-03", "EN-01"])
 def test_an_adapter_unplugged_midway_leaves_the_verdicts_so_far(case_id: str) -> None:
     subject = MockSubject("bms")

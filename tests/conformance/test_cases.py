@@ -31,6 +31,7 @@ def failed(
     return [result.case_id for result in report.results if result.verdict is not CaseVerdict.PASS]
 
 
+@pytest.mark.slow
 @each("target", ["wmc", "bms"])
 def test_the_mock_passes(target: str) -> None:
     assert failed(target=target) == []

@@ -30,12 +30,14 @@ def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseR
     return report.results[0]
 
 
+@pytest.mark.slow
 def test_the_mock_passes() -> None:
     expected = ("BU-01", "BU-02", "BU-06", "PW-01", "PW-02", "PW-04", "CO-01", "CO-02", "CO-04")
     assert expected == MINE
     assert not_passed("CO-01", *QUICK) == []
 
 
+@pytest.mark.slow
 def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed(*QUICK, target="wmc") == []
 
@@ -55,6 +57,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
     assert not_passed(*QUICK, **choices) == []
 
 
+@pytest.mark.slow
 def test_one_image_and_readback_tell_a_torn_image_too() -> None:
     for name in ("starts-torn-image", "record-first"):
         assert verdicts(["PW-01"], name, with_second_image=False) == {"PW-01": CaseVerdict.FAIL}
@@ -68,6 +71,7 @@ def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
     assert result.first_failure.got.startswith("version ")
 
 
+@pytest.mark.slow
 def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
     result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
     assert result.verdict is CaseVerdict.PASS_IN_PART
@@ -80,6 +84,7 @@ def test_what_a_bench_lacks_makes_a_case_unsupported(case_id: str, power: str) -
     assert result_of(case_id, None, **{power: False}).verdict is CaseVerdict.UNSUPPORTED
 
 
+@pytest.mark.slow
 def test_others_take_nine_tenths_of_the_bus() -> None:
     own = Encoder("bms").to_device
     trace = result_of("CO-01").trace
@@ -91,6 +96,7 @@ def test_others_take_nine_tenths_of_the_bus() -> None:
     assert max(sum(at <= one < at + 0.1 for one in foreign) for at in foreign[::100]) > 160
 
 
+@pytest.mark.slow
 def test_every_frame_of_every_message_is_disturbed() -> None:
     """Each frame in each way: as many steps as there are frames and kinds of fault."""
     result = result_of("BU-01")
@@ -102,6 +108,7 @@ def test_every_frame_of_every_message_is_disturbed() -> None:
         assert frame == 18 or f"frame {frame} sent is swapped" in steps
 
 
+@pytest.mark.slow
 def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation() -> None:
     result = result_of("PW-01")
     assert result.verdict is CaseVerdict.PASS

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.mock import MockSubject, device_maker
 from flasher.conformance.results import CaseVerdict
@@ -19,6 +21,7 @@ from .verdicts import cases_of, not_passed, verdicts
 CASES = ("EN-01", "EN-02", "EN-04", "EN-07", "EN-08")
 
 
+@pytest.mark.slow
 def test_the_mock_passes_with_images_that_carry_a_checksum() -> None:
     assert tuple(cases_of("EN")) == CASES
     assert not_passed(*CASES, image_checksum="crc32") == []
@@ -28,12 +31,14 @@ def test_without_a_checksum_of_its_own_there_is_nothing_to_refuse_an_image_for()
     assert verdicts(["EN-04"]) == {"EN-04": CaseVerdict.UNSUPPORTED}
 
 
+@pytest.mark.slow
 def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
     found = verdicts(CASES, target="obc", image_checksum="crc32")
     assert found.pop("EN-08") is CaseVerdict.UNSUPPORTED
     assert set(found.values()) == {CaseVerdict.PASS}
 
 
+@pytest.mark.slow
 @each(
     "choices",
     [
@@ -46,6 +51,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
     assert not_passed(*CASES, image_checksum="crc32", **choices) == []
 
 
+@pytest.mark.slow
 @each(
     "case_id, states",
     [
@@ -60,6 +66,7 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
     assert not_passed(case_id, states=states, image_checksum="crc32") == [case_id]
 
 
+@pytest.mark.slow
 def test_without_a_second_image_the_rest_of_a_row_of_upgrades_is_judged() -> None:
     found = verdicts(["EN-01", "EN-07", "EN-08"], with_second_image=False)
     assert found == {

@@ -47,6 +47,7 @@ def failed(done: RunReport) -> list[str]:
     return [result.case_id for result in done.results if result.verdict is not CaseVerdict.PASS]
 
 
+@pytest.mark.slow
 @each(
     "target, only",
     [("bms", SHORT), ("wmc", ("FR-08", "CR-03", "CR-04")), ("obc", ("FR-01", "CR-04", "TM-05"))],
@@ -82,6 +83,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     assert failed(report(only=only, **choices)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_a_device_that_says_nothing_to_damaged_packets_is_judged_all_the_same() -> None:
     assert failed(report(only=("CR-02",), bad_packet="silence", pause_in_transfer="waits")) == []
@@ -92,6 +94,7 @@ def test_no_damaged_packet_is_taken_by_the_mock() -> None:
     assert failed(report(only=LONGEST)) == []
 
 
+@pytest.mark.slow
 @each(
     "name, case_id, key, value",
     [

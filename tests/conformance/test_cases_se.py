@@ -13,6 +13,7 @@ from .verdicts import cases_of, not_passed
 CASES = ("SE-01", "SE-03", "SE-04")
 
 
+@pytest.mark.slow
 def test_the_mock_passes() -> None:
     assert tuple(cases_of("SE")) == CASES
     assert not_passed(*CASES) == []

@@ -16,12 +16,14 @@ REPEATED = ("TX-02", "TX-05")
 LEFT = ("TX-12", "TX-13")
 
 
+@pytest.mark.slow
 def test_the_mock_passes() -> None:
     cases = cases_of("TX")
     assert len(cases) == 10
     assert not_passed(*cases) == []
 
 
+@pytest.mark.slow
 @each("target", ["wmc", "obc"])
 def test_a_target_without_a_version_query_passes(target: str) -> None:
     assert not_passed("TX-01", "TX-13", target=target) == []
@@ -70,6 +72,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     assert not_passed(*cases, **choices) == []
 
 
+@pytest.mark.slow
 @each(
     "case_id, states",
     [

@@ -35,6 +35,7 @@ MOCK = ("conformance", "-t", "bms", "--mock")
 WRONG = (*MOCK, "--variant", "announces-three-times", "--case", "RS-01", "--case", "RS-04")
 
 
+@pytest.mark.slow
 def test_a_device_that_follows_the_protocol_passes(flasher: Flasher) -> None:
     run = flasher(*MOCK, "--group", "rs")
     assert run.code == 0
@@ -105,6 +106,7 @@ def test_the_list_shows_what_can_be_run_and_what_cannot(
     assert all(case["title"] for case in everything)
 
 
+@pytest.mark.slow
 def test_a_quick_run_takes_less_than_a_minute_on_the_bus(flasher: Flasher) -> None:
     report = flasher(*MOCK, "--quick", "--json").document["report"]
     assert report["passed"]

@@ -138,6 +138,7 @@ class StartsAtZero(PythonBootloader):
     crc_start = 0
 
 
+@pytest.mark.slow
 def test_bring_up_fails_with_the_diagnosis_and_its_trace() -> None:
     name = "tests.conformance.test_diagnosis:StartsAtZero"
     with open_subject(name, "bms", None, good_image=None, second_image=None) as (subject, profile):

@@ -49,6 +49,7 @@ def test_nothing_is_found_on_a_device_of_other_choices(choices: dict[str, str]) 
     assert _explorer(**choices).explore(250).finding is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
 def test_nothing_is_found_on_a_right_device(target: str) -> None:
     explored = _explorer(target=target).explore(250)
@@ -78,11 +79,13 @@ def test_the_shortest_walk_to_a_flaw_is_found_and_finds_it_again(
     assert _explorer().replay(steps.split()).finding is None
 
 
+@pytest.mark.slow
 def test_a_seed_decides_everything() -> None:
     first, second = (_explorer("accepts-early-end", seed="4").explore(1000) for _ in range(2))
     assert first == second
 
 
+@pytest.mark.slow
 def test_a_device_that_takes_no_upgrade_is_a_finding_before_the_first_step() -> None:
     explored = _explorer("big-endian-numbers").explore(100)
     assert explored.finding is not None
@@ -119,6 +122,7 @@ def test_a_walk_that_is_stopped_leaves_the_good_image(
     assert restore(subject, profile_of_mock(), flash=False).how == BY_NOTHING
 
 
+@pytest.mark.slow
 def test_a_stop_while_the_walk_is_cut_down_keeps_what_was_found() -> None:
     subject = MockSubject(make_device=variant_maker("repeat-unanswered"))
     whole = Explorer(subject, profile_of_mock()).explore(4000)
@@ -171,6 +175,7 @@ def test_no_two_messages_that_are_refused_are_the_same_and_none_is_the_right_one
     assert writes == {0x16}
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_replay_that_finds_the_same(flasher: Flasher, tmp_path: Path) -> None:
     trace = tmp_path / "walk.log"
     ran = flasher(
@@ -227,6 +232,7 @@ def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("argument", ["", "=other"])
 @pytest.mark.parametrize("choice", ["ack", "nak_next", "either"])
 def test_a_repeated_packet_is_judged_by_the_profile_as_in_the_case(

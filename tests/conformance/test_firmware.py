@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
+
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.firmware import Firmware, make_firmware
@@ -64,6 +66,7 @@ class Restores(RunObserver):
         self.seen.append(what)
 
 
+@pytest.mark.slow
 def test_a_case_that_leaves_the_good_image_running_needs_no_restore() -> None:
     device, observer = subject(), Restores()
     selection = Selection(cases=("UP-05", "TX-02", "EN-07"))

@@ -60,6 +60,7 @@ def test_a_form_that_is_added_is_sent_in_walks() -> None:
     assert explorer.replay([*START, "packet-open=fr_02-6", "packets=all", "end"]).finding is None
 
 
+@pytest.mark.slow
 @each("key", KEYS)
 def test_a_walk_judges_by_the_profile_as_a_case_does(key: str) -> None:
     _, not_taken = choice_words(key)

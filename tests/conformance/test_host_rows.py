@@ -6,6 +6,8 @@ import ast
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, WEAR
 from tests.loops import each
 
@@ -49,6 +51,7 @@ def functions(path: Path) -> frozenset[str]:
     )
 
 
+@pytest.mark.slow
 @each("row", HOST_ROWS)
 def test_the_tests_of_a_row_exist(row: str) -> None:
     assert HOST_ROWS[row]

@@ -65,6 +65,7 @@ def _fails_at_once(bench: Bench) -> None:
     bench.fail("one", "two")
 
 
+@pytest.mark.slow
 @each(
     "action, keys",
     (

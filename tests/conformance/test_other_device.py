@@ -168,6 +168,7 @@ def test_other_ways_that_the_document_leaves_open_pass(
     assert judged(kind, cases, **choices) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each(
     "kind, cases, choices",

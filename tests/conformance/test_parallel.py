@@ -37,6 +37,7 @@ def _without_times(document: dict[str, Any]) -> dict[str, Any]:
     return {**report, "results": results, "started_at": "", "duration_s": 0, "times": []}
 
 
+@pytest.mark.slow
 def test_two_processes_report_what_one_does(flasher: Flasher) -> None:
     selected = [word for case_id in CASES[:-1] for word in ("--case", case_id)]
     one = flasher("--json", *WRONG, *selected, "--repeat", "2")
@@ -45,6 +46,7 @@ def test_two_processes_report_what_one_does(flasher: Flasher) -> None:
     assert _without_times(two.document) == _without_times(one.document)
 
 
+@pytest.mark.slow
 def test_without_a_case_several_processes_report_what_one_does(flasher: Flasher) -> None:
     none = ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--exclude", "RS-01")
     one, two = flasher("--json", *none), flasher("--json", *none, "--jobs", "2")
@@ -52,6 +54,7 @@ def test_without_a_case_several_processes_report_what_one_does(flasher: Flasher)
     assert _without_times(two.document) == _without_times(one.document)
 
 
+@pytest.mark.slow
 def test_a_stop_ends_all_processes() -> None:
     report = run_in_processes(
         BenchOptions("bms", is_mock=True),

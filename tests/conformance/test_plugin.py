@@ -57,6 +57,7 @@ def test_a_team_adds_its_own_tests_beside_the_suite(pytester: pytest.Pytester) -
     done.stdout.fnmatch_lines(["btl::RS-01 PASSED*", "*times in ms*", "mine*500.0*"])
 
 
+@pytest.mark.slow
 def test_a_failed_check_fails_a_test_that_went_on(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
@@ -78,6 +79,7 @@ def test_a_failed_check_fails_a_test_that_went_on(pytester: pytest.Pytester) -> 
     done.stdout.fnmatch_lines(["expected one; got two", "expected four; got five"])
 
 
+@pytest.mark.slow
 def test_the_verdicts_of_the_suite_are_those_of_pytest(pytester: pytest.Pytester) -> None:
     Path("p.toml").write_text(
         '[deviations]\n"RS-05" = "by design"\n[limits]\nversion_spacing_s = 0.02\n'
@@ -90,6 +92,7 @@ def test_the_verdicts_of_the_suite_are_those_of_pytest(pytester: pytest.Pytester
     done.stdout.fnmatch_lines(["*fail: expected *", "seed: 1/RS-01/1", "XFAIL*by design*"])
 
 
+@pytest.mark.slow
 def test_what_a_run_keeps_is_what_the_command_line_keeps(
     pytester: pytest.Pytester, flasher: Flasher
 ) -> None:
@@ -117,6 +120,7 @@ def test_what_a_run_keeps_is_what_the_command_line_keeps(
     assert "good image at the end" in Path("r.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_pass_in_part_says_what_was_not_tried_and_fails_a_strict_run(
     pytester: pytest.Pytester,
 ) -> None:
@@ -132,6 +136,7 @@ def test_a_pass_in_part_says_what_was_not_tried_and_fails_a_strict_run(
     assert strict.parseoutcomes()["failed"] == 1
 
 
+@pytest.mark.slow
 def test_the_frames_of_an_own_test_that_failed_are_kept(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
@@ -185,6 +190,7 @@ def test_what_is_wrong_with_the_bench_is_told_without_a_traceback(
 # -- for those who do not use it ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_a_device_its_fixtures_skip_and_nothing_else_changes(
     pytester: pytest.Pytester,
 ) -> None:

@@ -45,6 +45,7 @@ def bench(*, has_power: bool) -> tuple[RealSubject, MockDevice]:
     return real, device
 
 
+@pytest.mark.slow
 def test_a_device_without_power_control_passes_what_it_can() -> None:
     real, device = bench(has_power=False)
     report = run(real, profile_of_mock(), selection=Selection(groups=("RS", "UP")))
@@ -111,6 +112,7 @@ def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_flash_is_compared_over_the_bus_where_nothing_else_reads_it() -> None:
     real, _ = bench(has_power=False)
     report = run(real, KNOWS_ADDRESS, selection=Selection(cases=("UP-03", "UP-08")))

@@ -60,6 +60,7 @@ def test_the_good_image_runs_after_a_replay(trace: Path) -> None:
     assert subject.readback().startswith(subject.good_image)
 
 
+@pytest.mark.slow
 def test_a_crash_is_a_finding(flasher: Flasher, trace: Path) -> None:
     subject = "tests.conformance.test_subject:Raises"
     ran = flasher("conformance", "replay", trace, "-t", "bms", "--subject", subject)

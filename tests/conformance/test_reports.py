@@ -7,6 +7,8 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from typing import Any, Final
 
+import pytest
+
 from flasher.cli.bench.conformance import ConformanceDocument
 from flasher.cli.bench.conformance_text import report_lines
 from flasher.cli.schema import schema_of
@@ -91,6 +93,7 @@ def page_of(report: RunReport, **replays: str) -> str:
 # -- JSON -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each("make", [wrong_run, hostile_report, lambda: run_case(passes_once)])
 def test_the_document_is_as_its_schema_says(make: Any) -> None:
     document = {"report": document_of(make())}
@@ -116,6 +119,7 @@ def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
     assert [case["id"] for case in made["cases"]] == ["RS-01", "RS-04", "EN-04"]
 
 
+@pytest.mark.slow
 @each("address, by", [(AREA_START, ["version", "memory over the bus"]), (0, ["version"])])
 def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: list[str]) -> None:
     small = replace(MOCK_PROFILE, application_area_bytes=4096)
@@ -158,6 +162,7 @@ def test_times_are_told_with_their_histogram() -> None:
     assert sum(times["histogram"]["counts"]) == 101
 
 
+@pytest.mark.slow
 def test_two_runs_with_one_seed_differ_in_times_only() -> None:
     cases = ("RS-01", "UP-04", "UP-08")
     first, second = (without_times(document_of(wrong_run(*cases, seed="7"))) for _ in range(2))
@@ -212,6 +217,7 @@ def verdict_of(report: RunReport) -> tuple[str, str]:
     return "", ""
 
 
+@pytest.mark.slow
 def test_every_verdict_has_its_element() -> None:
     assert verdict_of(run_case(passes_once)) == ("", "")
     assert verdict_of(run_case(fails_once)) == ("failure", "expected one; got two")
@@ -317,6 +323,7 @@ def test_hostile_text_is_shown_and_does_nothing() -> None:
     assert "<script>alert(1)</script>" in page.text
 
 
+@pytest.mark.slow
 def test_a_page_stays_small_however_much_a_case_says() -> None:
     def talks(bench: Bench) -> None:
         for _ in range(300):

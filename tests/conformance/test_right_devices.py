@@ -72,6 +72,7 @@ def test_the_quick_suite_holds_nothing_against_a_right_device(seed: int) -> None
     assert faults_of(seed, Selection(quick=True)) == []
 
 
+@pytest.mark.slow
 def test_a_request_for_a_doubled_update_command_may_come_between_two_copies_of_packet_1() -> None:
     assert faults_of(334, Selection(cases=("BU-01",))) == []
 
@@ -83,6 +84,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
 # -- times at their limits -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_many_updates_in_a_row_may_erase_to_the_limit_each() -> None:
     slow = dataclasses.replace(MOCK_PROFILE, erase_time_s=9.9 / 4)  # a record and three pages
     assert blamed("UP-08", device=slow, given={"up_08": "either"}) == []
@@ -110,6 +112,7 @@ def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> N
     assert blamed(case_id, kind=kind, device=device) == []
 
 
+@pytest.mark.slow
 @each("case_id", ("UP-08", "TX-13", "CO-02", "CO-04"))
 def test_silence_in_a_transfer_is_no_pause(case_id: str) -> None:
     """The suite waits for silence as long as general feedback may take (limits.feedback_s)."""
@@ -121,6 +124,7 @@ def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() ->
     assert faults_of(21, Selection(cases=("UP-05",)), at_limits=True) == []
 
 
+@pytest.mark.slow
 @each("case_id", ("CR-01", "CR-03"))
 def test_waits_for_late_answers_to_damage_add_up_to_no_pause(case_id: str) -> None:
     """Two of them take longer than the pause, one does not."""
@@ -130,11 +134,13 @@ def test_waits_for_late_answers_to_damage_add_up_to_no_pause(case_id: str) -> No
     assert blamed(case_id, kind=kind, device=device, given=given) == []
 
 
+@pytest.mark.slow
 def test_an_application_starts_after_the_announcements_also_without_a_bus() -> None:
     device = dataclasses.replace(MOCK_PROFILE, reset_delay_s=3.0)
     assert blamed("BU-02", device=device, given={"limits.start_s": 1.0}) == []
 
 
+@pytest.mark.slow
 @each("choice", ("once", "either"))
 @each("request_s, ack_s", ((0.3, 0.2), (0.05, 0.45), (2.4, 0.49)))
 def test_a_repeated_update_command_may_be_answered_late(
@@ -144,6 +150,7 @@ def test_a_repeated_update_command_may_be_answered_late(
     assert blamed("UP-05", kind=kind, given={"up_05": choice}) == []
 
 
+@pytest.mark.slow
 @each("choice", ("either", "restarts"))
 @each("delay_s", (1.0, 4.0, 4.9))
 def test_a_restart_of_the_bootloader_may_take_as_long_as_one_of_the_application(
@@ -155,6 +162,7 @@ def test_a_restart_of_the_bootloader_may_take_as_long_as_one_of_the_application(
     assert blamed("RS-02", device=device, given={"rs_02": choice}) == []
 
 
+@pytest.mark.slow
 @each("choice", ("either", "restarts"))
 @each("pause", ("announces", "waits"))
 def test_a_restart_in_a_transfer_may_take_longer_than_a_pause(choice: str, pause: Any) -> None:
@@ -169,11 +177,13 @@ def test_a_restart_in_a_transfer_may_take_longer_than_a_pause(choice: str, pause
     assert blamed("TX-13", device=device, given=given) == []
 
 
+@pytest.mark.slow
 def test_an_application_may_start_at_the_end_of_its_limit() -> None:
     device = dataclasses.replace(MOCK_PROFILE, start_delay_s=4.99)
     assert blamed("BR-01", "EN-01", "EN-02", "EN-07", device=device) == []
 
 
+@pytest.mark.slow
 def test_an_update_command_in_the_burst_may_be_answered_by_nak() -> None:
     kind = type("Right", (RefusesInBurst, answers_late(Nak=0.3)), {})
     given: dict[str, Value] = {"up_04_burst": "rejected", "up_02": "nak"}
@@ -210,6 +220,7 @@ def test_a_device_may_listen_only_after_its_announcements(case_id: str) -> None:
     assert blamed(case_id, kind=ListensAfterBurst, given=_AFTER_BURST) == []
 
 
+@pytest.mark.slow
 @each(
     "case_id, flaw",
     (("UP-06", AnyTargetName), ("UP-02", ErasesBeforeCheck), ("PW-01", _RecordLast)),
@@ -229,6 +240,7 @@ def test_a_case_without_a_stimulus_that_was_heard_does_not_pass(case_id: str) ->
     assert "were heard" in found
 
 
+@pytest.mark.slow
 @each("case_id", ("UP-02", "UP-06", "FR-04", "TX-04", "RS-04", "UP-03"))
 def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
     report = run(subject(), profile_of_mock(), selection=Selection(cases=(case_id,)))
@@ -365,6 +377,7 @@ def test_walks_on_a_dual_bank_device_find_nothing(old: str) -> None:
     assert Explorer(subject(SwapsBanks), profile, seed="4").explore(400).finding is None
 
 
+@pytest.mark.slow
 @each("target", ("bms", "wmc", "obc"))
 def test_an_application_may_take_its_time_to_listen(target: str) -> None:
     report = run(

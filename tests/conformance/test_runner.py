@@ -344,6 +344,7 @@ def test_an_adapter_that_is_unplugged_ends_the_run_with_a_true_report() -> None:
     assert not report.ok
 
 
+@pytest.mark.slow
 def test_a_node_that_babbles_beside_the_device_is_no_failure_of_it() -> None:
     device = MockSubject("bms", others=[Babbler(0.002)])
     report = run(device, PROFILE, selection=Selection(cases=("RS-01", "RS-04", "UP-05")))
@@ -361,6 +362,7 @@ def test_a_bus_that_is_taken_ends_the_run_in_bounded_time() -> None:
     assert report.duration_s < 60
 
 
+@pytest.mark.slow
 def test_a_device_that_resets_at_random_is_not_taken_for_a_good_one() -> None:
     report = run(
         subject(RestlessDevice), PROFILE, selection=Selection(cases=("RS-01", "RS-04", "UP-05"))

@@ -271,6 +271,7 @@ class SaysNothingEachMillisecond(PythonBootloader):
         return None
 
 
+@pytest.mark.slow
 def test_the_passes_of_one_call_are_few_enough_for_the_watchdog(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -281,6 +282,7 @@ def test_the_passes_of_one_call_are_few_enough_for_the_watchdog(
         assert device.port.now() == 1500.0
 
 
+@pytest.mark.slow
 def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_flash() -> None:
     report = _run(_FLAWS + "ErasesForEach", "UP-05")
     assert _failures(report) == ""
@@ -288,6 +290,7 @@ def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_fla
     assert result.verdict is CaseVerdict.PASS
 
 
+@pytest.mark.slow
 def test_time_passes_for_one_that_polls_the_clock() -> None:
     assert _run(_FLAWS + "WaitsForTheClock", "EN-01").ok
 
@@ -342,6 +345,7 @@ class PrintsForEver(PythonBootloader):
             os.write(1, b"x" * 4096)
 
 
+@pytest.mark.slow
 def test_a_bootloader_that_prints_without_end_is_ended_before_the_disk_is_full(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -350,6 +354,7 @@ def test_a_bootloader_that_prints_without_end_is_ended_before_the_disk_is_full(
     assert "ended by SIGXFSZ in flasher_dut_receive" in _failures(report)
 
 
+@pytest.mark.slow
 def test_a_crash_is_printed_whole_and_once(flasher: Flasher, tmp_path: Path) -> None:
     junit = tmp_path / "junit.xml"
     ran = flasher(
@@ -372,6 +377,7 @@ class IsSanitized(PythonBootloader):
         os._exit(1)
 
 
+@pytest.mark.slow
 def test_the_report_of_a_sanitizer_is_told_without_its_dump() -> None:
     report = _run(_FLAWS + "IsSanitized", "EN-01")
     found = _failures(report) + report.not_upgradable + report.stopped
@@ -409,6 +415,7 @@ def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() 
     assert [gap > 0.001 for gap in gaps].count(True) == 1  # back to back, except for the bus-off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["EndsAtOnce", "SaysNothing"])
 def test_nobody_is_sent_to_look_for_wires_of_a_bootloader_on_the_computer(flaw: str) -> None:
     report = _run(_FLAWS + flaw, "BR-01")
@@ -416,6 +423,7 @@ def test_nobody_is_sent_to_look_for_wires_of_a_bootloader_on_the_computer(flaw: 
     assert "wiring" not in report.stopped + _failures(report)
 
 
+@pytest.mark.slow
 def test_signals_to_the_group_of_processes_are_for_the_suite() -> None:
     assert _run(_FLAWS + "EndsItsGroup", "EN-01").ok
 
@@ -524,6 +532,7 @@ os._exit(4)
 """
 
 
+@pytest.mark.slow
 def test_a_program_of_the_first_version_of_the_header_gets_its_answers(tmp_path: Path) -> None:
     program = tmp_path / "boot"
     program.write_text(f"#!{sys.executable}{_OF_ABI_1}")

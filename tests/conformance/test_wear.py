@@ -73,6 +73,7 @@ def test_upgrades_that_fail_are_named_by_their_number() -> None:
     assert "erased and written 8 times" in result.infos[-1]
 
 
+@pytest.mark.slow
 def test_what_passes_is_told_in_one_check() -> None:
     result = one(worn("SO-01", 30), "SO-01")
     assert [str(check) for check in result.checks] == [
@@ -80,6 +81,7 @@ def test_what_passes_is_told_in_one_check() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_a_slower_bootloader_is_seen_in_the_comparison_and_fails_a_limit() -> None:
     before, after = (worn("SP-01", 5, program_time_s=time_s) for time_s in (0.001, 0.004))
     reports = [completed(each, started_at="") for each in (before, after)]

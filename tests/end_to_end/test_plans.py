@@ -60,6 +60,7 @@ def test_what_is_no_plan_is_refused(line: str) -> None:
         Plan.parse(line)
 
 
+@pytest.mark.slow
 @each("seed", range(100, 112))
 def test_a_line_replays_a_run_frame_by_frame(seed: int) -> None:
     plan = drawn(seed)

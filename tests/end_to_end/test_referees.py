@@ -85,6 +85,7 @@ def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
     assert device.state == "application"
 
 
+@pytest.mark.slow
 @each(
     "script, ending, code",
     [
@@ -179,6 +180,7 @@ def test_a_lost_final_answer_never_leads_to_a_second_erase() -> None:
 # -- a host of literal frames, flasher's device model -------------------------------------------
 
 
+@pytest.mark.slow
 @each("size_bytes", [1, 127, 128, 129, 78351])
 @each("target", ["wmc", "bms", "obc"])
 def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_bytes: int) -> None:

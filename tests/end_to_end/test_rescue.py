@@ -398,6 +398,7 @@ def test_the_wait_for_the_adapter_is_over_with_the_overall_deadline() -> None:
     assert stage.clock.now() == pytest.approx(5.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_long_wait_for_the_adapter_is_allowed_for_by_the_default_deadline() -> None:
     stage = Stage()
     stage.at_packet[2] = lambda: stage.bus.unplug(550.0)

@@ -105,6 +105,7 @@ def test_a_cut_trace_is_a_table_up_to_there(flasher: Flasher, tmp_path: Path) ->
 # -- other programs' packages ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_notebook_reads_a_trace_in_two_lines(trace: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="needs the extra table")
     table = pandas.DataFrame(trace_rows(trace))

@@ -87,6 +87,7 @@ def _watch_update_commands(bench: Bench, said: list[tuple[float, UpgradeMessage]
         assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
 
 
+@pytest.mark.slow
 @given(script, st.booleans(), st.integers(1, 2))
 @settings(max_examples=100, deadline=None, derandomize=True)
 def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application(

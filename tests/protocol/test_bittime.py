@@ -67,6 +67,7 @@ def test_pathological_frames_have_the_length_of_the_reference(can_id: int) -> No
         assert frame_bits(Frame(can_id, data)) == _reference_bits(can_id, data), data.hex()
 
 
+@pytest.mark.slow
 def test_random_frames_of_all_ids_and_sizes_have_the_length_of_the_reference() -> None:
     rng = random.Random(2)
     for _ in range(3000):
@@ -74,6 +75,7 @@ def test_random_frames_of_all_ids_and_sizes_have_the_length_of_the_reference() -
         assert frame_bits(Frame(can_id, data)) == _reference_bits(can_id, data), (can_id, data)
 
 
+@pytest.mark.slow
 @each("can_id", [0x000, 0x715, 0x752, 0x7FF])
 def test_a_stream_has_the_lengths_of_its_frames(can_id: int) -> None:
     full = [data for data in _PATHOLOGICAL if len(data) == 8]

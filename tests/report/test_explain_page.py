@@ -127,6 +127,7 @@ def test_what_the_recording_tool_said_is_shown() -> None:
     assert "a packet was not acknowledged" in page.text
 
 
+@pytest.mark.slow
 @each("text", stories.HOSTILE)
 def test_hostile_text_is_shown_and_does_nothing(text: str) -> None:
     told = replace(stories.hostile_story(text), recorded=Recorded(text, None, text))
@@ -141,6 +142,7 @@ def test_hostile_text_is_shown_and_does_nothing(text: str) -> None:
         assert text in page.text
 
 
+@pytest.mark.slow
 def test_very_long_texts_are_cut() -> None:
     html = render(stories.hostile_story("x" * 100_000))
     assert len(html) < 60_000

@@ -84,6 +84,7 @@ def carrying(text: str, content: dict[str, Any]) -> str:
     return re.sub(f"{MARKS[0]}.*?{MARKS[1]}", block, text, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("serial", [SERIAL, "W2605003"])
 def test_a_certificate_as_it_was_written_is_proven(plant: Bench, serial: str) -> None:
     found = checked(plant, page(plant, serial))
@@ -93,6 +94,7 @@ def test_a_certificate_as_it_was_written_is_proven(plant: Bench, serial: str) ->
     assert found.fingerprint == checked(plant, page(plant)).fingerprint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("language", "measured"), [("de", "36,25 V"), ("zh", "36.25 V")])
 def test_a_certificate_in_another_language_is_checked(
     plant: Bench, language: str, measured: str

@@ -502,6 +502,7 @@ def test_a_missing_table_is_said(bench: Bench) -> None:
         load_badges(Path("nowhere.toml"), bench.recipe.recipe.serial_number)
 
 
+@pytest.mark.slow
 def test_a_hash_is_made_as_the_library_recommends() -> None:
     made = pins.hash_of(Pin(PIN))
     pins.check_hash(made)

@@ -306,6 +306,7 @@ def test_a_label_of_another_source_can_be_freed_everywhere(recipe: LoadedRecipe)
 # -- a card dies with its unit --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each("own", [("", ""), ("M1", "M2"), ("W1", "W2")])
 def test_a_card_does_not_live_longer_than_its_unit(
     recipe: LoadedRecipe, own: tuple[str, str]

@@ -512,6 +512,7 @@ def test_an_order_that_crosses_the_report_of_an_exchange_is_not_carried_out(
     assert "before the run began" in ended.text
 
 
+@pytest.mark.slow
 @each("gap_s", [0.3, 0.5, 1.0, 3.5])
 @each("pulled_after_s", [0.0, 0.04, 0.06, 0.08, 0.1, 0.13, 0.15, 0.2, 0.3])
 def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(

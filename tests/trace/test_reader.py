@@ -70,6 +70,7 @@ def test_an_unknown_suffix_is_told_with_the_known_ones(tmp_path: Path) -> None:
     assert ".asc" in caught.value.remedy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".blf", ".csv", ".log", ".db", ".asc.gz"])
 def test_a_file_that_is_something_else_is_wrong_usage(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"trace{suffix}"
@@ -209,6 +210,7 @@ def test_a_recording_that_grows_faster_than_it_is_read_has_an_end(tmp_path: Path
     assert count == 2000
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("data", [b"", b"MDF     4.10", b"MDF     4.10    " + bytes(200)])
 def test_an_invalid_measurement_file_is_refused_with_its_cause(tmp_path: Path, data: bytes) -> None:

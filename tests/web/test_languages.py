@@ -125,6 +125,7 @@ def _use(fault: BikeFault) -> Callable[[BikeBench], object]:
     return order(BikeBench.use_adapter, fault.value)
 
 
+@pytest.mark.slow
 def test_no_adapter(place: BenchPlace) -> None:
     state = place.do(lambda _bench: open_bus({"interface": "socketcan", "channel": "can97"}))
     assert state.trouble is not None
@@ -197,6 +198,7 @@ def test_a_trace_that_cannot_be_read(place: BenchPlace, name: str, data: bytes, 
     _check(pages, shows=shows)
 
 
+@pytest.mark.slow
 @each("fault", [BikeFault.POWER, BikeFault.PULLED, BikeFault.SECOND_TOOL, BikeFault.REFUSES])
 def test_an_upgrade_that_fails(place: BenchPlace, fault: BikeFault) -> None:
     state = place.do(
@@ -359,6 +361,7 @@ def test_a_failed_run_in_the_records(
         _check(pages, shows=shows if path.startswith("/units") else "How to read this page")
 
 
+@pytest.mark.slow
 @each(
     "statement, shows",
     [

@@ -278,6 +278,7 @@ def guesses(count: int, *, address: str = "192.0.2.1") -> list[tuple[str, str, s
     return [(address, "BADGE-2", f"{number:04}") for number in range(count)]
 
 
+@pytest.mark.slow
 def test_of_guesses_at_the_same_time_no_more_than_five_are_checked() -> None:
     place = Place()
     found: Counter[int] = Counter()
@@ -317,6 +318,7 @@ def test_a_client_that_is_refused_learns_how_long() -> None:
     assert "Too many tries: wait 60 s." in answer.text
 
 
+@pytest.mark.slow
 def test_a_badge_that_is_attacked_signs_in_from_another_address() -> None:
     place = Place()
     for _ in range(3 * TRIES_MAX):
@@ -325,6 +327,7 @@ def test_a_badge_that_is_attacked_signs_in_from_another_address() -> None:
     as_sue(place.browser("192.0.2.2"))
 
 
+@pytest.mark.slow
 def test_one_client_does_not_lock_out_everybody() -> None:
     place = Place()
     attacker = place.browser("192.0.2.1")
@@ -334,6 +337,7 @@ def test_one_client_does_not_lock_out_everybody() -> None:
     as_sue(place.browser("192.0.2.2"))
 
 
+@pytest.mark.slow
 @each(
     "one, other, is_one",
     [
@@ -369,6 +373,7 @@ def test_a_badge_that_opens_nothing_takes_as_long_as_one_with_a_pin(badge: str) 
     assert place.checker.done == 1
 
 
+@pytest.mark.slow
 def test_badges_without_a_pin_are_not_guessed_without_end() -> None:
     browser = Place().browser()
     found = [sign_in(browser, badge=f"GUESS-{number}")[0] for number in range(30)]
@@ -415,6 +420,7 @@ def test_a_stream_or_a_look_by_a_script_is_no_use() -> None:
     assert status(browser) == 303
 
 
+@pytest.mark.slow
 @each("fields", [{"badge": "BADGE-4", "pin": PIN}, {"password": ALL}])
 def test_every_sign_in_ends_after_a_shift(fields: dict[str, str]) -> None:
     place = Place(is_far=True, password=ALL)
@@ -430,6 +436,7 @@ def test_every_sign_in_ends_after_a_shift(fields: dict[str, str]) -> None:
     assert [each["why"] for each in place.told(AuditEvent.SIGN_IN_ENDED)] == ["8 h"]
 
 
+@pytest.mark.slow
 def test_a_supervisor_who_is_always_there_signs_in_once_a_shift() -> None:
     place = Place()
     browser = as_sue(place.browser())
@@ -607,6 +614,7 @@ def test_a_supervisor_sees_who_is_there_and_ends_it() -> None:
     assert [each["name"] for each in place.told(AuditEvent.SIGN_IN)] == ["Sue", "Rea"]
 
 
+@pytest.mark.slow
 @each(
     "fields", [{"number": "99"}, {"number": "x"}, {"number": "\u0663"}, {"number": "9" * 5000}, {}]
 )
@@ -644,6 +652,7 @@ def test_sign_ins_of_one_person_are_limited() -> None:
     assert notes.count(AuditEvent.SIGN_IN_ENDED) == 1
 
 
+@pytest.mark.slow
 @each("badge, pin", [("BADGE-2", PIN), ("BADGE-3", "")])
 def test_who_signs_in_again_and_again_in_a_shift_is_let_in(badge: str, pin: str) -> None:
     place = Place()
@@ -652,6 +661,7 @@ def test_who_signs_in_again_and_again_in_a_shift_is_let_in(badge: str, pin: str)
         place.clock.go_on(PAUSE_S / 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["/login", "/sign-ins"])
 def test_pages_of_sign_ins_are_in_every_language(page: str) -> None:
     place = Place(password=ALL)

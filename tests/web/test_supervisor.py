@@ -501,6 +501,7 @@ def test_hostile_texts_stay_texts(bench: Bench) -> None:
         assert "\u202e" not in text, path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("language", ["en", "de", "zh"])
 @pytest.mark.parametrize(
     "path", ["/runs", "/units", "/units?serial=W2605003", "/images", "/yield", "/times", "/audit"]
