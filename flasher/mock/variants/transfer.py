@@ -393,7 +393,7 @@ class PauseCountsFromStart(MockDevice):
         super()._await_host(self._began_at)
 
 
-@variant("timer-wraps", "TX-12", also="CR-01")
+@variant("timer-wraps", "TX-12")
 class TimerWraps(MockDevice):
     """Gives up a transfer 65.536 s after its start, where its clock of 16 bits wraps."""
 
