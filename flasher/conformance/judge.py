@@ -107,9 +107,16 @@ class Judge:
         self._record(CheckOutcome.PASS if ok else CheckOutcome.FAIL, expected, str(got), by)
         return ok
 
-    def require(self, ok: bool, expected: str, got: object) -> None:  # noqa: FBT001
+    def require(
+        self,
+        ok: bool,  # noqa: FBT001
+        expected: str,
+        got: object,
+        *,
+        by: Mapping[str, float] | None = None,
+    ) -> None:
         """Record a check; a failure ends the case by CaseStopped."""
-        if not self.check(ok, expected, got):
+        if not self.check(ok, expected, got, by=by):
             raise CaseStopped(expected)
 
     def succeed(self, expected: str, got: object) -> None:

@@ -53,7 +53,10 @@ _LONG_STAY_S: Final = 4320.0
 def reset(bench: Bench) -> None:
     with bench.tester.collecting_feedback():
         sent = bench.send(bench.encoder.reset())
-        feedback = bench.expect(Reply.FEEDBACK)
+        within_s, expected = bench.tester.limit_s(Reply.FEEDBACK), Reply.FEEDBACK.value
+        feedback = bench.require_received(bench.next_message(within_s), expected, within_s)
+        # No key allows another message.
+        bench.require(feedback.kind is Reply.FEEDBACK, expected, feedback, by={})
     bench.measure(TimeName.FEEDBACK, feedback.at - sent.left_at)
     first = bench.expect(Reply.BOOT_VERSION)
     bench.measure(TimeName.FIRST, first.at - sent.left_at)
