@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.mock import MockSubject, device_maker
+from flasher.conformance.mock import (
+    GOOD_IMAGE,
+    MOCK_PROFILE,
+    SECOND_IMAGE,
+    MockSubject,
+    device_maker,
+    profile_of_mock,
+)
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.model import AnyMessage, MockDevice
@@ -95,3 +103,23 @@ def test_an_end_mark_that_is_refused_and_then_taken_fails() -> None:
     assert failure is not None
     assert failure.step.startswith("end of transfer with")
     assert "complete" in failure.got
+
+
+@each("checksum", ("none", "crc32"))
+def test_a_good_image_of_the_user_is_padded_to_the_end_of_a_sector(checksum: str) -> None:
+    device = replace(MOCK_PROFILE, image_checksum=checksum)  # type: ignore[arg-type]
+    subject = MockSubject(profile=device, good_image=GOOD_IMAGE, second_image=SECOND_IMAGE)
+    report = run(subject, profile_of_mock(device), selection=Selection(cases=("EN-01",)))
+    (result,) = report.results
+    assert result.verdict is CaseVerdict.PASS
+    steps = {check.step for check in result.checks}
+    assert steps >= {f"the good image padded to {size} bytes" for size in (8191, 8192, 8193)}
+
+
+def test_a_device_without_room_for_a_padded_image_is_judged_in_part() -> None:
+    device = replace(MOCK_PROFILE, application_area_bytes=8192)
+    subject = MockSubject(profile=device, good_image=GOOD_IMAGE, second_image=SECOND_IMAGE)
+    report = run(subject, profile_of_mock(device), selection=Selection(cases=("EN-01",)))
+    (result,) = report.results
+    assert result.verdict is CaseVerdict.PASS_IN_PART
+    assert "an image that ends with a sector" in result.not_tried[0]
