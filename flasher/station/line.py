@@ -804,8 +804,9 @@ class Line:
                     if waiting.label
                     else text("No label was scanned for it.")
                 )
+                is_card = waiting.card is not None
                 self._drop_waiting(waiting, _dropped(reason))
-                waiting.is_in_doubt = False
+                waiting.is_in_doubt = is_card  # its label may be scanned late, at another unit
             if waiting.is_in_doubt and waiting.forget_at_s is None:
                 waiting.forget_at_s = now + SCAN_LIMIT_S
             if not (waiting.text or waiting.is_in_doubt):
