@@ -5,12 +5,13 @@ profile.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import click
 
@@ -83,6 +84,11 @@ from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunRepor
 from flasher.conformance.side_by_side import SideBySide, side_by_side
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
+
+if TYPE_CHECKING:
+    from flasher.conformance.dut.exported_test import ExportedTest
+    from flasher.conformance.profile import ConformanceProfile
+    from flasher.conformance.subject import Subject
 
 _EXAMPLES: Final = """\
 examples:
@@ -211,7 +217,7 @@ class Choices:
     )]  # fmt: skip
     quick: Annotated[bool, _what(
         "--quick", is_flag=True, brief=True,
-        help="some of every group, in under a minute on a real bus with an image of a few KiB",
+        help="some of every group: one to three minutes on a real bus with an image of a few KiB",
     )]  # fmt: skip
     seed: Annotated[str, _what(
         "--seed", default="1", metavar="SEED", help="decides all that is left to chance",
@@ -285,7 +291,6 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
     if chosen.is_list:
         return _list(chosen.selection, output)
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
-    from flasher.conformance.dut.exported_test import export_case  # noqa: PLC0415
     from flasher.conformance.runner import SuiteOptions, run  # noqa: PLC0415
 
     bench = described(bench, bus)
@@ -335,22 +340,26 @@ def conformance(output: Output, bus: Bus, bench: BenchOptions, chosen: Choices) 
                 observer=observer,
                 stopped=stopped,
             )
-        export(
-            chosen.export_test,
-            (
-                (result.case_id, partial(
-                    export_case, result, case_text(result.case_id, profile).title,
-                    subject, profile, stopped=stopped,
-                ))
-                for result in report.results
-                if result.verdict is CaseVerdict.FAIL
-            ),
-            output,
-        )  # fmt: skip
+        export(chosen.export_test, _exportable(report, subject, profile, stopped), output)
         was_stopped = stopped()
     code = exit_code(report, was_stopped=was_stopped)
     _tell(report, chosen, output, started_at, code)
     return code
+
+
+def _exportable(
+    report: RunReport,
+    subject: Subject,
+    profile: ConformanceProfile,
+    stopped: Callable[[], bool],
+) -> Iterator[tuple[str, Callable[[], ExportedTest]]]:
+    """Failed cases, and how to make a test in C of each."""
+    from flasher.conformance.dut.exported_test import export_case  # noqa: PLC0415  rarely needed
+
+    for text, result in report.by_case():
+        if result.verdict is CaseVerdict.FAIL:
+            make = partial(export_case, result, text.title, subject, profile, stopped=stopped)
+            yield result.case_id, make
 
 
 def _only_failed(chosen: Choices, path: Path, target: str) -> Choices:

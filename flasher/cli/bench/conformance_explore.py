@@ -98,8 +98,7 @@ def explore(
     """Walk through valid and invalid messages in any order until the device breaks a rule, and
     find the shortest walk that breaks it.
     """
-    from flasher.conformance.dut.exported_test import export_walk  # noqa: PLC0415  much is loaded
-    from flasher.conformance.explore import Explorer  # noqa: PLC0415
+    from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
 
     bench = described(bench, bus)
     check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
@@ -139,9 +138,12 @@ def explore(
             if replay is None
             else explorer.replay(replay.split())
         )
-        finding = explored.finding
-        make = partial(export_walk, explored, subject, profile, stopped=stopped)
-        export(export_test, [("the walk", make)] if finding is not None else [], output)
+        if export_test is not None:
+            from flasher.conformance.dut.exported_test import export_walk  # noqa: PLC0415
+
+            make = partial(export_walk, explored, subject, profile, stopped=stopped)
+            found = [] if explored.finding is None else [("the walk", make)]
+            export(export_test, found, output)
         was_stopped = stopped()
     code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
     if was_stopped and explored.finding is None:
