@@ -19,7 +19,7 @@ from flasher.conformance.firmware import Firmware
 from flasher.conformance.judge import Judge, TimeName
 from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import CheckOutcome, Unsupported
+from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import BY_BUS, SIMULATED_BUS, Subject, readback_source
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import (
@@ -125,8 +125,8 @@ class Bench:
 
     @property
     def firmware(self) -> Firmware:
-        """The largest images that the bench has, for cases about content and size."""
-        return self.subject.firmware or Firmware(self.good_image, self.subject.second_image)
+        """Images for cases about content and size."""
+        return self.subject.firmware
 
     def padded(self, size_bytes: int) -> bytes:
         """The good image padded with FF to `size_bytes`, with a new checksum where the product's
@@ -355,14 +355,11 @@ class Bench:
 
     def check_image(self, image: bytes) -> None:
         """Check that the application of `image` runs and that the flash holds it."""
-        before = len(self.judge.checks)
-        self._check_runs(image)
-        self.check_stored(image, runs=True)
-        outcomes = {check.outcome for check in self.judge.checks[before:]}
-        knows = reported_version(self.subject.target, image) is not None or outcomes == {
-            CheckOutcome.PASS
-        }
-        is_good = image == self.good_image and knows and CheckOutcome.FAIL not in outcomes
+        runs = self._check_runs(image)
+        is_stored = self.check_stored(image, runs=True)
+        if is_stored is None:  # then the version has to tell them apart
+            is_stored = reported_version(self.subject.target, image) is not None
+        is_good = runs and is_stored and image == self.good_image
         self._good_since = self.now if is_good else inf
 
     def check_application(self, image: bytes | None = None) -> None:
@@ -374,22 +371,18 @@ class Bench:
         if self.tester.update_was_sent and reported_version(self.subject.target, chosen) is None:
             self.check_stored(chosen, runs=True)
 
-    def _check_runs(self, image: bytes) -> None:
+    def _check_runs(self, image: bytes) -> bool:
         wanted = reported_version(self.subject.target, image)
         if wanted is not None:
             found = self.application_version(self.limit("start_s"))
-            self.check(
-                found == wanted,
-                f"application {wanted} runs",
-                "no answer" if found is None else f"{found!a}",
-            )
-        else:
-            runs = self.application_runs()
-            self.check(runs, "the application runs", "it answers" if runs else "no answer")
+            got = "no answer" if found is None else f"{found!a}"
+            return self.check(found == wanted, f"application {wanted} runs", got)
+        runs = self.application_runs()
+        return self.check(runs, "the application runs", "it answers" if runs else "no answer")
 
-    def check_stored(self, image: bytes, *, runs: bool = False) -> None:
+    def check_stored(self, image: bytes, *, runs: bool = False) -> bool | None:
         """Check that the flash holds exactly `image`; `runs` says that its application is running.
-        Recorded as unsupported where the bench cannot read the flash.
+        None, recorded as unsupported, where the bench cannot read the flash.
         """
         expected = "the flash holds the image"
         try:
@@ -398,11 +391,11 @@ class Bench:
             reports = reported_version(self.subject.target, self.good_image) is not None
             why = "" if reports else ", and the device does not report which application runs"
             self.unsupported(expected, f"{missing}{why}")
-            return
+            return None
         if differs_at is not None and not runs and self.is_kept_aside(image):
             why = "the device keeps its old application until complete (rs_03_old)"
             self.unsupported(expected, why)
-            return
+            return None
         got = "the image"
         if differs_at is not None:
             got = f"different bytes from offset {differs_at}"
@@ -412,7 +405,7 @@ class Bench:
         # During a transfer, a part of it may still be in a buffer.
         name = "buffer_bytes"
         by = {} if runs else {f"device.{name}": self.number(name)}
-        self.check(differs_at is None, expected, got, by=by)
+        return self.check(differs_at is None, expected, got, by=by)
 
     def is_kept_aside(self, image: bytes) -> bool:
         """True when the device stores a transfer in another place, so that its flash still holds

@@ -138,8 +138,7 @@ class Case:
         """Time limit of the case for this device, on the bench's clock."""
         waits = Waits(profile, subject.port.bitrate_bps)
         largest_s = waits.upgrade_s(profile.number("largest_image_bytes"))
-        own = subject.firmware.good if subject.firmware else subject.good_image
-        own_s = waits.upgrade_s(len(own))
+        own_s = waits.upgrade_s(len(subject.firmware.good))
         return self.limit_s + self.upgrades * own_s + self.largest * largest_s
 
 

@@ -111,7 +111,6 @@ class RealSubject:
     has_bus_off = False
     has_timed_cuts = False
     flash_faults: FlashFaults | None = None
-    firmware: Firmware | None = None
 
     def __init__(
         self,
@@ -128,6 +127,7 @@ class RealSubject:
         self.target = target
         self.good_image = good_image
         self.second_image = second_image
+        self.firmware = Firmware(good_image, second_image)
         self.has_power = power is not None
         self.has_readback = readback is not None
         self.port = port

@@ -13,13 +13,13 @@ from flasher.conformance.restore import restore
 from flasher.conformance.results import DeviceCrashed, RunStopped, TraceEntry
 from flasher.conformance.subject import Subject
 from flasher.conformance.trace_excerpt import decoded_rows
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, Node, Target, can_id
 from flasher.trace.decoder import Decoder
 
-_LIMITS: Final = ("first_version_s", "erase_s", "ack_s", "complete_s", "start_s")
 """A slower device gets the longest of these times for the answers of the recorded one."""
 _TAIL_S: Final = 1.0
 """Time after the last frame in which answers still count."""
@@ -82,7 +82,7 @@ def replay(
     compare the device's messages. The good image is flashed again at the end, also after a stop.
     Raises BusError.
     """
-    player = Player(subject, max(map(profile.limit, _LIMITS)), stopped)
+    player = Player(subject, Waits(profile, subject.port.bitrate_bps).answer_s, stopped)
     trouble = ""
     try:
         done = restore(subject, profile, flash=True, stopped=stopped)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.conformance.firmware import GOOD, SECOND, ImageMaker, make_firmware
+from flasher.conformance.firmware import GOOD, SECOND, Firmware, ImageMaker, make_firmware
 from flasher.conformance.results import DeviceCrashed
 from flasher.conformance.subject import SIMULATED_BUS, Arrival, FlashFaults
 from flasher.conformance.wire import RawFrame
@@ -116,8 +116,10 @@ class SimulatedSubject(Generic[DeviceT]):
         self.device = device
         self.good_image = good_image or make_image(*GOOD, b"")
         self.second_image = second_image or (None if good_image else make_image(*SECOND, b""))
-        makes = not (good_image or second_image)
-        self.firmware = make_firmware(make_image, sector_bytes, area_bytes) if makes else None
+        self.firmware = Firmware(self.good_image, self.second_image)
+        if not (good_image or second_image):
+            made = make_firmware(make_image, sector_bytes, area_bytes)
+            self.firmware = made or self.firmware
         self.port = SimulatedPort(WELLING.bitrate_bps)
         self.bus = self.port.bus
 

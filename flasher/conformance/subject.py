@@ -101,8 +101,8 @@ class Subject(Protocol):
     """An image that runs on the device."""
     second_image: bytes | None
     """Another such image, smaller and of another version."""
-    firmware: Firmware | None
-    """Larger images, which cases about content and size use; None: the two above."""
+    firmware: Firmware
+    """Images for cases about content and size: larger ones, else the two above."""
     has_own_clock: bool
     """True when the device counts time by itself, so that its counters can overflow."""
     has_power: bool

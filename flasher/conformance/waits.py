@@ -83,6 +83,12 @@ class Waits:
         return min(self.silence_s, _NO_PAUSE * self._limit("pause_s"))
 
     @property
+    def answer_s(self) -> float:
+        """Longest time to the answer to any message."""
+        names = ("first_version_s", "erase_s", "ack_s", "complete_s", "start_s")
+        return max(map(self._limit, names))
+
+    @property
     def packet_s(self) -> float:
         """Longest time of a packet on the bus."""
         return PACKET_FRAMES * _FRAME_BITS / self._bitrate_bps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -9,7 +10,13 @@ import pytest
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.firmware import Firmware, make_firmware
-from flasher.conformance.mock import GOOD_IMAGE, SECOND_IMAGE, model_image, profile_of_mock
+from flasher.conformance.mock import (
+    GOOD_IMAGE,
+    MOCK_PROFILE,
+    SECOND_IMAGE,
+    model_image,
+    profile_of_mock,
+)
 from flasher.conformance.runner import RunObserver, run
 from flasher.conformance.wire import version_in
 from flasher.mock.store import checksum_fits
@@ -50,10 +57,8 @@ def test_small_and_large_sectors_are_bounded(sector_bytes: int, size_bytes: int)
 
 def test_a_device_with_too_little_room_is_tested_with_short_images() -> None:
     assert make_firmware(model_image, 8192, 3 * 8192 - 1) is None
-    small = subject()
-    small.firmware = None
-    bench = Bench(small, profile_of_mock(), limit_s=10.0)
-    assert bench.firmware == (GOOD_IMAGE, SECOND_IMAGE, ())
+    small = subject(profile=replace(MOCK_PROFILE, application_area_bytes=4096))
+    assert small.firmware == (GOOD_IMAGE, SECOND_IMAGE, ())
 
 
 class Restores(RunObserver):

@@ -20,6 +20,7 @@ from flasher.conformance.catalogue import (
     catalogue_order,
     missing_requirements,
 )
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, Unsupported
@@ -41,7 +42,8 @@ def bare(target: str) -> MockSubject:
     subject = MockSubject(target, profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES))
     subject.has_power = subject.has_readback = False
     subject.has_bus_off = subject.has_timed_cuts = False
-    subject.second_image = subject.firmware = None
+    subject.second_image = None
+    subject.firmware = Firmware(subject.good_image, None)
     subject.port.sends_error_frames = False
     send = subject.port.send
 

@@ -9,6 +9,7 @@ from typing import Any
 import flasher.conformance.cases  # noqa: F401  registers the cases
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, Case, group_of, why_unsupported
+from flasher.conformance.firmware import Firmware
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
@@ -36,7 +37,8 @@ def verdicts(
     make_device = None if variant is None else variant_maker(variant)
     subject = MockSubject(target, profile=profile, make_device=make_device)
     if not with_second_image:
-        subject.second_image = subject.firmware = None
+        subject.second_image = None
+        subject.firmware = Firmware(subject.good_image, None)
     if not with_power:
         subject.has_power = False
     # A variant includes choices of its own.

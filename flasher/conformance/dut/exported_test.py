@@ -15,7 +15,6 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.dut.subject import CompiledSubject
-from flasher.conformance.firmware import Firmware
 from flasher.conformance.mock import MockSubject, model_of_profile
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.replay import Player
@@ -28,6 +27,7 @@ from flasher.conformance.results import (
 )
 from flasher.conformance.shrink import shrink
 from flasher.conformance.subject import Subject
+from flasher.conformance.waits import Waits
 from flasher.conformance.wire import (
     ACK,
     BOOT_VERSION,
@@ -50,7 +50,6 @@ _AFTER_S: Final = 0.02
 """An answer this soon after the check belongs to it."""
 _FIRST_S: Final = 0.001
 _US: Final = 1_000_000
-_LIMITS: Final = ("first_version_s", "erase_s", "ack_s", "complete_s", "start_s")
 _COMMANDS: Final = {
     Reply.BOOT_VERSION.value: BOOT_VERSION,
     Reply.REQUEST.value: REQUEST,
@@ -172,7 +171,7 @@ def _demand(
     """Derive what the device has to do from the texts of a check. Raises NotExportableError."""
     sent_at = max((entry.at_s for entry in trace if entry.sent), default=at_s)
     waited_s = max(at_s - sent_at, 0.0) + _AFTER_S
-    patience_s = max(map(profile.limit, _LIMITS))
+    patience_s = Waits(profile, subject.port.bitrate_bps).answer_s
     encoder = Encoder(subject.target)
     if got.startswith("the device stopped"):
         return Demand("the bootloader goes on", patience_s)
@@ -239,7 +238,7 @@ def _sent_image(trace: Sequence[TraceEntry], subject: Subject, encoder: Encoder)
         for entry in trace
         if entry.sent and entry.frame.can_id == encoder.to_device
     )
-    good, second, sizes = subject.firmware or Firmware(subject.good_image, subject.second_image)
+    good, second, sizes = subject.firmware
     known = (subject.second_image, subject.good_image, good, second, *sizes)
     images = [image for image in known if image is not None]
     places = {
@@ -297,7 +296,7 @@ class _Exporter:
         self._profile = profile
         self._stopped = stopped
         self._encoder = Encoder(subject.target)
-        self._patience_s = max(map(profile.limit, _LIMITS))
+        self._patience_s = Waits(profile, subject.port.bitrate_bps).answer_s
         self._model = MockSubject(
             subject.target,
             profile=model_of_profile(profile),
