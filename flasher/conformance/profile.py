@@ -289,11 +289,17 @@ class ConformanceProfile:
 
     def _line(self, path: str, name: str) -> str:
         value = self.value(path)
-        shown = _quoted(value) if isinstance(value, str) else repr(value)
+        shown = _quoted(value) if isinstance(value, str) else value_text(path, value)
         why = self.rationales.get(path)
         if why is not None:
             shown = f"{{ value = {shown}, rationale = {_quoted(why)} }}"
         return f"{'' if path in self.given else '# '}{name} = {shown}"
+
+
+def value_text(path: str, value: Value) -> str:
+    """The value of a key for people; commands and addresses in hexadecimal."""
+    is_hexadecimal = path.endswith(("_command", "_address")) and isinstance(value, int)
+    return f"0x{value:04X}" if is_hexadecimal else str(value)
 
 
 def load_profile(path: str | os.PathLike[str]) -> ConformanceProfile:

@@ -9,6 +9,7 @@ import pytest
 from flasher.conformance.mock import profile_of_mock
 from flasher.conformance.profile import (
     ConformanceProfile,
+    Value,
     check_deviations,
     load_profile,
     profile_keys,
@@ -122,3 +123,16 @@ def test_the_mocks_choices_become_the_suites() -> None:
     assert profile.number("largest_image_bytes") == 1000
     # The announcement's 20 bytes take about 1.2 ms on the wire.
     assert 0.1985 < profile.limit("window_s") < 0.199
+
+
+def test_commands_and_addresses_are_written_in_hexadecimal(tmp_path: Path) -> None:
+    given: dict[str, Value] = {
+        "device.application_address": 0x0800_8000,
+        "device.reset_command": 0x4205,
+        "device.largest_image_bytes": 4096,
+    }
+    text = ConformanceProfile(given).to_toml()
+    assert "\napplication_address = 0x8008000\n" in text
+    assert "\nreset_command = 0x4205\n" in text
+    assert "\nlargest_image_bytes = 4096\n" in text
+    assert load_profile(write(tmp_path, text)).given == given

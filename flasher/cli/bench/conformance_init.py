@@ -74,7 +74,11 @@ def init(
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
     from flasher.conformance.init import UPGRADES, ask_device  # noqa: PLC0415
     from flasher.conformance.init.answers import MARGINS  # noqa: PLC0415
-    from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
+    from flasher.conformance.profile import (  # noqa: PLC0415
+        ConformanceProfile,
+        load_profile,
+        value_text,
+    )
     from flasher.conformance.runner import run  # noqa: PLC0415
 
     bench = described(bench, bus)
@@ -101,7 +105,7 @@ def init(
         seen = one.seen
         if output.verbosity <= 0 and len(seen) > _SEEN_SHOWN:
             seen = seen[: _SEEN_SHOWN - 3] + "..."
-        value = "open" if one.value is None else str(one.value)
+        value = "open" if one.value is None else value_text(one.key, one.value)
         rows.append(tuple(map(printable, (one.key, value, seen))))
     output.table(rows)
     tried = asked.report
