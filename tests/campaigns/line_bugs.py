@@ -1,145 +1,58 @@
 """Plants mistakes in the station, and has the campaign of the line find each of them:
 `python -m tests.campaigns.line_bugs`, or with the names of some.
 
-The mistakes are in `line_bugs.toml`, each with a story that it spoils. One is planted by giving the
-functions that it changes their other code; with it stories are drawn (`tests.campaigns.line_world`)
-until one ends in a violation that the station without the mistake does not have, for at most a
-minute of computing time; that story is shrunk. Prints what was found how, and after how long;
+The mistakes are in `line_bugs.toml`, each with a story that it spoils. With one planted
+(`flasher.simulate.planting`) stories are drawn (`tests.campaigns.line_world`) until one ends in a
+violation that the station without the mistake does not have, for at most a minute of computing
+time; that story is shrunk. Prints what was found how, and after how long;
 fails when a mistake is not found.
 """
 
 from __future__ import annotations
 
 import argparse
-import inspect
 import os
 import statistics
 import sys
 import time
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import CodeType, FunctionType
 from typing import Final
 
+from flasher.simulate.planting import Bug, Edit, swapped
 from tests.campaigns.line_world.play import draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 from tests.campaigns.line_world.world import STUCK
 
-CHECKOUT: Final = Path(__file__).parents[2]
 ACTS: Final = 60
 """Of one story."""
 LIMIT_S: Final = 60.0
 _BUGS: Final = Path(__file__).with_suffix(".toml")
-Codes = dict[FunctionType, CodeType]
 
 
 # -- the mistakes ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Edit:
-    file: str
-    """In the checkout."""
-    old: str
-    new: str
-
-
-@dataclass(frozen=True)
-class Bug:
-    name: str
-    breaks: str
-    """Which promise, and how."""
+class LineBug(Bug):
     kind: str
     """Of the violation with which its story ends."""
     story: str
-    edits: Sequence[Edit]
-
-    def modules(self) -> dict[str, str]:
-        """The changed modules, by their files. Raises ValueError for an edit whose text is not in
-        its file exactly once.
-        """
-        changed: dict[str, str] = {}
-        for edit in self.edits:
-            text = changed.get(edit.file) or (CHECKOUT / edit.file).read_text("utf-8")
-            found = text.count(edit.old)
-            if found != 1:
-                raise ValueError(f"{self.name}: {edit.old!a} is {found} times in {edit.file}")
-            changed[edit.file] = text.replace(edit.old, edit.new)
-        return changed
-
-    def codes(self) -> Codes:
-        """The code of each function that it changes."""
-        changed: Codes = {}
-        for file, text in self.modules().items():
-            module = import_module(file.removesuffix(".py").replace("/", "."))
-            for name, code in _codes_in(compile(text, module.__file__ or file, "exec")):
-                function = _function(vars(module), name)
-                if function is not None and _differ(function.__code__, code):
-                    changed[function] = code
-        return changed
 
 
-def _codes_in(code: CodeType) -> Iterator[tuple[str, CodeType]]:
-    """The functions of a module or a class, by their qualified names."""
-    for each in code.co_consts:
-        if isinstance(each, CodeType):
-            if each.co_flags & inspect.CO_OPTIMIZED:
-                yield each.co_qualname, each
-            else:
-                yield from _codes_in(each)
-
-
-def _function(names: Mapping[str, object], name: str) -> FunctionType | None:
-    *classes, last = name.split(".")
-    for each in classes:
-        names = vars(names.get(each, object))
-    found = names.get(last)
-    found = found.fget if isinstance(found, property) else found
-    found = inspect.unwrap(getattr(found, "__func__", found))  # type: ignore[arg-type]
-    return found if isinstance(found, FunctionType) else None
-
-
-def _differ(one: CodeType, other: CodeType) -> bool:
-    """Compares what they do, not where they are."""
-    mine, theirs = one.co_consts, other.co_consts
-    if (one.co_code, one.co_names, len(mine)) != (other.co_code, other.co_names, len(theirs)):
-        return True
-    return any(
-        _differ(a, b) if isinstance(a, CodeType) and isinstance(b, CodeType) else a != b
-        for a, b in zip(mine, theirs, strict=True)
-    )
-
-
-@contextmanager
-def swapped(codes: Codes) -> Iterator[None]:
-    """Functions have this code, or, in a story with it, their own again."""
-    _swap(codes)
-    try:
-        yield
-    finally:
-        _swap(codes)
-
-
-def _swap(codes: Codes) -> None:
-    for function, code in codes.items():
-        codes[function], function.__code__ = function.__code__, code
-
-
-def read_bugs() -> list[Bug]:
+def read_bugs() -> list[LineBug]:
     tables = tomllib.loads(_BUGS.read_text("utf-8"))["bug"]
     return [
-        Bug(
+        LineBug(
             table["name"],
             table["breaks"],
+            [Edit(**edit) for edit in table["edit"]],
             table["kind"],
             " ".join(table["story"].split()),
-            [Edit(**edit) for edit in table["edit"]],
         )
         for table in tables
     ]
@@ -152,7 +65,7 @@ def read_bugs() -> list[Bug]:
 class Found:
     """What came of a mistake."""
 
-    bug: Bug
+    bug: LineBug
     kind: str
     """Of the violation; empty when none was found."""
     text: str
@@ -179,7 +92,7 @@ class Found:
             yield f"    ({self.not_ours} stories that end so without the mistake were left out)"
 
 
-def find(bug: Bug, seed: int, limit_s: float, *, shrinks: bool) -> Found:
+def find(bug: LineBug, seed: int, limit_s: float, *, shrinks: bool) -> Found:
     """Draw stories with a mistake. What is found counts only when the station without it takes it
     well.
     """

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.campaigns.line_bugs import CHECKOUT, Bug, read_bugs, swapped
+from flasher.simulate.planting import swapped
+from tests.campaigns.line_bugs import LineBug, read_bugs
 from tests.campaigns.line_world.play import play
 from tests.campaigns.line_world.stories import Story
 
@@ -17,18 +18,15 @@ each_bug = pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
 
 
 @each_bug
-def test_a_planted_bug_applies_and_is_python(bug: Bug) -> None:
-    modules = bug.modules()
-
-    for file, text in modules.items():
-        before = (CHECKOUT / file).read_text("utf-8")
-        compile(text, file, "exec")
-        assert text != before
+def test_a_planted_bug_applies(bug: LineBug) -> None:
+    assert bug.codes()
 
 
 @pytest.mark.slow
 @each_bug
-def test_the_oracle_condemns_the_story_of_a_planted_bug_and_of_no_other_station(bug: Bug) -> None:
+def test_the_oracle_condemns_the_story_of_a_planted_bug_and_of_no_other_station(
+    bug: LineBug,
+) -> None:
     story, goes_home = Story.parse(bug.story), bug.kind in AT_HOME
 
     assert play(story, goes_home=goes_home).text == ""

@@ -15,6 +15,7 @@ from subprocess import run
 import pytest
 
 from flasher.mock.table import BootloaderState
+from flasher.simulate.planting import swapped
 from flasher.station import codes
 from flasher.station.continuity import Continuity
 from flasher.station.presence import Presence, TargetWatcher
@@ -24,7 +25,7 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.unit_target import StepFailedError
 from tests.campaigns import line_world
-from tests.campaigns.line_bugs import read_bugs, swapped
+from tests.campaigns.line_bugs import read_bugs
 from tests.campaigns.line_world import undetectable
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.promises import Violation

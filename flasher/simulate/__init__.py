@@ -1,0 +1,1 @@
+"""Simulated upgrades with faults, from seeds."""
