@@ -142,12 +142,16 @@ class SimulatedBus:
         self._nodes.remove(device)
         self._devices.remove(device)
 
-    def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
-        """Add a host to the bus; return its link."""
+    def add_host(self) -> _Host:
+        """Add a node for a host."""
         host = _Host()
         self._nodes.append(host)
         self._hosts.append(host)
-        return SimulatedLink(self, host, queue_frames)
+        return host
+
+    def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
+        """Add a host to the bus; return its link."""
+        return SimulatedLink(self, queue_frames)
 
     @property
     def is_idle(self) -> bool:
@@ -304,9 +308,9 @@ def _count_error(node: _Node) -> None:
 class SimulatedLink:
     """Host's adapter on a simulated bus: a `Link` without hardware."""
 
-    def __init__(self, bus: SimulatedBus, host: _Host, queue_frames: int) -> None:
+    def __init__(self, bus: SimulatedBus, queue_frames: int) -> None:
         self._bus = bus
-        self._host = host
+        self._host = bus.add_host()
         self._queue_frames = queue_frames
         self._health = HealthKeeper(Layout.SOCKETCAN)
         self._opened_at = bus.faults.times_unplugged

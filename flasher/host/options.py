@@ -19,7 +19,7 @@ PATIENT_TRIES: Final = 60
 answer."""
 ERASURES_MAX: Final = 20
 """Maximum number of erasures in one upgrade without user limit, because flash wears out. No device
-of the campaign tests/campaigns/world needed more than ten."""
+of a simulated campaign needed more than ten."""
 OTHER_TOOL_QUIET_S: Final = 2.0
 """Silence required of another tool that wrote to an erased device, before the upgrade is
 repeated."""

@@ -1,7 +1,7 @@
 """Stories of a line, as text that replays exactly: what there is, and who does what when.
 
 A story is a list of clauses, one a line (or all in one line, parted by " ; "), as plans of an
-upgrade are (`tests.campaigns.world.plans`):
+upgrade are (`flasher.simulate.plan`):
 
     line sockets=2 recipe=writes
     unit label=1 number=none
@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from tests.campaigns.world.plans import Clause, When, parse_clauses
+from flasher.simulate.plan import Clause, When, parse_clauses
 
 Number = Literal["none", "empty", "own", "maker", "other"]
 SOCKETS: Final = "ABC"

@@ -1,4 +1,4 @@
-"""Plans of the campaign `tests.campaigns.world`: read, replayed, and judged by an honest oracle."""
+"""Plans of simulated upgrades: read, replayed, and judged by an honest oracle."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import pytest
 
 from flasher.host.duplicates import DuplicateDetector
 from flasher.host.outcome import Outcome
-from tests.campaigns.world import plans
-from tests.campaigns.world.draw import drawn
-from tests.campaigns.world.plans import Plan
-from tests.campaigns.world.play import play
-from tests.campaigns.world.stranger import frames_of
+from flasher.simulate import plan as plans
+from flasher.simulate.draw import drawn
+from flasher.simulate.independent import frames_of
+from flasher.simulate.plan import Plan
+from flasher.simulate.play import play
 from tests.loops import each
 
 VECTORS = Path(__file__).parent.parent / "vectors.json"
-SHORT = "world packets=3 ; stranger erase=0.05"
+SHORT = "job packets=3 ; independent erase=0.05"
 
 
-@each("name", ["stranger", "mock"])
+@each("name", ["independent", "mock"])
 def test_an_undisturbed_device_is_upgraded(name: str) -> None:
-    verdict = play(Plan.parse(f"world packets=3 ; {name}"))
+    verdict = play(Plan.parse(f"job packets=3 ; {name}"))
     assert verdict.is_good
-    assert (verdict.ending, verdict.left, verdict.faults) == ("completed", "new", ())
+    assert (verdict.ending, verdict.left, verdict.violations) == ("completed", "new", ())
 
 
-def test_the_strangers_messages_are_those_of_the_document() -> None:
+def test_the_messages_of_the_independent_device_are_those_of_the_document() -> None:
     for vector in json.loads(VECTORS.read_text())["vectors"]:
         head = (int(vector["can_id"], 16), int(vector["mode"], 16), int(vector["command"], 16))
         frames = frames_of(*head, bytes.fromhex(vector["data"]))
@@ -47,10 +47,10 @@ def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
     "line",
     [
         "nonsense",
-        "@noon lose",
-        "lose count=many",
-        "lose colour=red",
-        "stranger erase=soon",
+        "@noon drop",
+        "drop count=many",
+        "drop colour=red",
+        "independent erase=soon",
         "@packet3 tool does=sing",
         "mock nonsense=1",
     ],
@@ -71,36 +71,37 @@ def test_a_line_replays_a_run_frame_by_frame(seed: int) -> None:
 def test_random_plans_end_in_no_false_success_and_no_false_claim() -> None:
     for seed in range(60):
         verdict = play(drawn(seed, twin_share=0.0))
-        assert verdict.faults == (), verdict
+        assert verdict.violations == (), verdict
 
 
 def test_the_oracle_finds_a_success_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """It believes the devices' flash only."""
     monkeypatch.setattr(Outcome, "ok", property(lambda _outcome: True))
-    plan = Plan.parse("world target=wmc ; stranger ; @packet2 power ; @packet2+0.5 interrupt")
+    plan = Plan.parse("job target=wmc ; independent ; @packet2 power ; @packet2+0.5 interrupt")
     verdict = play(plan)
     assert verdict.left == "none"
-    assert verdict.is_false
+    assert "FALSE" in {each.kind for each in verdict.violations}
 
 
 def test_the_oracle_finds_a_twin_that_was_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DuplicateDetector, "_set_evidence", lambda _duplicates, _what: None)
-    twin = "stranger erase=0.05 late=0.003 ; @packet3+0.02 power device=1 seconds=9"
-    verdict = play(Plan.parse(f"world target=wmc packets=3 ; stranger erase=0.05 ; {twin}"))
+    twin = "independent erase=0.05 late=0.003 ; @packet3+0.02 power device=1 seconds=9"
+    verdict = play(Plan.parse(f"job target=wmc packets=3 ; independent erase=0.05 ; {twin}"))
     assert verdict.left == "new / none"
-    assert verdict.faults == ("FALSE: success, and its twin has none",)
+    assert [*map(str, verdict.violations)] == ["FALSE: success, and its twin has none"]
 
 
 def test_a_twin_that_sent_nothing_in_the_transfer_is_counted_by_itself() -> None:
-    verdict = play(Plan.parse(f"{SHORT} ; stranger begins=off"))
+    verdict = play(Plan.parse(f"{SHORT} ; independent begins=off"))
     assert verdict.left == "new / old"
-    assert verdict.faults == ("UNSEEN: success, and its twin has old",)
+    assert [*map(str, verdict.violations)] == ["UNSEEN: success, and its twin has old"]
+    assert all(each.is_excused for each in verdict.violations)
 
 
 def test_a_second_device_that_comes_after_the_transfer_is_no_fault_of_the_host() -> None:
-    verdict = play(Plan.parse(f"{SHORT} ; @end+0.001 stranger begins=off"))
+    verdict = play(Plan.parse(f"{SHORT} ; @end+0.001 independent begins=off"))
     assert verdict.left == "new / old"
-    assert verdict.faults == ()
+    assert verdict.violations == ()
 
 
 def test_each_clause_of_a_plan_is_drawn_by_some_seed() -> None:

@@ -1,33 +1,36 @@
-"""Plans: what there is on the bus, and what happens when, as text that replays a run exactly.
+"""Plans of simulated upgrades: the job, the devices and the faults, as text that replays exactly.
 
-A plan is a list of clauses, one a line (or all in one line, parted by " ; "):
+A plan is a list of clauses, one a line (or all in one line, separated by " ; "):
 
-    world target=bms packets=40
-    stranger erase=0.31 session=0.0
-    stranger late=0.000117 application=none
-    @packet12 lose sender=device count=2
+    job target=bms packets=40
+    independent erase=0.31 session=0.0
+    independent late=0.000117 application=none
+    @packet12 drop sender=device count=2
     @packet20+0.0131 power seconds=1.2
     @update+0.2 unplug seconds=0.4
 
 A clause is a name and the fields of its type that are not the default. Without a time it holds from
-the beginning; `@1.25` is seconds since then, `@packet12`, `@reset`, `@update`, `@end` the moment at
-which the host first begins to send that message, `@frame512` a frame on the bus, and `+0.0131` so
-much later. The first device is the one that is meant, a second one its twin.
+the beginning. `@1.25` is seconds since then, `@packet12`, `@reset`, `@update`, `@end` the moment at
+which the host first begins to send that message, `@frame512` a frame on the bus, `@flash7` the
+beginning of the seventh flash operation of the first device, and `+0.0131` so much later. The first
+device is the one to be upgraded; a second one is its twin, which has the same CAN ids.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar, Final, Literal, get_args, get_origin, get_type_hints
 
+from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
 from flasher.mock.profile import DeviceProfile
-from tests.campaigns.world.stranger import Choices
+from flasher.simulate.independent import Choices
 
 Sender = Literal["any", "host", "device"]
+_NUMBERED: Final = ("packet", "frame", "flash")
 _WHEN: Final = re.compile(
-    r"@(?:(?P<at>\d+(?:\.\d+)?(?:e-?\d+)?)|(?P<what>packet|frame|reset|update|end)(?P<number>\d*))"
+    r"@(?:(?P<at>\d+(?:\.\d+)?(?:e-?\d+)?)|(?P<what>packet|frame|flash|reset|update|end)(?P<number>\d*))"
     r"(?:\+(?P<plus>\d+(?:\.\d+)?(?:e-?\d+)?))?"
 )
 
@@ -43,14 +46,14 @@ class When:
     def __str__(self) -> str:
         if not self.what:
             return f"@{self.plus_s!r}"
-        number = str(self.number) if self.what in ("packet", "frame") else ""
+        number = str(self.number) if self.what in _NUMBERED else ""
         return f"@{self.what}{number}" + (f"+{self.plus_s!r}" if self.plus_s else "")
 
     @classmethod
     def parse(cls, text: str) -> When:
         found = _WHEN.fullmatch(text)
         if found is None:
-            raise ValueError(f"{text!r} is no time of a plan")
+            raise ValueError(f"{text!r} is not a time of a plan")
         if found["at"]:
             return cls(plus_s=float(found["at"]))
         return cls(found["what"], int(found["number"] or 0), float(found["plus"] or 0))
@@ -74,29 +77,28 @@ class Clause:
         return " ".join(word for word in words if word)
 
 
-# -- what there is --------------------------------------------------------------------------------
+# -- the job, the adapter, the devices ------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class World(Clause):
-    """The job, and the bus around it."""
+class Job(Clause):
+    """The upgrade, and whether anybody else is on the bus. 0 in a limit is the default."""
 
-    NAME = "world"
+    NAME = "job"
     target: Literal["bms", "wmc", "obc"] = "bms"
     packets: int = 20
     image: int = 5
-    """The seed of the image's bytes."""
+    """Seed of the image's bytes."""
     others: bool = True
-    """Somebody else acknowledges; False: the devices and the tool are alone on the bus."""
+    """Another node acknowledges; False: the devices and the tool are alone on the bus."""
     attempts: int = 0
-    """0: the default."""
     tries: int = 0
     timeout: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adapter(Clause):
-    """How the host's adapter gives its own frames back."""
+    """How the host's adapter returns its own frames, and how many it queues."""
 
     NAME = "adapter"
     echoes: bool = True
@@ -108,6 +110,8 @@ class Adapter(Clause):
     """Share of the echoes that never come."""
     doubled: float = 0.0
     """Share that comes twice."""
+    queue: int = DEFAULT_QUEUE_FRAMES
+    """Frames that wait to be sent; a full queue takes no more."""
     seed: int = 1
 
 
@@ -117,16 +121,18 @@ class Device(Clause):
 
     application: Literal["old", "none"] = "old"
     version: str = "V1r0r0_20220512"
-    """What the old application names."""
+    """Version of the old application."""
     begins: Literal["application", "boot", "off"] = "application"
     """`boot`: it is switched on at the beginning."""
+    drift: float = 0.0
+    """Its clock is faster by this share."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Strange(Device):
-    """A device written from the document alone."""
+class Independent(Device):
+    """A device that was written from the document alone."""
 
-    NAME = "stranger"
+    NAME = "independent"
     choices: str = ""
     """Fields of `Choices`."""
 
@@ -143,14 +149,14 @@ class Mock(Device):
     """Fields of `DeviceProfile`."""
 
     def chosen(self) -> DeviceProfile:
-        profile = {"application_area_bytes": "32768"}
+        profile = {"application_area_bytes": "131072"}
         words = (f"{name}={value}" for name, value in profile.items())
         return DeviceProfile(**_values(DeviceProfile, [*words, *self.choices.split()]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Load(Clause):
-    """Other traffic, one frame every so many seconds."""
+    """Other traffic, one frame every so many seconds; id 0 wins every arbitration."""
 
     NAME = "load"
     id: int = 0x712
@@ -158,7 +164,7 @@ class Load(Clause):
     seconds: float = 1e9
 
 
-# -- what happens to frames ------------------------------------------------------------------------
+# -- faults of frames ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,18 +176,29 @@ class OnFrames(Clause):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lose(OnFrames):
-    NAME = "lose"
+class Drop(OnFrames):
+    """Nobody receives it."""
+
+    NAME = "drop"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Double(OnFrames):
+    """It arrives twice."""
+
     NAME = "double"
 
 
 @dataclass(frozen=True, kw_only=True)
+class Swap(OnFrames):
+    """It arrives after the next frame of the same sender."""
+
+    NAME = "swap"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Delay(OnFrames):
-    """Arrives later: what was sent after it overtakes it."""
+    """It arrives later: frames that were sent after it overtake it."""
 
     NAME = "delay"
     seconds: float = 0.001
@@ -189,23 +206,23 @@ class Delay(OnFrames):
 
 @dataclass(frozen=True, kw_only=True)
 class Flip(OnFrames):
-    """A wrong bit that the bus's own checksum does not see."""
+    """One bit is wrong, and the checksum of the CAN frame does not detect it."""
 
     NAME = "flip"
     bit: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cut(OnFrames):
-    """Arrives with so many bytes only."""
+class Truncate(OnFrames):
+    """Only its first `to` bytes arrive."""
 
-    NAME = "cut"
+    NAME = "truncate"
     to: int = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Noise(Clause):
-    """For a time, a share of all frames is lost, wrong, or doubled."""
+    """For a time, shares of all frames are lost, wrong, doubled, or reported as error frames."""
 
     NAME = "noise"
     seconds: float = 0.5
@@ -213,17 +230,18 @@ class Noise(Clause):
     lost: float = 0.0
     wrong: float = 0.0
     doubled: float = 0.0
+    errors: float = 0.0
     seed: int = 1
 
 
-# -- what devices do ------------------------------------------------------------------------------
+# -- faults of devices -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class Say(Clause):
-    """A message that the device should not send now."""
+class Unsolicited(Clause):
+    """A message of the device that nobody asked for, valid, from another sender."""
 
-    NAME = "say"
+    NAME = "unsolicited"
     what: Literal["ack", "nak", "boot", "request", "complete", "feedback"] = "nak"
     number: int = 1
     count: int = 1
@@ -231,9 +249,23 @@ class Say(Clause):
 
 @dataclass(frozen=True, kw_only=True)
 class OnDevice(Clause):
-    """Happens to a device: 0 is the one that is meant, 1 its twin."""
+    """Happens to a device: 0 is the one to be upgraded, 1 its twin."""
 
     device: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer(OnDevice):
+    """The next answer of the device is another one, or comes later."""
+
+    NAME = "answer"
+    becomes: Literal["same", "ack", "nak", "silence"] = "same"
+    """An ACK becomes a NAK of the same number, and the reverse."""
+    shift: int = 0
+    """Added to the number of an ACK or NAK."""
+    late: float = 0.0
+    """Seconds."""
+    count: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,30 +278,45 @@ class Power(OnDevice):
 
 @dataclass(frozen=True, kw_only=True)
 class Restart(OnDevice):
-    """Its supply dips: it starts anew at once."""
+    """Its supply dips: it restarts at once."""
 
     NAME = "restart"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hang(OnDevice):
-    """It neither hears nor speaks."""
+    """It neither receives nor sends."""
 
     NAME = "hang"
     seconds: float = 2.0
 
 
-# -- what happens on the tool's side ---------------------------------------------------------------
+@dataclass(frozen=True, kw_only=True)
+class FlashFails(OnDevice):
+    """Its next `count` flash operations change nothing, and it detects that; only `independent`
+    devices.
+    """
+
+    NAME = "flash-fails"
+    count: int = 1
+
+
+# -- faults of the host's side ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unplug(Clause):
+    """The adapter is removed; it comes back, for `wrong_rate` seconds at another bit rate."""
+
     NAME = "unplug"
     seconds: float = 0.4
+    wrong_rate: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class BusOff(Clause):
+    """The adapter's controller is off."""
+
     NAME = "busoff"
     seconds: float = 0.3
 
@@ -286,7 +333,7 @@ class Tool(Clause):
 
 @dataclass(frozen=True, kw_only=True)
 class Stall(Clause):
-    """The host's computer stands still."""
+    """The host's computer pauses."""
 
     NAME = "stall"
     seconds: float = 1.0
@@ -294,7 +341,7 @@ class Stall(Clause):
 
 @dataclass(frozen=True, kw_only=True)
 class Kill(Clause):
-    """The host's process dies; the same command is run so much later."""
+    """The host's process dies; the same command runs so much later, with the history alone."""
 
     NAME = "kill"
     again: float = 1.0
@@ -312,38 +359,38 @@ class Interrupt(Clause):
 CLAUSES: Final[dict[str, type[Clause]]] = {
     kind.NAME: kind
     for kind in (
-        World, Adapter, Strange, Mock, Load, Lose, Double, Delay, Flip, Cut, Noise, Say, Power,
-        Restart, Hang, Unplug, BusOff, Tool, Stall, Kill, Interrupt,
+        Job, Adapter, Independent, Mock, Load, Drop, Double, Swap, Delay, Flip, Truncate, Noise,
+        Unsolicited, Answer, Power, Restart, Hang, FlashFails, Unplug, BusOff, Tool, Stall, Kill,
+        Interrupt,
     )
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is, and what happens."""
+    """What there is on the bus, and what happens."""
 
     clauses: tuple[Clause, ...]
-    _kinds: dict[type, tuple[Any, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     def __str__(self) -> str:
         return " ; ".join(map(str, self.clauses))
 
     @property
-    def world(self) -> World:
-        return next((each for each in self.clauses if isinstance(each, World)), World())
+    def job(self) -> Job:
+        return next((each for each in self.clauses if isinstance(each, Job)), Job())
 
     @property
     def adapter(self) -> Adapter:
         return next((each for each in self.clauses if isinstance(each, Adapter)), Adapter())
 
     @property
-    def devices(self) -> Sequence[Strange | Mock]:
-        found = [each for each in self.clauses if isinstance(each, Strange | Mock)]
-        return found or [Strange()]
+    def devices(self) -> Sequence[Independent | Mock]:
+        found = [each for each in self.clauses if isinstance(each, Independent | Mock)]
+        return found or [Independent()]
 
     @property
-    def happenings(self) -> Iterator[Clause]:
-        """What happens at a time."""
+    def events(self) -> Iterator[Clause]:
+        """Clauses that happen at a time."""
         for each in self.clauses:
             if each.when is not None or isinstance(each, Load):
                 yield each
@@ -365,15 +412,15 @@ def _clause(line: str, kinds: Mapping[str, type[Clause]]) -> Clause:
     words = line.split()
     when = When.parse(words.pop(0)) if words and words[0].startswith("@") else None
     if not words or words[0] not in kinds:
-        raise ValueError(f"{line!r} begins with no name of a clause: {', '.join(kinds)}")
+        raise ValueError(f"{line!r} does not begin with the name of a clause: {', '.join(kinds)}")
     kind = kinds[words[0]]
     own = {known.name for known in fields(kind)} - {"choices", "when"}
     given = [word for word in words[1:] if word.partition("=")[0] in own]
     others = [word for word in words[1:] if word not in given]
     values = _values(kind, given)
-    if issubclass(kind, Strange | Mock):
+    if issubclass(kind, Independent | Mock):
         clause: Clause = kind(when=when, choices=" ".join(others), **values)
-        clause.chosen()  # type: ignore[attr-defined]  # raises for a choice that is none
+        clause.chosen()  # type: ignore[attr-defined]  # raises for an unknown choice
         return clause
     if others:
         raise ValueError(f"{line!r}: {kind.NAME} has no {' '.join(others)}")

@@ -1,7 +1,8 @@
-"""A device written from the protocol document alone: bootloader, application and flash.
+"""Independent device model, written from the protocol document alone: bootloader, application, flash.
 
-It shares nothing with flasher but the type of a frame. What the document leaves open is a field of
-`Choices`. An engine for a simulated bus (`flasher.protocol.engine`).
+It shares nothing with the rest of flasher but the type of a frame, so that a misreading in the
+protocol package is not repeated here. What the document leaves open is a field of `Choices`. An
+engine for a simulated bus (`flasher.protocol.engine`).
 """
 
 from __future__ import annotations
@@ -94,12 +95,20 @@ class Choices:
 
 
 class Flash:
-    """Cells that are erased as a whole and programmed once; a mark says that they are valid."""
+    """Cells that are erased as a whole and programmed once, and a mark that they are valid.
+
+    An operation takes effect at its end; power lost before leaves half of it.
+    """
 
     def __init__(self, content: bytes | None) -> None:
         self.cells = bytearray(content or b"")
         self.is_valid = content is not None
-        self.erasures = 0
+        self.operations = 0
+        """Operations that have begun."""
+        self.failures_left = 0
+        """Operations that will fail."""
+        self._under_way: tuple[int, bytes] | None = None
+        """Address and data of a program operation."""
 
     @property
     def application(self) -> bytes | None:
@@ -107,20 +116,56 @@ class Flash:
         return bytes(self.cells) if self.is_valid else None
 
     def begin_to_erase(self) -> None:
+        self.operations += 1
         self.is_valid = False
         self.cells[: len(self.cells) // 2] = b"\xff" * (len(self.cells) // 2)
 
-    def erase(self, size_bytes: int) -> None:
-        self.erasures += 1
-        self.is_valid = False
+    def erase(self, size_bytes: int) -> bool:
+        """End the erasing; False if it failed."""
+        if self._fails():
+            return False
         self.cells = bytearray(b"\xff" * size_bytes)
+        return True
 
-    def program(self, at: int, data: bytes) -> None:
+    def begin_to_program(self, at: int, data: bytes) -> None:
+        self.operations += 1
+        self._under_way = (at, data)
+
+    def program(self) -> bool:
+        """End the program operation; False if it failed."""
+        assert self._under_way is not None
+        (at, data), self._under_way = self._under_way, None
+        if self._fails():
+            return False
+        self._write(at, data)
+        return True
+
+    def begin_to_mark(self) -> None:
+        self.operations += 1
+
+    def mark(self) -> bool:
+        """Mark the content as valid; False if that failed."""
+        self.is_valid = not self._fails()
+        return self.is_valid
+
+    def tear(self) -> None:
+        """Lose power: half of the data under way is stored."""
+        if self._under_way is not None:
+            (at, data), self._under_way = self._under_way, None
+            self._write(at, data[: len(data) // 2])
+
+    def _write(self, at: int, data: bytes) -> None:
         for index, byte in enumerate(data[: max(0, len(self.cells) - at)]):
             self.cells[at + index] &= byte
 
+    def _fails(self) -> bool:
+        if not self.failures_left:
+            return False
+        self.failures_left -= 1
+        return True
 
-class Stranger:
+
+class IndependentDevice:
     """One device. `application` is what its flash holds; None: its bootloader is alone."""
 
     done = False
@@ -157,6 +202,7 @@ class Stranger:
             self._restart(now)
 
     def power_cut(self, now: float) -> None:
+        self.flash.tear()
         self._forget()
         self.state = "off"
 
@@ -358,7 +404,9 @@ class Stranger:
         self._alarm(now + self._choices.erase, self._erased)
 
     def _erased(self, now: float) -> None:
-        self.flash.erase(self._size_bytes)
+        if not self.flash.erase(self._size_bytes):
+            self._restart(now)  # no document says what a device does that cannot erase
+            return
         self.state, self._wanted, self._heard_at = "transfer", 1, now
         self._say(REQUEST, b"\0\0", now)
         self._watch_session(now)
@@ -388,7 +436,9 @@ class Stranger:
                 self._say(NAK, self._wanted.to_bytes(2, "little"), now)
         elif number == self._wanted <= total:
             self._is_busy = True
-            self._alarm(now + choices.store, lambda at: self._stored(number, data[5:], at))
+            used = data[5:][: self._size_bytes - (number - 1) * PACKET_SIZE]
+            self.flash.begin_to_program((number - 1) * PACKET_SIZE, used)
+            self._alarm(now + choices.store, lambda at: self._stored(number, at))
         elif number == self._wanted - 1 and number:
             self._say(ACK, data[1:3], now)
         elif 0 < number < self._wanted:
@@ -399,12 +449,13 @@ class Stranger:
             wanted = self._wanted.to_bytes(2, "little")
             self._say(NAK, wanted if choices.bad_packet == "nak_wanted" else data[1:3], now)
 
-    def _stored(self, number: int, data: bytes, now: float) -> None:
+    def _stored(self, number: int, now: float) -> None:
         self._is_busy = False
-        used = data[: self._size_bytes - (number - 1) * PACKET_SIZE]
-        self.flash.program((number - 1) * PACKET_SIZE, used)
-        self._wanted = number + 1
         self._heard_at = now
+        if not self.flash.program():
+            self._say(NAK, number.to_bytes(2, "little"), now)
+            return
+        self._wanted = number + 1
         self._say(ACK, number.to_bytes(2, "little"), now)
 
     def _hear_end(self, data: bytes, now: float) -> None:
@@ -419,16 +470,22 @@ class Stranger:
             return
         self._heard_at = now
         if data != b"\x04" or self._wanted != self._total + 1:
-            self._say(NAK, self._wanted.to_bytes(2, "little"), now)
-            self.state = "refused"
-            if self._choices.after_refusal == "announces":
-                self._alarm(now + 1.0, self._restart)
+            self._refuse(now)
             return
         self.state = "checking"
+        self.flash.begin_to_mark()
         self._alarm(now + self._choices.check, self._checked)
 
+    def _refuse(self, now: float) -> None:
+        self._say(NAK, self._wanted.to_bytes(2, "little"), now)
+        self.state = "refused"
+        if self._choices.after_refusal == "announces":
+            self._alarm(now + 1.0, self._restart)
+
     def _checked(self, now: float) -> None:
-        self.flash.is_valid = True
+        if not self.flash.mark():
+            self._refuse(now)
+            return
         self.state = "complete"
         self._say(COMPLETE, b"\0\0", now)
         self._alarm(now + self._choices.start, self._leave)

@@ -1,4 +1,4 @@
-"""Draws plans: a seed gives the same plan each time."""
+"""Random plans: a seed gives the same plan each time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import random
 from collections.abc import Callable
 from typing import Final
 
-from tests.campaigns.world import plans
-from tests.campaigns.world.plans import Plan, When
+from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
+from flasher.simulate import plan as plans
+from flasher.simulate.plan import Plan, When
 
-TWIN_SHARE: Final = 0.25
+TWIN_SHARE: Final = 0.1
+"""Share of the plans with two devices; their images are long, and take half of the time."""
 _HOW_MANY: Final = (0, 1, 1, 1, 2, 2, 2, 3, 3, 4, 6)
 
 
@@ -27,6 +29,7 @@ class _Draw:
         self._packets = 20
         self._has_twin = False
         self._target = "bms"
+        self._is_independent = False
 
     # -- helpers ---------------------------------------------------------------------------------
 
@@ -56,7 +59,9 @@ class _Draw:
             return When("update", 0, self._between(1e-4, 1.0) if self._is(0.7) else 0.0)
         if kind < 0.90:
             return When("reset", 0, self._between(1e-4, 0.5) if self._is(0.7) else 0.0)
-        if kind < 0.95:
+        if kind < 0.93:
+            return When("flash", draw.randint(1, self._packets + 2), self._between(1e-5, 0.3))
+        if kind < 0.96:
             return When("frame", draw.randint(1, 20 * self._packets))
         return When(plus_s=self._between(0.01, 5.0))
 
@@ -70,10 +75,12 @@ class _Draw:
         if self._has_twin:
             # As long as firmware is: of a shorter transfer little shows that two devices take part.
             self._packets = draw.choice((120, 200, 300, 600))
-        happenings = [self._happening() for _ in range(draw.choice(_HOW_MANY))]
-        needs_others = any(isinstance(each, plans.Tool | plans.Load) for each in happenings)
+        devices = self._devices()
+        self._is_independent = isinstance(devices[0], plans.Independent)
+        events = [self._event() for _ in range(draw.choice(_HOW_MANY))]
+        needs_others = any(isinstance(each, plans.Tool | plans.Load) for each in events)
         clauses: list[plans.Clause] = [
-            plans.World(
+            plans.Job(
                 target=self._target,  # type: ignore[arg-type]  # one of them
                 packets=self._packets,
                 image=self._seed % 1000,
@@ -82,8 +89,7 @@ class _Draw:
         ]
         if self._is(0.5):
             clauses.append(self._adapter())
-        clauses += self._devices()
-        return Plan((*clauses, *happenings))
+        return Plan((*clauses, *devices, *events))
 
     def _adapter(self) -> plans.Adapter:
         kind = self._random.random()
@@ -94,23 +100,25 @@ class _Draw:
             jitter=self._between(1e-4, 0.02) if self._is(0.3) else 0.0,
             lost=round(self._random.uniform(0, 0.5), 3) if self._is(0.3) else 0.0,
             doubled=round(self._random.uniform(0, 0.5), 3) if self._is(0.3) else 0.0,
+            queue=self._random.choice((1, 2, 10, 18)) if self._is(0.3) else DEFAULT_QUEUE_FRAMES,
             seed=self._seed,
         )
 
     def _devices(self) -> list[plans.Clause]:
-        is_strange = self._is(0.65)
-        choices = self._strange() if is_strange else self._mock()
+        is_independent = self._is(0.65)
+        choices = self._independent() if is_independent else self._mock()
         application = "none" if self._is(0.1) else "old"
-        kind = plans.Strange if is_strange else plans.Mock
+        kind = plans.Independent if is_independent else plans.Mock
         first = kind(
             application=application,  # type: ignore[arg-type]
             begins="boot" if self._is(0.05) else "application",
+            drift=self._drift(),
             choices=choices,
         )
         if not self._has_twin:
             return [first]
-        other = choices if self._is(0.7) else self._strange() if is_strange else self._mock()
-        if is_strange and self._is(0.9):
+        other = choices if self._is(0.7) else self._independent() if is_independent else self._mock()
+        if is_independent and self._is(0.9):
             late = self._between(1e-6, 0.01)
             other = f"{other} late={late}".strip()
         begins = self._random.choice(("application", "application", "boot"))
@@ -119,11 +127,15 @@ class _Draw:
             application="none" if self._is(0.3) else "old",
             version=self._random.choice(("V1r0r0_20220512", "V1r0r0_20220512", "V1r1r0_20230101")),
             begins=begins,  # type: ignore[arg-type]
+            drift=self._drift(),
             choices=other,
         )
         return [first, twin]
 
-    def _strange(self) -> str:
+    def _drift(self) -> float:
+        return round(self._random.uniform(-0.01, 0.01), 4) if self._is(0.1) else 0.0
+
+    def _independent(self) -> str:
         among = self._chosen
         words = (
             f"restart={self._between(0.01, 1.0)}" if self._is(0.5) else "",
@@ -174,15 +186,17 @@ class _Draw:
 
     # -- what happens ----------------------------------------------------------------------------
 
-    def _happening(self) -> plans.Clause:
+    def _event(self) -> plans.Clause:
         kinds: list[tuple[int, Callable[[When], plans.Clause]]] = [
             (14, self._on_frames),
             (12, self._noise),
-            (8, self._say),
+            (8, self._unsolicited),
             (12, self._power),
             (8, lambda when: plans.Restart(when=when, device=self._which())),
             (8, self._hang),
-            (8, lambda when: plans.Unplug(when=when, seconds=self._between(0.05, 30.0))),
+            (8, self._answer),
+            (3 if self._is_independent else 0, self._flash_fails),
+            (8, self._unplug),
             (4, lambda when: plans.BusOff(when=when, seconds=self._between(0.05, 10.0))),
             (8, self._tool),
             (6, lambda when: plans.Stall(when=when, seconds=self._between(0.05, 10.0))),
@@ -202,7 +216,7 @@ class _Draw:
 
     def _on_frames(self, when: When) -> plans.Clause:
         sender, count = self._sender(), self._random.choice((1, 1, 1, 2, 2, 3, 4, 8))
-        match self._random.randrange(5):
+        match self._random.randrange(6):
             case 0:
                 return plans.Double(when=when, sender=sender, count=count)
             case 1:
@@ -213,9 +227,11 @@ class _Draw:
                 return plans.Flip(when=when, sender=sender, count=count, bit=bit)
             case 3:
                 to = self._random.randrange(8)
-                return plans.Cut(when=when, sender=sender, count=count, to=to)
+                return plans.Truncate(when=when, sender=sender, count=count, to=to)
+            case 4:
+                return plans.Swap(when=when, sender=sender, count=count)
             case _:
-                return plans.Lose(when=when, sender=sender, count=count)
+                return plans.Drop(when=when, sender=sender, count=count)
 
     def _noise(self, when: When) -> plans.Clause:
         scale = self._random.choice((0.01, 0.05, 0.2, 1.0))
@@ -230,10 +246,11 @@ class _Draw:
             lost=share(),
             wrong=share() if self._is(0.5) else 0.0,
             doubled=share() if self._is(0.3) else 0.0,
+            errors=share() if self._is(0.2) else 0.0,
             seed=self._random.randrange(1000),
         )
 
-    def _say(self, when: When) -> plans.Clause:
+    def _unsolicited(self, when: When) -> plans.Clause:
         what = self._random.choice(
             ("ack", "ack", "nak", "nak", "nak", "boot", "boot", "request", "feedback", "complete")
         )
@@ -242,7 +259,29 @@ class _Draw:
             when = When("packet", max(1, self._packets - 3))
         number = max(0, when.number + self._random.choice((-1, -1, 0, 1, 2, 300)))
         count = self._random.choice((1, 1, 2, 5, 20))
-        return plans.Say(when=when, what=what, number=number, count=count)  # type: ignore[arg-type]
+        return plans.Unsolicited(when=when, what=what, number=number, count=count)  # type: ignore[arg-type]
+
+    def _answer(self, when: When) -> plans.Clause:
+        becomes = self._random.choice(("same", "same", "ack", "nak", "silence"))
+        return plans.Answer(
+            when=when,
+            device=self._which(),
+            becomes=becomes,  # type: ignore[arg-type]
+            shift=self._random.choice((0, 0, -1, 1, 2, 300)),
+            # Just before and after the limit for an ACK (0.5 s), among others.
+            late=self._random.choice((0.0, 0.0, 0.499, 0.501, self._between(1e-4, 12.0))),
+            count=self._random.choice((1, 1, 1, 2, 5)),
+        )
+
+    def _flash_fails(self, when: When) -> plans.Clause:
+        return plans.FlashFails(when=when, count=self._random.choice((1, 1, 2, 5, 20)))
+
+    def _unplug(self, when: When) -> plans.Clause:
+        return plans.Unplug(
+            when=when,
+            seconds=self._between(0.05, 30.0),
+            wrong_rate=self._between(0.05, 10.0) if self._is(0.2) else 0.0,
+        )
 
     def _power(self, when: When) -> plans.Clause:
         return plans.Power(when=when, device=self._which(), seconds=self._between(0.05, 60.0))
@@ -261,7 +300,7 @@ class _Draw:
     def _load(self, when: When) -> plans.Clause:
         return plans.Load(
             when=when,
-            id=self._random.choice((0x100, 0x712, 0x7FF)),
+            id=self._random.choice((0x000, 0x100, 0x712, 0x7FF)),
             every=self._between(0.0007, 0.02),
             seconds=self._between(0.05, 20.0),
         )

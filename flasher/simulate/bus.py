@@ -1,0 +1,493 @@
+"""Simulated bus of a plan: units with a supply, frames that go astray, an adapter with faults."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+from math import inf
+from typing import Any, Final, Protocol
+
+from flasher.bus.echoes import Echoes
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus, SimulatedLink
+from flasher.mock.model import MockDevice
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import WELLING
+from flasher.simulate import plan as plans
+from flasher.simulate.independent import ACK, NAK, REPORT, IndependentDevice, frames_of
+
+INBOX_FRAMES: Final = 4096
+"""Frames that an adapter's driver keeps for a computer that pauses."""
+ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=True)
+"""Form error of the bus, as Linux reports it."""
+_COMMANDS: Final = {b"\x42\x05": "reset", b"\xa1\x0b": "update", b"\xa3\x85": "packet"} | {
+    b"\xa4\x01": "end"
+}
+_ROUNDING_S: Final = 1e-9
+_HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", b"\x55\x03"
+_NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
+
+
+class KilledError(BaseException):
+    """The host's process is gone; no code of the host may catch it."""
+
+
+class OverdueError(Exception):
+    """The host did not end."""
+
+
+class Agenda:
+    """Engine that calls functions, and sends frames of other traffic, at their times."""
+
+    done = False
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[float, int, Callable[[float], None]]] = []
+        self._order = count()
+        self._due: deque[Frame] = deque()
+
+    def at(self, moment: float, act: Callable[[float], None]) -> None:
+        heapq.heappush(self._heap, (moment, next(self._order), act))
+
+    def send(self, frames: Iterable[Frame], moment: float) -> None:
+        """Send frames that are nobody's: other traffic, a second tool, unsolicited messages."""
+        sent = list(frames)
+        self.at(moment, lambda _now: self._due.extend(sent))
+
+    def clear(self) -> None:
+        """Forget what is not done yet."""
+        self._heap.clear()
+        self._due.clear()
+
+    def receive(self, frame: Frame, now: float) -> None:
+        pass
+
+    def tick(self, now: float) -> None:
+        while self._heap and self._heap[0][0] <= now:
+            heapq.heappop(self._heap)[2](now)
+
+    def deadline(self) -> float | None:
+        return self._heap[0][0] if self._heap else None
+
+    def next_frame(self, now: float) -> Frame | None:
+        return self._due[0] if self._due else None
+
+    def frame_sent(self, now: float) -> None:
+        if self._due:
+            self._due.popleft()
+
+    def cancel(self, now: float) -> None:
+        pass
+
+    def take_events(self) -> Sequence[object]:
+        return ()
+
+
+class Unit:
+    """Engine of a device whose supply fails, whose processor hangs, and whose answers change."""
+
+    done = False
+
+    def __init__(self, engine: IndependentDevice | MockDevice, *, drift: float = 0.0) -> None:
+        self.engine = engine
+        self.before = self.application
+        """Application that it had at the beginning."""
+        self._rate = 1.0 + drift
+        """Seconds of its clock in one second."""
+        self._hangs_until = -inf
+        self._answers: list[plans.Answer] = []
+        self._late: deque[tuple[float, list[Frame]]] = deque()
+        """Messages in the place of others, with their times."""
+        self._under_way: deque[Frame] = deque()
+        """Rest of such a message."""
+        self._bytes_left = 0
+        """Of the engine's own message that is being sent."""
+        self._first = self._begun = self.operations_begun
+        self.on_operation: Callable[[int, float], None] | None = None
+        """Called with the number of each flash operation that begins, from 1."""
+
+    @property
+    def application(self) -> bytes | None:
+        """Bootable content of the flash."""
+        engine = self.engine
+        if isinstance(engine, IndependentDevice):
+            return engine.flash.application
+        return engine.stored_image
+
+    @property
+    def operations_begun(self) -> int:
+        """Flash operations that have begun."""
+        engine = self.engine
+        if isinstance(engine, IndependentDevice):
+            return engine.flash.operations
+        return engine.operations_done + (engine.operation_reaches(0.0) is not None)
+
+    @property
+    def has_power(self) -> bool:
+        return self.engine.has_power
+
+    def power_cut(self, now: float) -> None:
+        if self.engine.has_power:
+            self.engine.power_cut(self._own_time(now))
+        self._hangs_until = -inf
+        self._late.clear()
+        self._under_way.clear()
+        self._bytes_left = 0
+
+    def power_on(self, now: float) -> None:
+        if not self.engine.has_power:
+            self.engine.power_on(self._own_time(now))
+
+    def hang(self, until: float) -> None:
+        self._hangs_until = until
+
+    def end_faults(self) -> None:
+        """Run on without a fault; a power supply that is off stays off."""
+        self._hangs_until = -inf
+        self._answers.clear()
+        if isinstance(self.engine, IndependentDevice):
+            self.engine.flash.failures_left = 0
+
+    def change(self, answer: plans.Answer) -> None:
+        """Change the next answers."""
+        self._answers += [answer] * answer.count
+
+    # -- the engine interface --------------------------------------------------------------------
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if now >= self._hangs_until:
+            self.engine.receive(frame, self._own_time(now))
+            self._watch_flash(now)
+
+    def tick(self, now: float) -> None:
+        if now >= self._hangs_until:
+            self.engine.tick(self._own_time(now))
+            self._watch_flash(now)
+
+    def deadline(self) -> float | None:
+        due = self.engine.deadline()
+        own = inf if due is None else due / self._rate
+        if self._late:
+            own = min(own, self._late[0][0])
+        return None if own == inf else max(own, self._hangs_until)
+
+    def next_frame(self, now: float) -> Frame | None:
+        if now < self._hangs_until:
+            return None
+        if not (self._answers or self._late or self._under_way or self._bytes_left):
+            return self.engine.next_frame(self._own_time(now))
+        if not self._under_way and not self._bytes_left and self._late:
+            due_at, frames = self._late[0]
+            if due_at <= now:
+                self._late.popleft()
+                self._under_way.extend(frames)
+        if self._under_way:
+            return self._under_way[0]
+        frame = self.engine.next_frame(self._own_time(now))
+        if frame is None:
+            return None
+        if not self._bytes_left and frame.data[:3] == b"\x55\xaa\x0c":
+            if self._answers:
+                self._change_answer(now)
+                return self.next_frame(now)
+            self._bytes_left = frame.data[3] + 9
+        self._bytes_left = max(0, self._bytes_left - len(frame.data))
+        return frame
+
+    def frame_sent(self, now: float) -> None:
+        if self._under_way:
+            self._under_way.popleft()
+        else:
+            self.engine.frame_sent(self._own_time(now))
+
+    def cancel(self, now: float) -> None:
+        pass
+
+    def take_events(self) -> Sequence[object]:
+        return self.engine.take_events()
+
+    def _own_time(self, now: float) -> float:
+        """Time on its clock; a deadline is not missed by rounding."""
+        if self._rate == 1.0:
+            return now
+        own, due = now * self._rate, self.engine.deadline()
+        return due if due is not None and own < due < own + _ROUNDING_S else own
+
+    def _watch_flash(self, now: float) -> None:
+        if self.on_operation is not None:
+            before, self._begun = self._begun, self.operations_begun
+            for number in range(before + 1, self._begun + 1):
+                self.on_operation(number - self._first, now)
+
+    def _change_answer(self, now: float) -> None:
+        """Take a message from the engine, and queue the one that is sent in its place."""
+        engine, change, own = self.engine, self._answers.pop(0), self._own_time(now)
+        frames: list[Frame] = []
+        size = inf
+        while sum(len(each.data) for each in frames) < size:
+            frame = engine.next_frame(own)
+            if frame is None:
+                break
+            frames.append(frame)
+            engine.frame_sent(own)
+            size = frames[0].data[3] + 9
+        wire = b"".join(frame.data for frame in frames)
+        command, data = int.from_bytes(wire[4:6], "big"), wire[6:-5]
+        if change.becomes == "silence":
+            return
+        if command in (ACK, NAK):
+            command = _NUMBERED_ANSWERS.get(change.becomes, command)
+            number = (int.from_bytes(data, "little") + change.shift) % 0x10000
+            frames = frames_of(frames[0].can_id, REPORT, command, number.to_bytes(2, "little"))
+        self._late.append((now + change.late, frames))
+
+
+class Watcher(Protocol):
+    """Observer of each frame before it is delivered."""
+
+    def __call__(self, frame: Frame, sender: plans.Sender | None, now: float) -> None: ...
+
+
+class PlanBus(SimulatedBus):
+    """Simulated bus that knows who sends, and disturbs frames."""
+
+    def __init__(self, clock: VirtualClock, watch: Watcher) -> None:
+        super().__init__(WELLING.bitrate_bps, clock)
+        self.agenda = Agenda()
+        self.attach(self.agenda)
+        self.units: list[Unit] = []
+        """Units that have been connected."""
+        self.frame_faults: list[FrameFault] = []
+        self.host: PlanLink | None = None
+        """Link of the tool that runs now."""
+        self.is_garbled = False
+        """The host's adapter has another bit rate: it receives error frames only."""
+        self.heard: set[Any] = set()
+        """Engines that began a message alone that reached the tool; the player empties it. General
+        feedback does not count: an application sends it to all that is not for it.
+        """
+        self._watch = watch
+
+    def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
+        self._sending = None
+        if frame is None:
+            return
+        sender, ends_at = senders[0], self._sending_ends_at
+        self._delivered_at = ends_at
+        self.frames_carried += 1
+        word: plans.Sender | None = "device"
+        if self.host is not None and sender is self.host.node:
+            word = "host"
+        elif getattr(sender, "engine", None) is self.agenda:
+            word = None
+        self._watch(frame, word, ends_at)
+        takes_part = self.faults.takes_part
+        frames: Iterable[Frame] = (frame,)
+        if self.frame_faults and word is not None:
+            frames = self._disturbed(frame, word, sender, ends_at)
+        for carried in frames:
+            self._carry(carried, senders, ends_at)
+        if self.is_garbled and self.host is not None:
+            self.host.node.inbox.append(ERROR_FRAME)
+        if word == "host":
+            if self.host is not None:
+                self.host.echo(frame, ends_at)
+        elif takes_part and len(senders) == 1 and word is not None:
+            data = frame.data
+            if data[:2] == _HEADER and data[4:6] != _GENERAL_FEEDBACK:
+                self.heard.add(sender.engine)
+
+    def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
+        for device in self._devices:
+            if device not in senders and not frame.is_error:
+                device.engine.receive(frame, now)
+        if self.faults.takes_part:
+            for host in self._hosts:
+                if host not in senders:
+                    host.inbox.append(frame)
+
+    def _disturbed(
+        self, frame: Frame, word: plans.Sender, sender: Any, now: float
+    ) -> Sequence[Frame]:
+        def arrive_later(late: Frame, after_s: float) -> None:
+            self.agenda.at(now + after_s, lambda at: self._carry(late, [sender], at))
+
+        frames = [frame]
+        for fault in tuple(self.frame_faults):
+            if fault.is_over(now):
+                self.frame_faults.remove(fault)
+            else:
+                frames = fault.apply(frames, word, arrive_later)
+        return frames
+
+
+class FrameFault:
+    """Fault of frames that is in force."""
+
+    def __init__(self, clause: plans.OnFrames | plans.Noise, now: float) -> None:
+        self._clause = clause
+        self._left = getattr(clause, "count", 0)
+        self._until = now + getattr(clause, "seconds", inf)
+        self._random = random.Random(getattr(clause, "seed", 0))
+        self._held: list[Frame] = []
+        """Swapped frame that waits for the next one of its sender."""
+        self._sender = clause.sender
+
+    def is_over(self, now: float) -> bool:
+        if isinstance(self._clause, plans.Noise):
+            return now >= self._until
+        return self._left <= 0 and not self._held
+
+    def apply(
+        self,
+        frames: list[Frame],
+        sender: plans.Sender,
+        later: Callable[[Frame, float], None],
+    ) -> list[Frame]:
+        """Return what arrives of frames in their place."""
+        if not frames or self._sender not in ("any", sender):
+            return frames
+        self._left -= 1
+        frame, rest = frames[0], frames[1:]
+        match self._clause:
+            case plans.Drop():
+                return rest
+            case plans.Double():
+                return [frame, frame, *rest]
+            case plans.Swap():
+                return self._swap(frame, rest, sender)
+            case plans.Delay(seconds=seconds):
+                later(frame, seconds)
+                return rest
+            case plans.Flip(bit=bit):
+                return [_flipped(frame, bit), *rest]
+            case plans.Truncate(to=size):
+                return [frame._replace(data=frame.data[:size]), *rest]
+            case plans.Noise(lost=lost, wrong=wrong, doubled=doubled, errors=errors):
+                drawn = self._random.random()
+                if drawn < lost:
+                    return rest
+                if drawn < lost + wrong:
+                    return [_flipped(frame, self._random.randrange(64)), *rest]
+                if drawn < lost + wrong + doubled:
+                    return [frame, frame, *rest]
+                return [ERROR_FRAME, *rest] if drawn < lost + wrong + doubled + errors else frames
+        raise AssertionError(self._clause)
+
+    def _swap(self, frame: Frame, rest: list[Frame], sender: plans.Sender) -> list[Frame]:
+        if self._held:
+            frames = [frame, *self._held, *rest]
+            self._held.clear()
+            self._sender = self._clause.sender
+            return frames
+        self._held.append(frame)
+        self._sender = sender
+        return rest
+
+
+def _flipped(frame: Frame, bit: int) -> Frame:
+    data = bytearray(frame.data)
+    if data:
+        data[bit // 8 % len(data)] ^= 1 << bit % 8
+    return frame._replace(data=bytes(data))
+
+
+def message_begun(frame: Frame) -> tuple[str, int] | None:
+    """The host's message that begins with this frame, and the number of its packet."""
+    data = frame.data
+    if data[:3] != b"\x55\xaa\x16" or len(data) < 8:
+        return None
+    name = _COMMANDS.get(data[4:6])
+    return None if name is None else (name, data[7] if name == "packet" else 0)
+
+
+class _Inbox(deque[Frame]):
+    """Frames that have arrived at an adapter, with the time of each."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        super().__init__()
+        self._now = now
+        self._stamps: deque[float] = deque()
+        self.stamp_s = 0.0
+        """Arrival of the frame that was taken last."""
+
+    def append(self, frame: Frame) -> None:
+        if len(self) < INBOX_FRAMES:
+            super().append(frame)
+            self._stamps.append(self._now())
+
+    def popleft(self) -> Frame:
+        self.stamp_s = self._stamps.popleft()
+        return super().popleft()
+
+    def clear(self) -> None:
+        super().clear()
+        self._stamps.clear()
+
+
+class PlanLink(SimulatedLink):
+    """The host's adapter: returns its own frames as the plan has it, and pauses with its host."""
+
+    def __init__(self, bus: PlanBus, adapter: plans.Adapter, overdue_at: float = inf) -> None:
+        super().__init__(bus, adapter.queue)
+        self.node = self._host
+        self.node.inbox = self._inbox = _Inbox(bus.clock.now)
+        self._plan_bus = bus
+        self._adapter = adapter
+        self._echoes = Echoes()
+        self._random = random.Random(adapter.seed)
+        self._stalls_s = 0.0
+        self._is_killed = False
+        self._overdue_at = overdue_at
+        bus.host = self
+
+    def stall(self, seconds: float) -> None:
+        """Pause the host at its next call."""
+        self._stalls_s += seconds
+
+    def kill(self) -> None:
+        """End the host's process at its next call."""
+        self._is_killed = True
+
+    def echo(self, frame: Frame, now: float) -> None:
+        """Return a frame that has left."""
+        adapter, draw = self._adapter, self._random.random
+        if not adapter.echoes or draw() < adapter.lost:
+            return
+        for _ in range(2 if draw() < adapter.doubled else 1):
+            due_at = now + adapter.delay + adapter.jitter * draw()
+            if due_at <= now:
+                self._inbox.append(frame)
+            else:
+                self._plan_bus.agenda.at(due_at, lambda _now: self._inbox.append(frame))
+
+    def _live(self) -> None:
+        clock = self._plan_bus.clock
+        if self._is_killed:
+            raise KilledError
+        if self._stalls_s:
+            until, self._stalls_s = clock.now() + self._stalls_s, 0.0
+            while clock.now() < until:
+                self._plan_bus.advance(until)
+        if clock.now() > self._overdue_at:
+            raise OverdueError
+
+    def send(self, frame: Frame) -> None:
+        self._live()
+        super().send(frame)
+        self._echoes.sent(frame)
+
+    def receive(self, deadline: float) -> Frame | None:
+        self._live()
+        frame = super().receive(deadline)
+        if frame is None:
+            return None
+        return self._echoes.mark(frame, self._inbox.stamp_s, is_rx=True)
+
+    def reopen(self) -> None:
+        self._live()
+        super().reopen()
+        self._echoes.reopened()

@@ -1,0 +1,528 @@
+"""Plays a plan: the production upgrade on the plan's bus, then an examination of every device."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import inf
+from typing import Final
+
+from flasher import api
+from flasher.bus.link import VirtualClock
+from flasher.errors import FlasherError
+from flasher.events import PowerCycleAwaited
+from flasher.host.identity import Identity
+from flasher.host.options import UpgradeOptions, overall_timeout_s
+from flasher.host.session import Result
+from flasher.image.image import Image
+from flasher.image.plan import Plan as ImagePlan
+from flasher.image.plan import plan as image_plan
+from flasher.mock.model import MockDevice
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import PACKET_DATA_SIZE, TARGETS, WELLING
+from flasher.simulate import plan as plans
+from flasher.simulate.bus import (
+    FrameFault,
+    KilledError,
+    OverdueError,
+    PlanBus,
+    PlanLink,
+    Unit,
+    message_begun,
+)
+from flasher.simulate.independent import (
+    ACK,
+    BOOT_VERSION,
+    COMPLETE,
+    FEEDBACK,
+    NAK,
+    PACKET,
+    READ,
+    READ_VERSION,
+    REPORT,
+    REQUEST,
+    RESET,
+    UPDATE,
+    WRITE,
+    IndependentDevice,
+    frames_of,
+)
+from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
+
+NEW_VERSION: Final = "V1r2r0_20240601"
+"""Version that the new image reports."""
+SETTLE_S: Final = 3.0
+"""Time from the end of a run to the examination of the flash."""
+OVERDUE_SHARE: Final = 1.5
+OVERDUE_S: Final = 60.0
+"""A run that is so much later than its announced deadline has not ended."""
+_VECTORS: Final = struct.pack("<4I", 0x2000_5000, 0x0800_4101, 0, 0)
+"""Vector table of a Cortex-M: stack pointer, reset vector, no NMI and no hard fault handler."""
+_BOOT_NAMES: Final = {"bms": b"BMS", "wmc": b"WMC", "obc": b"PBU"}
+_OPERATOR_S: Final = 2.0
+"""Time in which the operator of the recovery follows a prompt; the supply is then off so long."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a plan ended, and what the oracle found wrong."""
+
+    plan: str
+    ending: str
+    """Ending of the upgrade, or the code of the error."""
+    exit_code: int
+    is_good: bool
+    """The result claims success, and the device has the image."""
+    left: str
+    """Content of the device's flash: new, old, none or other; after " / " that of a twin."""
+    attempts: int
+    took_s: float
+    lateness: float
+    """The end as a share of the announced deadline."""
+    violations: tuple[Violation, ...] = ()
+    """Empty if the host was right."""
+    recovered: str = ""
+    """Command that brought the device back after a run without success; empty if none had to."""
+    had_twin: bool = False
+    runs: int = 1
+    reached: frozenset[str] = frozenset()
+    """What the run passed through: faults with the phase in which they happened."""
+    wire: str = ""
+    """Digest of all frames with their times."""
+    where: str = ""
+
+
+@lru_cache(maxsize=64)
+def image_of(packets: int, seed: int) -> Image:
+    """Return an image that names its version, its last packet not full."""
+    head = _VECTORS + NEW_VERSION.encode() + b"\0"
+    body = random.Random(seed).randbytes(packets * PACKET_DATA_SIZE - 5 - len(head))
+    return replace(Image.from_bytes(head + body), version=NEW_VERSION)
+
+
+@lru_cache(maxsize=64)
+def _image_plan(packets: int, seed: int, target: str) -> ImagePlan:
+    return image_plan(image_of(packets, seed), TARGETS[target], WELLING.bitrate_bps)
+
+
+class Player:
+    """One plan being played. `log` gets each frame, fault and event as a line of text, `tap` each
+    frame with its sender (`None` for other traffic) and time.
+    """
+
+    def __init__(
+        self,
+        plan: plans.Plan,
+        options: UpgradeOptions | None = None,
+        *,
+        log: Callable[[str], None] | None = None,
+        tap: Callable[[Frame, plans.Sender | None, float], None] | None = None,
+    ) -> None:
+        job = plan.job
+        self.plan = plan
+        self.target = TARGETS[job.target]
+        self.clock = VirtualClock()
+        self.bus = PlanBus(self.clock, self._seen)
+        self.image_plan = _image_plan(job.packets, job.image, job.target)
+        self.image = image_of(job.packets, job.image)
+        self.units: list[Unit] = []
+        self._options = _options(job, options or UpgradeOptions())
+        self._log = log
+        self._tap = tap
+        self._link: PlanLink | None = None
+        self._frames = 0
+        self._digest = hashlib.sha256()
+        self._waiting: dict[tuple[str, int], list[plans.Clause]] = {}
+        self._is_running = True
+        self._is_interrupted = False
+        self._has_operator = False
+        """Somebody follows the prompts."""
+        self._again_after_s: float | None = None
+        """The host's process is killed, and run again after so long."""
+        self._phase = "idle"
+        """Last message that the host began."""
+        self._reached: set[str] = set()
+        self._facts = Facts(plan, self.target.request_id)
+        self._at_update: list[Unit] = []
+        """Units on the bus when the last update command began."""
+        for number, device in enumerate(plan.devices):
+            unit = Unit(self._engine(device), drift=device.drift)
+            self.units.append(unit)
+            if device.when is None:
+                self._join(number, device, 0.0)
+        for clause in plan.events:
+            self._expect(clause)
+        if any(what == "flash" for what, _ in self._waiting):
+            self.units[0].on_operation = lambda number, now: self._begins("flash", number, now)
+
+    # -- the world -------------------------------------------------------------------------------
+
+    def _engine(self, device: plans.Independent | plans.Mock) -> IndependentDevice | MockDevice:
+        if isinstance(device, plans.Independent):
+            old = _VECTORS + device.version.encode() + b"\0" + bytes(range(256)) * 4
+            content = old if device.application == "old" else None
+            return IndependentDevice(self.target.name, device.chosen(), content)
+        return MockDevice(
+            self.target,
+            bitrate_bps=WELLING.bitrate_bps,
+            profile=replace(device.chosen(), factory_version=device.version),
+            has_application=device.application == "old",
+        )
+
+    def _join(self, number: int, device: plans.Independent | plans.Mock, now: float) -> None:
+        unit = self.units[number]
+        engine = unit.engine
+        self.bus.attach(unit)
+        self.bus.units.append(unit)
+        if device.begins == "application" and device.application == "old" and device.when is None:
+            if isinstance(engine, IndependentDevice):
+                engine.run_application(now)
+        elif isinstance(engine, MockDevice):
+            engine.power_cut(now)
+        if device.begins != "off":
+            unit.power_on(now)
+        self._update_acknowledgement()
+
+    def _update_acknowledgement(self) -> None:
+        has_units = any(unit.has_power for unit in self.units)
+        is_alone = self.bus.is_garbled or not (self.plan.job.others or has_units)
+        if is_alone != self.bus.is_unacknowledged:
+            self.bus.is_unacknowledged = is_alone
+
+    def _expect(self, clause: plans.Clause) -> None:
+        when = clause.when
+        if when is None or not when.what:
+            moment = 0.0 if when is None else when.plus_s
+            self.bus.agenda.at(moment, lambda now: self._happen(clause, now))
+        else:
+            self._waiting.setdefault((when.what, when.number), []).append(clause)
+
+    def _seen(self, frame: Frame, sender: plans.Sender | None, now: float) -> None:
+        self._frames += 1
+        self._digest.update(b"%d %s %.9f;" % (frame.can_id, frame.data, now))
+        if self._tap is not None:
+            self._tap(frame, sender, now)
+        if self._log is not None:
+            name = sender or "other"
+            self._log(f"{now:.6f} {name} {frame.can_id:03X} {frame.data.hex(' ')}")
+        if self._waiting:
+            self._begins("frame", self._frames, now)
+        if sender == "host":
+            self._facts.host_ids.add(frame.can_id)
+            begun = message_begun(frame)
+            if begun is not None:
+                what, number = begun
+                self._phase = what
+                if what == "update":
+                    self._facts.may_have_erased = True
+                    self._at_update = self._present
+                    self.bus.heard.clear()
+                self._facts.host_begins(what, number, now)
+                self._begins(what, number, now)
+        elif sender == "device":
+            self._facts.device_sends(frame, now)
+
+    def _begins(self, what: str, number: int, now: float) -> None:
+        if not self._waiting:
+            return
+        for clause in self._waiting.pop((what, number), ()):
+            plus_s = clause.when.plus_s if clause.when else 0.0
+            if plus_s:
+                self.bus.agenda.at(now + plus_s, lambda at, due=clause: self._happen(due, at))  # type: ignore[misc]
+            else:
+                self._happen(clause, now)
+
+    def _happen(self, clause: plans.Clause, now: float) -> None:
+        if self._log is not None:
+            self._log(f"{now:.6f} *** {clause}")
+        self._reached.add(f"{clause.NAME} @ {self._phase}")
+        match clause:
+            case plans.OnFrames() | plans.Noise():
+                self.bus.frame_faults.append(FrameFault(clause, now))
+            case plans.OnDevice():
+                self._happen_to(clause, now)
+            case plans.Independent() | plans.Mock():
+                self._join(list(self.plan.devices).index(clause), clause, now)
+            case plans.Load():
+                self._load(clause, now, now + clause.seconds)
+            case plans.Unsolicited():
+                for copy in range(clause.count):
+                    self.bus.agenda.send(self._unsolicited(clause), now + 0.002 * copy)
+            case plans.Tool():
+                for turn in range(clause.count):
+                    frames = self._foreign(clause.does, turn)
+                    self.bus.agenda.send(frames, now + clause.every * turn)
+            case _:
+                self._happen_to_host(clause, now)
+
+    def _happen_to_host(self, clause: plans.Clause, now: float) -> None:
+        bus, link = self.bus, self._link
+        match clause:
+            case plans.Unplug(seconds=seconds, wrong_rate=wrong_rate):
+                bus.unplug(seconds)
+                if wrong_rate:
+                    bus.agenda.at(now + seconds, lambda _at: self._garble(is_garbled=True))
+                    back_at = now + seconds + wrong_rate
+                    bus.agenda.at(back_at, lambda _at: self._garble(is_garbled=False))
+            case plans.BusOff(seconds=seconds):
+                bus.bus_off(seconds)
+            case plans.Stall(seconds=seconds) if link is not None:
+                link.stall(seconds)
+            case plans.Kill(again=again) if link is not None:
+                self._again_after_s = again
+                link.kill()
+            case plans.Interrupt():
+                self._is_interrupted = True
+
+    def _garble(self, *, is_garbled: bool) -> None:
+        self.bus.is_garbled = is_garbled
+        self._update_acknowledgement()
+
+    def _happen_to(self, clause: plans.OnDevice, now: float) -> None:
+        if clause.device >= len(self.units):
+            return
+        unit = self.units[clause.device]
+        match clause:
+            case plans.Answer():
+                unit.change(clause)
+            case plans.Power(seconds=seconds):
+                self._cut(unit, seconds, now)
+            case plans.Restart():
+                unit.power_cut(now)
+                unit.power_on(now)
+            case plans.Hang(seconds=seconds):
+                unit.hang(now + seconds)
+            case plans.FlashFails(count=count) if isinstance(unit.engine, IndependentDevice):
+                unit.engine.flash.failures_left += count
+
+    def _cut(self, unit: Unit, seconds: float, now: float) -> None:
+        unit.power_cut(now)
+        self._update_acknowledgement()
+        self.bus.agenda.at(now + seconds, lambda at: self._power_back(unit, at))
+
+    def _power_back(self, unit: Unit, now: float) -> None:
+        unit.power_on(now)
+        self._update_acknowledgement()
+
+    def _load(self, clause: plans.Load, now: float, until: float) -> None:
+        if now < until and self._is_running:
+            self.bus.agenda.send([Frame(clause.id, b"\x33" * 8)], now)
+            self.bus.agenda.at(now + clause.every, lambda at: self._load(clause, at, until))
+
+    def _unsolicited(self, clause: plans.Unsolicited) -> list[Frame]:
+        number = clause.number.to_bytes(2, "little")
+        command, data = {
+            "ack": (ACK, number),
+            "nak": (NAK, number),
+            "boot": (BOOT_VERSION, _BOOT_NAMES[self.target.name] + b"V1.0.0"),
+            "request": (REQUEST, b"\0\0"),
+            "complete": (COMPLETE, b"\0\0"),
+            "feedback": (FEEDBACK, b"ACK"),
+        }[clause.what]
+        return frames_of(self.target.answer_id, REPORT, command, data)
+
+    def _foreign(self, does: str, turn: int) -> list[Frame]:
+        packets = self.plan.job.packets
+        mode, command, data = {
+            "asks": (READ, READ_VERSION, b""),
+            "writes": (WRITE, 0x3A10, b"second tool.    "),
+            "resets": (WRITE, RESET, b"RESET"),
+            "updates": (
+                WRITE,
+                UPDATE,
+                self.target.update_text.encode() + (packets * 128 - 5).to_bytes(4, "little"),
+            ),
+            "packets": (
+                WRITE,
+                PACKET,
+                b"\1" + (turn + 1).to_bytes(2, "little") + packets.to_bytes(2, "little")
+                + b"\xa5" * 128,
+            ),
+        }[does]  # fmt: skip
+        return frames_of(self.target.request_id, mode, command, data)
+
+    # -- the host --------------------------------------------------------------------------------
+
+    def play(self) -> Verdict:
+        """Run the host, as often as it is killed; examine the devices; bring the unit back."""
+        runs, facts = 0, self._facts
+        while True:
+            runs += 1
+            began_at = self.clock.now()
+            facts.begin_run(self._content(self.units[0]))
+            # The history of this computer has a run without an end.
+            options = replace(self._options, in_session=runs > 1)
+            limit_s = overall_timeout_s(self.image_plan, options)
+            claim = self._run(options, began_at + limit_s * OVERDUE_SHARE + OVERDUE_S)
+            if claim is not None:
+                break
+            assert self._again_after_s is not None
+            again_at, self._again_after_s = self.clock.now() + self._again_after_s, None
+            self._wait(again_at)
+        took_s = self.clock.now() - began_at
+        heard = frozenset(self.bus.heard)
+        at_end = [self._content(unit) for unit in self.units]
+        self._end_faults()
+        self._wait(self.clock.now() + SETTLE_S)
+        left = " / ".join(map(self._content, self.units))
+        facts.took_s, facts.limit_s = took_s, limit_s
+        facts.units = [
+            UnitFacts(
+                at_end=content,
+                now=self._content(unit),
+                took_part=unit in self._at_update or unit.application != unit.before,
+                was_heard=unit.engine in heard,
+                was_at_update=unit in self._at_update,
+            )
+            for unit, content in zip(self.units, at_end, strict=True)
+        ]
+        violations = [*judge(facts, claim)]
+        recovered = ""
+        if not (claim.is_ok or violations) and len(self.units) == 1:
+            recovered = self._recover(claim, was_killed=runs > 1)
+            if not recovered:
+                lost = self._content(self.units[0])
+                violations.append(Violation("LOST", f"not brought back: the device has {lost}"))
+        return Verdict(
+            plan=str(self.plan),
+            ending=claim.ending,
+            exit_code=claim.exit_code,
+            is_good=claim.is_ok and self.units[0].application == self.image.data,
+            left=left,
+            attempts=claim.attempts,
+            took_s=took_s,
+            lateness=took_s / limit_s,
+            violations=tuple(violations),
+            recovered=recovered,
+            had_twin=len(self.units) > 1,
+            runs=runs,
+            reached=frozenset(self._reached),
+            wire=self._digest.hexdigest()[:16],
+            where=claim.where,
+        )
+
+    def _run(self, options: UpgradeOptions, overdue_at: float) -> Claim | None:
+        """Run the command once; None if its process was killed."""
+        self._phase = "idle"
+        self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
+        self._is_interrupted = False
+        device = api.Connection(link, self.clock, "the bus of the plan").device(self.target)
+        try:
+            result = device.upgrade(
+                self.image_plan,
+                options=options,
+                identity=Identity(),
+                on_event=self._note,
+                cancelled=lambda: self._is_interrupted,
+            )
+        except KilledError:
+            return None
+        except OverdueError:
+            return Claim("overdue", -1, is_ok=False, left=None, needs_rescue=True, is_overdue=True)
+        except FlasherError as error:
+            return Claim(
+                f"error {error.code}",
+                int(error.exit_code),
+                is_ok=False,
+                left=None,
+                needs_rescue=error.needs_rescue,
+                where=f"{error.where}: {error.what}",
+            )
+        return _claim_of(result)
+
+    def _recover(self, claim: Claim, *, was_killed: bool) -> str:
+        """Run the commands that the documents advise, without faults, for an operator who follows
+        each prompt; return the one that succeeded.
+        """
+        unit = self.units[0]
+        unit.power_on(self.clock.now())
+        self._has_operator = True
+        in_session = was_killed or claim.needs_rescue
+        options = replace(self._options, attempts=None, timeout_s=None)
+        for name, run in (
+            ("flash", replace(options, in_session=in_session)),
+            ("rescue", replace(options, at_power_up=True)),
+        ):
+            limit_s = overall_timeout_s(self.image_plan, run)
+            again = self._run(run, self.clock.now() + limit_s)
+            if again is not None and again.is_ok and unit.application == self.image.data:
+                return name
+        return ""
+
+    def _note(self, event: object) -> None:
+        if self._log is not None:
+            self._log(f"{self.clock.now():.6f}     {event}")
+        if self._has_operator and isinstance(event, PowerCycleAwaited):
+            cut_at = self.clock.now() + _OPERATOR_S
+            self.bus.agenda.at(cut_at, lambda at: self._cut(self.units[0], _OPERATOR_S, at))
+
+    def _end_faults(self) -> None:
+        """Cancel what has not happened yet, and end what lasts."""
+        self._is_running = False
+        self._waiting.clear()
+        self.bus.agenda.clear()
+        self.bus.frame_faults.clear()
+        self.bus.is_garbled = self.bus.is_unacknowledged = False
+        self.bus.plug()
+        for unit in self.units:
+            unit.end_faults()
+
+    def _wait(self, until: float) -> None:
+        link = self.bus.link()
+        while self.clock.now() < until:
+            self.bus.advance(until)
+            link.drain()
+
+    def _content(self, unit: Unit) -> str:
+        application = unit.application
+        if application is None:
+            return "none"
+        if application == self.image.data:
+            return "new"
+        return "old" if application == unit.before else "other"
+
+    @property
+    def _present(self) -> list[Unit]:
+        """Units that have been on the bus."""
+        return [unit for unit in self.units if unit in self.bus.units]
+
+
+def _options(job: plans.Job, options: UpgradeOptions) -> UpgradeOptions:
+    if job.attempts:
+        options = replace(options, attempts=job.attempts)
+    if job.tries:
+        options = replace(options, timings=replace(options.timings, packet_tries=job.tries))
+    return replace(options, timeout_s=job.timeout) if job.timeout else options
+
+
+def _claim_of(result: Result) -> Claim:
+    outcome, error = result.outcome, result.error()
+    needs_rescue = outcome.device_left.needs_rescue if error is None else error.needs_rescue
+    ending = outcome.ending.value
+    if outcome.ok and not result.verification.ok:
+        ending += f", {result.verification.verdict.value}"
+    return Claim(
+        ending,
+        int(result.exit_code),
+        is_ok=result.ok,
+        left=outcome.device_left,
+        needs_rescue=needs_rescue,
+        attempts=outcome.statistics.attempts,
+        where=outcome.where,
+    )
+
+
+def play(plan: plans.Plan, options: UpgradeOptions | None = None) -> Verdict:
+    """Play a plan. An exception of the code under test is a violation."""
+    try:
+        return Player(plan, options).play()
+    except Exception as error:  # noqa: BLE001  a finding
+        crash = Violation("CRASH", f"{type(error).__name__}: {error}")
+        return Verdict(
+            str(plan), "crash", 1, is_good=False, left="", attempts=0, took_s=0.0, lateness=0.0,
+            violations=(crash,),
+        )  # fmt: skip
