@@ -95,14 +95,11 @@ def _receive_waiting(
     """
     now_of, process_frame, receive = clock.now, engine.receive, link.receive
     now = now_of()
-    if frame is None:
-        frame = receive(AT_ONCE)
     for _ in range(_CATCH_UP_FRAMES):
-        if frame is None:
-            return now
+        if frame is None and (frame := receive(AT_ONCE)) is None:
+            break
         for tap in taps:
             tap(frame, sent=False, now=now)
         process_frame(frame, now)
-        now = now_of()
-        frame = receive(AT_ONCE)
+        frame, now = None, now_of()
     return now

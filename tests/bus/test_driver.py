@@ -184,6 +184,17 @@ def test_a_babbling_bus_does_not_stop_the_timers(clock: VirtualClock, link: Fake
     assert engine.calls.index(("tick", 5.0)) == 10_000
 
 
+def test_no_frame_is_lost_when_a_babbling_bus_is_interrupted_for_the_timers(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    engine = Recorder(ticks=2)
+    link.arrivals.extend((0.0, Frame(number % 0x700, b"x")) for number in range(10_003))
+    clock.wait_until(5.0)
+    drive(engine, link, clock)
+    received = [what for what, _ in engine.calls if what != "tick"]
+    assert received == [f"receive {number % 0x700:03X}" for number in range(10_003)]
+
+
 def test_a_frame_that_waited_has_the_time_at_which_the_engine_was_ready_for_it(
     clock: VirtualClock, link: FakeLink
 ) -> None:
