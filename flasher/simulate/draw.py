@@ -117,7 +117,9 @@ class _Draw:
         )
         if not self._has_twin:
             return [first]
-        other = choices if self._is(0.7) else self._independent() if is_independent else self._mock()
+        other = (
+            choices if self._is(0.7) else self._independent() if is_independent else self._mock()
+        )
         if is_independent and self._is(0.9):
             late = self._between(1e-6, 0.01)
             other = f"{other} late={late}".strip()

@@ -1,8 +1,8 @@
-"""Independent device model, written from the protocol document alone: bootloader, application, flash.
+"""Independent device model, written from the protocol document alone.
 
-It shares nothing with the rest of flasher but the type of a frame, so that a misreading in the
-protocol package is not repeated here. What the document leaves open is a field of `Choices`. An
-engine for a simulated bus (`flasher.protocol.engine`).
+Bootloader, application and flash share nothing with the rest of flasher but the type of a frame, so
+that a misreading in the protocol package is not repeated here. What the document leaves open is a
+field of `Choices`. An engine for a simulated bus (`flasher.protocol.engine`).
 """
 
 from __future__ import annotations
@@ -133,11 +133,10 @@ class Flash:
 
     def program(self) -> bool:
         """End the program operation; False if it failed."""
-        assert self._under_way is not None
-        (at, data), self._under_way = self._under_way, None
-        if self._fails():
+        under_way, self._under_way = self._under_way, None
+        if under_way is None or self._fails():
             return False
-        self._write(at, data)
+        self._write(*under_way)
         return True
 
     def begin_to_mark(self) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import random
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import inf
 from typing import Final
 
 from flasher import api
@@ -141,8 +140,8 @@ class Player:
         self._is_interrupted = False
         self._has_operator = False
         """Somebody follows the prompts."""
-        self._again_after_s: float | None = None
-        """The host's process is killed, and run again after so long."""
+        self._again_after_s = 0.0
+        """Time from the kill of the host's process until the same command runs again."""
         self._phase = "idle"
         """Last message that the host began."""
         self._reached: set[str] = set()
@@ -360,9 +359,7 @@ class Player:
             claim = self._run(options, began_at + limit_s * OVERDUE_SHARE + OVERDUE_S)
             if claim is not None:
                 break
-            assert self._again_after_s is not None
-            again_at, self._again_after_s = self.clock.now() + self._again_after_s, None
-            self._wait(again_at)
+            self._wait(self.clock.now() + self._again_after_s)
         took_s = self.clock.now() - began_at
         heard = frozenset(self.bus.heard)
         at_end = [self._content(unit) for unit in self.units]
@@ -375,7 +372,7 @@ class Player:
                 at_end=content,
                 now=self._content(unit),
                 took_part=unit in self._at_update or unit.application != unit.before,
-                was_heard=unit.engine in heard,
+                was_heard=unit in heard,
                 was_at_update=unit in self._at_update,
             )
             for unit, content in zip(self.units, at_end, strict=True)

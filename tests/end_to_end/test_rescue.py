@@ -289,7 +289,7 @@ def test_the_error_at_the_end_is_that_of_the_last_try_to_open_it() -> None:
                 code=ErrorCode.OTHER_BIT_RATE,
             )
 
-    stage.wrap = lambda link: Changed(link._bus, link._host, link._queue_frames)
+    stage.wrap = lambda link: Changed(link._bus, link._queue_frames)
     stage.at_packet[2] = lambda: stage.bus.unplug(1.0)
     with pytest.raises(BusError) as caught:
         stage.flash(LONG)
