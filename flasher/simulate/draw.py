@@ -83,6 +83,7 @@ class _Draw:
             plans.Job(
                 target=self._target,  # type: ignore[arg-type]  # one of them
                 packets=self._packets,
+                short=draw.choice((5, 5, 0, 1, 64, draw.randrange(96))),
                 image=self._seed % 1000,
                 others=needs_others or self._is(0.7),
             )

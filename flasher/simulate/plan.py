@@ -87,6 +87,8 @@ class Job(Clause):
     NAME = "job"
     target: Literal["bms", "wmc", "obc"] = "bms"
     packets: int = 20
+    short: int = 5
+    """Bytes that the last packet is short of a whole one."""
     image: int = 5
     """Seed of the image's bytes."""
     others: bool = True

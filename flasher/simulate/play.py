@@ -7,7 +7,6 @@ import random
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final
 
 from flasher import api
@@ -51,6 +50,7 @@ from flasher.simulate.independent import (
     frames_of,
 )
 from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
+from flasher.simulate.reached import fault_place
 
 NEW_VERSION: Final = "V1r2r0_20240601"
 """Version that the new image reports."""
@@ -82,6 +82,8 @@ class Verdict:
     took_s: float
     lateness: float
     """The end as a share of the announced deadline."""
+    share_of_bus_time: float = 0.0
+    """Duration as a multiple of the time that all frames of the upgrade take on the bus."""
     violations: tuple[Violation, ...] = ()
     """Empty if the host was right."""
     recovered: str = ""
@@ -95,17 +97,12 @@ class Verdict:
     where: str = ""
 
 
-@lru_cache(maxsize=64)
-def image_of(packets: int, seed: int) -> Image:
-    """Return an image that names its version, its last packet not full."""
+def image_plan_of(packets: int, short: int, seed: int, target: str) -> ImagePlan:
+    """Plan the upgrade to an image that names its version."""
     head = _VECTORS + NEW_VERSION.encode() + b"\0"
-    body = random.Random(seed).randbytes(packets * PACKET_DATA_SIZE - 5 - len(head))
-    return replace(Image.from_bytes(head + body), version=NEW_VERSION)
-
-
-@lru_cache(maxsize=64)
-def _image_plan(packets: int, seed: int, target: str) -> ImagePlan:
-    return image_plan(image_of(packets, seed), TARGETS[target], WELLING.bitrate_bps)
+    body = random.Random(seed).randbytes(packets * PACKET_DATA_SIZE - short - len(head))
+    image = replace(Image.from_bytes(head + body), version=NEW_VERSION)
+    return image_plan(image, TARGETS[target], WELLING.bitrate_bps)
 
 
 class Player:
@@ -126,8 +123,7 @@ class Player:
         self.target = TARGETS[job.target]
         self.clock = VirtualClock()
         self.bus = PlanBus(self.clock, self._seen)
-        self.image_plan = _image_plan(job.packets, job.image, job.target)
-        self.image = image_of(job.packets, job.image)
+        self.image_plan = image_plan_of(job.packets, job.short, job.image, job.target)
         self.units: list[Unit] = []
         self._options = _options(job, options or UpgradeOptions())
         self._log = log
@@ -238,7 +234,7 @@ class Player:
     def _happen(self, clause: plans.Clause, now: float) -> None:
         if self._log is not None:
             self._log(f"{now:.6f} *** {clause}")
-        self._reached.add(f"{clause.NAME} @ {self._phase}")
+        self._reached.add(fault_place(clause.NAME, self._phase))
         match clause:
             case plans.OnFrames() | plans.Noise():
                 self.bus.frame_faults.append(FrameFault(clause, now))
@@ -333,7 +329,8 @@ class Player:
             "updates": (
                 WRITE,
                 UPDATE,
-                self.target.update_text.encode() + (packets * 128 - 5).to_bytes(4, "little"),
+                self.target.update_text.encode()
+                + len(self.image_plan.image.data).to_bytes(4, "little"),
             ),
             "packets": (
                 WRITE,
@@ -388,11 +385,12 @@ class Player:
             plan=str(self.plan),
             ending=claim.ending,
             exit_code=claim.exit_code,
-            is_good=claim.is_ok and self.units[0].application == self.image.data,
+            is_good=claim.is_ok and self.units[0].application == self.image_plan.image.data,
             left=left,
             attempts=claim.attempts,
             took_s=took_s,
             lateness=took_s / limit_s,
+            share_of_bus_time=took_s / self.image_plan.wire_s,
             violations=tuple(violations),
             recovered=recovered,
             had_twin=len(self.units) > 1,
@@ -446,7 +444,7 @@ class Player:
         ):
             limit_s = overall_timeout_s(self.image_plan, run)
             again = self._run(run, self.clock.now() + limit_s)
-            if again is not None and again.is_ok and unit.application == self.image.data:
+            if again is not None and again.is_ok and unit.application == self.image_plan.image.data:
                 return name
         return ""
 
@@ -478,7 +476,7 @@ class Player:
         application = unit.application
         if application is None:
             return "none"
-        if application == self.image.data:
+        if application == self.image_plan.image.data:
             return "new"
         return "old" if application == unit.before else "other"
 

@@ -1,0 +1,288 @@
+"""Campaigns of simulated upgrades: batches of seeds, and results that are merged in any order.
+
+A batch is a range of seeds; `run_batch` plays their plans, wherever it runs. Results are added
+(`Result.__add__`): counts by +, places by |, violations by the lowest seeds, digests by exclusive
+or; so neither the size of the batches nor the order of their ends changes the sum.
+
+A canary is a planted mistake (`planting`) that a campaign has to find, or it is blind.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import random
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from math import log2
+from pathlib import Path
+from typing import Final, TypeVar
+
+from flasher.simulate import plan as plans
+from flasher.simulate.draw import drawn
+from flasher.simulate.planting import swapped, upgrade_bugs
+from flasher.simulate.play import Verdict, play
+from flasher.simulate.reached import UNREACHABLE, exit_place, places, recorded_cells
+
+VIOLATIONS_MAX: Final = 20
+"""Violations that a result keeps, those of the lowest seeds; all are counted."""
+CANARY_EVERY: Final = 2000
+"""Runs of a campaign for each canary."""
+CANARY_RUNS: Final = 1000
+"""Runs in which a canary has to be found."""
+CANARIES: Final = (
+    "last-program-unit-lost",
+    "one-packet-more-for-whole-sizes",
+)
+"""Planted mistakes that few runs find."""
+NO_FAULT: Final = "none"
+_TIMES_PER_OCTAVE: Final = 4
+"""Classes of times: each 2^(1/4) times as long as the one before."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Range of seeds, the unit of work; with a canary, the runs that have to find it."""
+
+    campaign: str
+    """`campaign_key`: a batch runs on the same code only."""
+    first: int
+    count: int
+    canary: str = ""
+    """Name of a planted mistake."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Violation, and the plan that shows it."""
+
+    seed: int
+    kind: str
+    text: str
+    plan: str
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How the runs with a kind of fault ended."""
+
+    runs: int = 0
+    good: int = 0
+    """Claimed success, and the device has the image."""
+    by_flash: int = 0
+    """Failed with an error; the same command without faults then succeeded."""
+    by_rescue: int = 0
+    """Failed with an error; `rescue` without faults succeeded."""
+    times: Mapping[int, int] = field(default_factory=dict)
+    """Number of good runs by the class of their time (`time_class`)."""
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(
+            self.runs + other.runs,
+            self.good + other.good,
+            self.by_flash + other.by_flash,
+            self.by_rescue + other.by_rescue,
+            _sum(self.times, other.times),
+        )
+
+    @property
+    def median_time(self) -> float | None:
+        """Median duration of the good runs, as a multiple of the time on the bus."""
+        left = (self.good + 1) // 2
+        for each, count in sorted(self.times.items()):
+            left -= count
+            if left <= 0:
+                return float(2 ** (each / _TIMES_PER_OCTAVE))
+        return None
+
+
+@dataclass(frozen=True)
+class Result:
+    """Sum of the runs of any number of batches."""
+
+    campaign: str
+    runs: int = 0
+    endings: Mapping[str, int] = field(default_factory=dict)
+    tallies: Mapping[str, Tally] = field(default_factory=dict)
+    """By the name of a clause that a plan contains; `NO_FAULT` for plans without a fault."""
+    reached: frozenset[str] = frozenset()
+    violations: tuple[Found, ...] = ()
+    violation_count: int = 0
+    excused: int = 0
+    """Successes beside a device that cannot be seen (`Violation.is_excused`)."""
+    canaries_found: Mapping[str, int] = field(default_factory=dict)
+    canaries_missed: Mapping[str, int] = field(default_factory=dict)
+    canary_runs: int = 0
+    digest: str = "0" * 16
+    """Of all frames of all runs, with their times."""
+    latest: float = 0.0
+    """Latest end as a share of its announced deadline."""
+    cpu_s: float = 0.0
+
+    def __add__(self, other: Result) -> Result:
+        """Raises ValueError for results of different campaigns."""
+        if self.campaign != other.campaign:
+            raise ValueError(f"results of two campaigns: {self.campaign} and {other.campaign}")
+        violations = sorted({*self.violations, *other.violations}, key=lambda each: each.seed)
+        names = self.tallies.keys() | other.tallies.keys()
+        return Result(
+            campaign=self.campaign,
+            runs=self.runs + other.runs,
+            endings=_sum(self.endings, other.endings),
+            tallies={
+                name: self.tallies.get(name, Tally()) + other.tallies.get(name, Tally())
+                for name in sorted(names)
+            },
+            reached=self.reached | other.reached,
+            violations=tuple(violations[:VIOLATIONS_MAX]),
+            violation_count=self.violation_count + other.violation_count,
+            excused=self.excused + other.excused,
+            canaries_found=_sum(self.canaries_found, other.canaries_found),
+            canaries_missed=_sum(self.canaries_missed, other.canaries_missed),
+            canary_runs=self.canary_runs + other.canary_runs,
+            digest=f"{int(self.digest, 16) ^ int(other.digest, 16):016x}",
+            latest=max(self.latest, other.latest),
+            cpu_s=self.cpu_s + other.cpu_s,
+        )
+
+    @property
+    def never_reached(self) -> list[str]:
+        """Places that no run reached, without those that none can reach."""
+        return sorted(places() - self.reached - UNREACHABLE.keys())
+
+    @property
+    def is_blind(self) -> bool:
+        """True unless every canary was found."""
+        return bool(self.canaries_missed) or not self.canaries_found
+
+
+Key = TypeVar("Key", int, str)
+
+
+def _sum(one: Mapping[Key, int], other: Mapping[Key, int]) -> dict[Key, int]:
+    return {key: one.get(key, 0) + other.get(key, 0) for key in sorted(one.keys() | other.keys())}
+
+
+@cache
+def campaign_key() -> str:
+    """Return a hash of all that decides the result of a seed: the code, and Python's version."""
+    digest = hashlib.sha256(platform.python_version().encode())
+    package = Path(__file__).parents[1]
+    for file in sorted([*package.rglob("*.py"), *package.rglob("*.toml")]):
+        digest.update(f"{file.relative_to(package).as_posix()}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def batches(first: int, runs: int, count: int) -> Iterator[Batch]:
+    """Yield the batches of a campaign of `runs` seeds from `first` on, each of `count` runs, with a
+    canary before each `CANARY_EVERY` runs.
+    """
+    key, end = campaign_key(), first + runs
+    for start in range(first, end, CANARY_EVERY):
+        canary = random.Random(start).choice(CANARIES)
+        yield Batch(key, start, CANARY_RUNS, canary)
+        part_end = min(start + CANARY_EVERY, end)
+        for begin in range(start, part_end, count):
+            yield Batch(key, begin, min(count, part_end - begin))
+
+
+def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
+    """Play the plans of a batch; once stopped, the sum of those that were played.
+
+    Raises ValueError for a batch of other code.
+    """
+    if batch.campaign != campaign_key():
+        raise ValueError(f"a batch of {batch.campaign}; this is the code {campaign_key()}")
+    began_s = time.process_time()
+    sums = _Sums()
+    if batch.canary:
+        sums.hunt(batch, is_stopped)
+    else:
+        with recorded_cells() as cells:
+            for seed in range(batch.first, batch.first + batch.count):
+                if is_stopped():
+                    break
+                plan = drawn(seed)
+                sums.add(seed, plan, play(plan))
+        sums.reached |= cells
+    return sums.result(batch.campaign, time.process_time() - began_s)
+
+
+class _Sums:
+    """Result that is being added up."""
+
+    def __init__(self) -> None:
+        self.reached: set[str] = set()
+        self._runs = self._excused = self._canary_runs = self._digest = 0
+        self._endings: Counter[str] = Counter()
+        self._tallies: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._times: defaultdict[str, Counter[int]] = defaultdict(Counter)
+        self._found: list[Found] = []
+        self._canaries: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
+        self._latest = 0.0
+
+    def add(self, seed: int, plan: plans.Plan, verdict: Verdict) -> None:
+        self._runs += 1
+        self._endings[verdict.ending] += 1
+        self.reached |= verdict.reached
+        self.reached.add(exit_place(verdict.exit_code))
+        self._latest = max(self._latest, verdict.lateness)
+        text = f"{seed} {verdict.wire} {verdict.ending} {verdict.left} {verdict.recovered}"
+        self._digest ^= int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+        how = "good" if verdict.is_good else f"by_{verdict.recovered}" if verdict.recovered else ""
+        for name in {each.NAME for each in plan.events} or {NO_FAULT}:
+            tally = self._tallies[name]
+            tally["runs"] += 1
+            if how:
+                tally[how] += 1
+            if verdict.is_good and verdict.share_of_bus_time:
+                time_class = round(_TIMES_PER_OCTAVE * log2(verdict.share_of_bus_time))
+                self._times[name][time_class] += 1
+        for each in verdict.violations:
+            if each.is_excused:
+                self._excused += 1
+            else:
+                self._found.append(Found(seed, each.kind, each.text, str(plan)))
+
+    def hunt(self, batch: Batch, is_stopped: Callable[[], bool]) -> None:
+        """Play plans with a planted mistake until one shows it."""
+        bug = next(each for each in upgrade_bugs() if each.name == batch.canary)
+        with swapped(bug.codes()):
+            for seed in range(batch.first, batch.first + batch.count):
+                if is_stopped():
+                    return
+                self._canary_runs += 1
+                violations = play(drawn(seed)).violations
+                if any(not each.is_excused for each in violations):
+                    self._canaries[True][bug.name] += 1
+                    return
+        self._canaries[False][bug.name] += 1
+
+    def result(self, campaign: str, cpu_s: float) -> Result:
+        return Result(
+            campaign=campaign,
+            runs=self._runs,
+            endings=_sorted(self._endings),
+            tallies={
+                name: Tally(**counts, times=_sorted(self._times[name]))
+                for name, counts in sorted(self._tallies.items())
+            },
+            reached=frozenset(self.reached - {""}),
+            violations=tuple(self._found[:VIOLATIONS_MAX]),
+            violation_count=len(self._found),
+            excused=self._excused,
+            canaries_found=_sorted(self._canaries[True]),
+            canaries_missed=_sorted(self._canaries[False]),
+            canary_runs=self._canary_runs,
+            digest=f"{self._digest:016x}",
+            latest=self._latest,
+            cpu_s=cpu_s,
+        )
+
+
+def _sorted(counts: Mapping[Key, int]) -> dict[Key, int]:
+    return dict(sorted(counts.items()))
