@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +15,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import UsageError
+from flasher.files import parse_json
 from flasher.host.waivers import WAIVERS
 from flasher.i18n import Text, text
 from flasher.protocol.contents import RunningInformation, VersionInformation
@@ -71,13 +72,26 @@ class Shelf:
         self._trace_suffixes = tuple(f".{suffix}" for suffix in traces)
 
     def use(self, folder: str) -> None:
-        """Choose the folder. Raises UsageError if it does not exist."""
-        path = Path(folder).expanduser()
-        if not folder or not path.is_dir():
+        """Choose the folder. Raises UsageError if it does not exist or cannot be read."""
+        path = None
+        try:
+            with suppress(RuntimeError):  # ~ of a user that does not exist
+                path = Path(folder).expanduser()
+            if not folder or path is None or not path.is_dir():
+                raise UsageError(
+                    text("{folder} is not a folder of this computer.", folder=printable(folder)),
+                    remedy=text("Name one with its whole path, as in /home/me/firmware."),
+                )
+            next(path.iterdir(), None)
+        except OSError as error:
             raise UsageError(
-                f"{printable(folder)} is not a folder of this computer.",
-                remedy="Name one with its whole path, as in /home/me/firmware.",
-            )
+                text(
+                    "{folder} cannot be read: {why}.",
+                    folder=printable(folder),
+                    why=error.strerror or str(error),
+                ),
+                remedy=text("Make the folder readable for this user, or name another one."),
+            ) from error
         self.folder = path.resolve()
 
     def files(self) -> list[Path]:
@@ -182,14 +196,16 @@ class BenchPage:
 
     async def _order(self, request: Request) -> Response:
         try:
-            order = json.loads(await request.body())
+            order = parse_json(await request.body())
             word = order["order"]
             if word == "stop":
                 self._bench.stop()
                 return JSONResponse({})
             step, fields = _ORDERS[word]
             values = [order[name] for name in fields]
-            is_meant = word != "waive" or order["risk"] == "known"
+            is_meant = all(isinstance(value, str) for value in values) and (
+                word != "waive" or order["risk"] == "known"
+            )
         except (ValueError, TypeError, KeyError):
             is_meant = False
         if not is_meant:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from flasher.files import parse_json
 from flasher.i18n import text
 from flasher.station.board import Board, Replies, Row
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
@@ -244,8 +244,7 @@ class OperatorPage:
 
     async def _scan(self, request: Request) -> Response:
         try:
-            to_json = json.loads(await request.body())
-            text = to_json["text"]
+            text = parse_json(await request.body())["text"]
         except (ValueError, TypeError, KeyError):
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:

@@ -17,6 +17,7 @@ from functools import partial
 from http import HTTPStatus
 from typing import Final, Protocol, TypeVar
 
+from starlette.convertors import Convertor, register_url_convertor
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
@@ -30,9 +31,26 @@ PROCESSES: Final = 2
 ANSWER_LIMIT_S: Final = 120.0
 FIELD_MAX: Final = 200
 """Characters of one field of a form."""
+RUN: Final = "{run:run}"
+"""The number of a run, in the path of a page."""
 _NICENESS: Final = 10
 Result = TypeVar("Result")
 HTML: Final = "text/html; charset=utf-8"
+
+
+class _RunConvertor(Convertor[int]):
+    """Matches numbers that fit into a database."""
+
+    regex = "[0-9]{1,18}"
+
+    def convert(self, value: str) -> int:
+        return int(value)
+
+    def to_string(self, value: int) -> str:
+        return str(value)
+
+
+register_url_convertor("run", _RunConvertor())
 
 
 @dataclass(frozen=True)

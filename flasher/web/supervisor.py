@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, time, timedelta
 from functools import cached_property
@@ -61,7 +62,7 @@ from flasher.trace.story import Story
 from flasher.translation import Translator, translator
 from flasher.web.charts import SERIES_MAX, lines, stacked_bars
 from flasher.web.pages import Pages
-from flasher.web.query_processes import Answer, Question
+from flasher.web.query_processes import RUN, Answer, Question
 
 USUAL_DAYS: Final = 30
 """Default period of pages with figures: this number of days with runs."""
@@ -70,6 +71,8 @@ _HOURS_UP_TO: Final = timedelta(days=2)
 _DAYS_UP_TO: Final = timedelta(days=62)
 _WEEKS_UP_TO: Final = timedelta(days=430)
 SPANS_MAX: Final = 400
+YEARS: Final = range(2000, 2100)
+"""Years of the times in a form. Periods around them are times too, with few enough shifts."""
 CHECK: Final = "/certificate"
 """Path of the page that checks a certificate."""
 _NAMES: Final = {
@@ -467,8 +470,8 @@ def serve_supervisor(
 PAGES: Final[dict[str, Callable[[SupervisorPages, Question], Answer]]] = {
     "/runs": SupervisorPages.runs,
     **dict.fromkeys(_FILES, SupervisorPages.file_of_runs),
-    "/runs/{run:int}": SupervisorPages.run,
-    "/runs/{run:int}/trace": SupervisorPages.trace,
+    f"/runs/{RUN}": SupervisorPages.run,
+    f"/runs/{RUN}/trace": SupervisorPages.trace,
     "/units": SupervisorPages.units,
     "/units/certificate": SupervisorPages.certificate,
     "/units/certificate.html": SupervisorPages.file_of_certificate,
@@ -509,12 +512,16 @@ def _moment(question: Question, name: str) -> datetime | None:
     text = question.fields.get(name)
     if text is None:
         return None
-    try:
-        return datetime.fromisoformat(text).astimezone()
-    except (ValueError, OverflowError) as error:
+    moment = None
+    with suppress(ValueError, OverflowError):
+        moment = datetime.fromisoformat(text).astimezone()
+    if moment is None or moment.year not in YEARS:
+        first, last = YEARS[0], YEARS[-1]
         raise UsageError(
-            f"{text!a:.40} is not a time.", remedy="Write 2026-05-17 or 2026-05-17T06:00."
-        ) from error
+            f"{text!a:.40} is not a time of the years {first} to {last}.",
+            remedy="Write 2026-05-17 or 2026-05-17T06:00.",
+        )
+    return moment
 
 
 def _oldest(question: Question) -> PageCursor:

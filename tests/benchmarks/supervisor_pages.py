@@ -47,7 +47,7 @@ from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import Report
 from flasher.station.shift_counts import DEFAULT_SHIFTS
-from flasher.web.query_processes import QueryProcesses, Question
+from flasher.web.query_processes import RUN, QueryProcesses, Question
 from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_supervisor
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
@@ -169,7 +169,7 @@ def questions_of(plant: Plant) -> list[tuple[str, Question]]:
             else ""
         )
         found.append((shown, Question(path, fields)))
-    found.insert(14, ("/runs/N/trace", Question("/runs/{run:int}/trace", run=runs - 1)))
+    found.insert(14, ("/runs/N/trace", Question(f"/runs/{RUN}/trace", run=runs - 1)))
     return found
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from intelhex import IntelHex
@@ -217,10 +219,26 @@ def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_pa
     )
     assert [each.name for each in state.offers] == ["other.bin"]
     assert LastChoices().kept("images") == str(other)
-    for wrong in ("", str(other / "other.bin"), "/no/such/folder"):
+    for wrong in (
+        "", str(other / "other.bin"), "/no/such/folder", "~no_such_user/x", "a" * 5000, "\0",
+    ):  # fmt: skip
         state = place.do(order(BenchController.use_folder, wrong))
         assert isinstance(state.trouble, UsageError)
         assert place.shelf.folder == other
+
+
+def test_a_folder_that_may_not_be_listed_is_not_chosen(
+    place: BenchPlace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_folder: Path) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", refuse)
+        state = place.do(order(BenchController.use_folder, str(tmp_path)))
+    assert isinstance(state.trouble, UsageError)
+    assert "Permission denied" in state.trouble.what
 
 
 # -- checks that are waived ------------------------------------------------------------------------

@@ -242,11 +242,31 @@ def test_the_form_of_the_runs_narrows_them_and_its_files_are_of_the_same(
     assert len(list(suite.iter("failure"))) == 3
 
 
-@pytest.mark.parametrize("query", ["from=yesterday", "outcome=GREAT", "to=2026-13-01"])
-def test_a_form_that_cannot_be_says_so(client: TestClient, query: str) -> None:
-    answer = client.get(f"/runs?{query}")
+@pytest.mark.parametrize(
+    "query",
+    [
+        "from=yesterday",
+        "outcome=GREAT",
+        "to=2026-13-01",
+        "to=0001-01-05",
+        "from=0001-01-02&by=shift",
+        "to=9999-12-31T23:59",
+        "from=2026-05-17&to=9026-05-17&by=shift",
+    ],
+)
+@pytest.mark.parametrize("page", ["/runs", "/yield"])
+def test_a_form_that_cannot_be_says_so(client: TestClient, page: str, query: str) -> None:
+    answer = client.get(f"{page}?{query}")
     assert answer.status_code == 400
     assert 'role="alert"' in answer.text
+
+
+@pytest.mark.parametrize("number", ["9" * 19, "9" * 5000])
+@pytest.mark.parametrize("page", ["", "/trace"])
+def test_a_number_that_no_run_can_have_is_no_page(
+    client: TestClient, number: str, page: str
+) -> None:
+    assert client.get(f"/runs/{number}{page}").status_code == 404
 
 
 @pytest.mark.parametrize("cut", ["before=x", "before=-1", "before=" + "9" * 30, "after=\u0663"])
