@@ -29,19 +29,18 @@ from flasher.cli.look.explain_text import story_lines
 from flasher.cli.station.scans import read_scans
 from flasher.conformance import diff
 from flasher.conformance import profile as conformance_profile
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import FlasherError
 from flasher.image.load import load
 from flasher.report.explain_page import render
 from flasher.settings.manifest import read_release
 from flasher.settings.profile import check_profile
 from flasher.station.config import load_config
 from flasher.station.recipe_file import load_recipe
-from flasher.trace.recorder import Recorder
 from flasher.trace.source import explain_path
-from tests.hostile.files import ROWS, SAMPLES, Row, report_with
-from tests.trace import traffic
+from tests.hostile import good
+from tests.hostile.files import ROWS, SAMPLES, Row
+from tests.hostile.judge import LIMIT_S, fault_of
 
-LIMIT_S = 2.0
 ROW_LIMIT_S = 4.0
 """Of the processor, for a command. 2 on an idle machine; room for a loaded one."""
 ROW_LIMIT_MB = 300
@@ -155,9 +154,8 @@ class Campaign:
             self.counts[f"{kind}: read"] += 1
         except FlasherError as error:
             self.counts[f"{kind}: refused"] += 1
-            said = str(error).replace("\n", "")
-            if error.exit_code not in (ExitCode.USAGE, ExitCode.IMAGE) or not said.isprintable():
-                self._keep(kind, path, f"exit code {error.exit_code}: {said!a:.200}")
+            if fault := fault_of(error):
+                self._keep(kind, path, fault)
         except Exception as error:  # noqa: BLE001  that is what it looks for
             self._keep(kind, path, f"{type(error).__name__}: {error!s:.200}")
         took_s = time.process_time() - began
@@ -208,26 +206,11 @@ def good_files(folder: Path) -> Iterator[tuple[str, str, bytes]]:
     yield "recipe", ".toml", (station / "recipe.toml").read_bytes()
     yield "station", ".toml", (station / "sockets.toml").read_bytes()
     yield "scans", ".txt", (station / "scans.txt").read_bytes()
-    yield (
-        "profile",
-        ".toml",
-        (
-            b"attempts = 5\n[timings]\nack_timeout_s = 1.0\n[wmc]\nframe_gap_s = 0.001\n"
-            b"reset_data = 'RESET'\n[wmc.version_query]\ncommand = 0x3300\n"
-        ),
-    )
-    yield (
-        "conformance profile",
-        ".toml",
-        (conformance_profile.ConformanceProfile({"tx_02": "nak_next"}).to_toml().encode()),
-    )
-    yield "report", ".json", report_with("1")
+    yield "profile", ".toml", good.TARGET_PROFILE
+    yield "conformance profile", ".toml", good.CONFORMANCE_PROFILE
+    yield "report", ".json", good.conformance_report()
     for suffix in TRACES:
-        path = folder / f"trace{suffix}"
-        with Recorder(path) as record:
-            for number, frame in enumerate(traffic.running() + traffic.reset()):
-                record(frame, sent=number % 2 == 0, now=number / 100)
-        yield "trace", suffix, path.read_bytes()
+        yield "trace", suffix, good.trace(folder / f"trace{suffix}")
 
 
 def main() -> int:
