@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler
 
 INTER_FRAME_TIMEOUT_S: Final = 0.1
+HELD_MAX: Final = 264 + 8 + 264
+"""One message, one frame, and junk as long as a message."""
 
 
 class Case(NamedTuple):

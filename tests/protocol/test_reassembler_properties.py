@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from flasher.protocol.wire import Damage, DamageReason, Message, encode
 from tests.loops import each
 
-from .cases import case, feed_all, make_reassembler, messages_of, pieces
+from .cases import HELD_MAX, case, feed_all, make_reassembler, messages_of, pieces
 
 _ID: Final = 0x725
 _ACK: Final = case("bms ACK 1")
 _PACKET: Final = case("bms packet 1/613")
-_HELD_MAX: Final = 264 + 8 + 264
-"""One message, one frame, and junk as long as a message."""
 
 
 @st.composite
@@ -143,7 +141,7 @@ def test_endless_bytes_of_no_use_do_not_fill_the_memory(pattern: bytes, size_byt
     reported = 0
     for payload in pieces((pattern * 3000)[:3000], size_bytes):
         reported += len(reassembler.feed(payload, 0.0))
-        assert reassembler.buffered_bytes <= _HELD_MAX
+        assert reassembler.buffered_bytes <= HELD_MAX
     assert reported
 
 
@@ -154,7 +152,7 @@ def test_endless_random_bytes_do_not_fill_the_memory() -> None:
         reassembler.feed(
             rng.choice([rng.randbytes(8), b"\x55\xaa", b"\x55\xaa\x0c\xff\xc2\xfd"]), 0
         )
-        assert reassembler.buffered_bytes <= _HELD_MAX
+        assert reassembler.buffered_bytes <= HELD_MAX
 
 
 # -- what the checksum catches (CR-01, CR-02, CR-03) ------------------------------------------

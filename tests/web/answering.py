@@ -32,7 +32,9 @@ def app_of(database: Path, keys: Path) -> ASGIApp:
     return app_with(open_supervisor(str(database), folder, KeyLocations(keys), DEFAULT_SHIFTS))
 
 
-def app_with(supervisor: SupervisorPages, login: Login | None = None, *more: BaseRoute) -> ASGIApp:
+def app_with(
+    supervisor: SupervisorPages, login: Login | None = None, *more: BaseRoute, secret: str = _KEY
+) -> ASGIApp:
     """The pages that it answers, and more; with `login` for who signed in."""
 
     async def ask(question: Question) -> Answer:
@@ -42,7 +44,7 @@ def app_with(supervisor: SupervisorPages, login: Login | None = None, *more: Bas
     return application(
         [*more, *answer_routes(pages, ask, PAGES, [CHECK])],
         hosts={"127.0.0.1"},
-        secret=_KEY,
+        secret=secret,
         login=login,
         uploads=upload_limit(BODY_MAX),
     )
