@@ -219,6 +219,8 @@ class Unit:
     def _watch_flash(self, now: float) -> None:
         if self.on_operation is not None:
             before, self._begun = self._begun, self.operations_begun
+            # flasher's model does not count an operation that was torn.
+            self._first -= max(0, before - self._begun)
             for number in range(before + 1, self._begun + 1):
                 self.on_operation(number - self._first, now)
 

@@ -203,7 +203,7 @@ class _Draw:
             (4, lambda when: plans.BusOff(when=when, seconds=self._between(0.05, 10.0))),
             (8, self._tool),
             (6, lambda when: plans.Stall(when=when, seconds=self._between(0.05, 10.0))),
-            (3, lambda when: plans.Kill(when=when, again=self._between(0.1, 10.0))),
+            (3, self._kill),
             (1, lambda when: plans.Interrupt(when=when)),
             (4, self._load),
         ]
@@ -291,6 +291,10 @@ class _Draw:
 
     def _hang(self, when: When) -> plans.Clause:
         return plans.Hang(when=when, device=self._which(), seconds=self._between(0.1, 30.0))
+
+    def _kill(self, when: When) -> plans.Clause:
+        again = self._between(0.1, 10.0)
+        return plans.Kill(when=when, again=again, rescue=self._is(0.3))
 
     def _tool(self, when: When) -> plans.Clause:
         return plans.Tool(

@@ -347,6 +347,8 @@ class Kill(Clause):
 
     NAME = "kill"
     again: float = 1.0
+    rescue: bool = False
+    """`flasher rescue` runs then instead, with an operator who follows its prompts."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -135,7 +135,7 @@ class Player:
         self._is_running = True
         self._is_interrupted = False
         self._has_operator = False
-        """Somebody follows the prompts."""
+        """Somebody follows the prompts of `flasher rescue`."""
         self._again_after_s = 0.0
         """Time from the kill of the host's process until the same command runs again."""
         self._phase = "idle"
@@ -267,8 +267,8 @@ class Player:
                 bus.bus_off(seconds)
             case plans.Stall(seconds=seconds) if link is not None:
                 link.stall(seconds)
-            case plans.Kill(again=again) if link is not None:
-                self._again_after_s = again
+            case plans.Kill(again=again, rescue=rescue) if link is not None:
+                self._again_after_s, self._has_operator = again, rescue
                 link.kill()
             case plans.Interrupt():
                 self._is_interrupted = True
@@ -351,7 +351,7 @@ class Player:
             began_at = self.clock.now()
             facts.begin_run(self._content(self.units[0]))
             # The history of this computer has a run without an end.
-            options = replace(self._options, in_session=runs > 1)
+            options = replace(self._options, in_session=runs > 1, at_power_up=self._has_operator)
             limit_s = overall_timeout_s(self.image_plan, options)
             claim = self._run(options, began_at + limit_s * OVERDUE_SHARE + OVERDUE_S)
             if claim is not None:
