@@ -290,7 +290,7 @@ class Line:
         if what.label and self._scans_labels and not socket.label:
             self._scan_virtual_label(socket, what.label, now)
         elif (is_new or was_silent) and socket.label and socket.binding is Binding.PROMPTED:
-            self._arrived_where_named(socket, what.label, now)
+            self._arrived_where_named(socket, what, now)
         elif (
             socket.awaits_label
             and not socket.is_chosen
@@ -320,11 +320,16 @@ class Line:
             socket.note = text("{reason} {remedy}", reason=why.reason, remedy=why.remedy)
             socket.note_until_s = now + NOTE_S
 
-    def _arrived_where_named(self, socket: Socket, virtual_label: str, now: float) -> None:
-        if not virtual_label and now < socket.bound_at_s + REACH_S:
+    def _arrived_where_named(self, socket: Socket, what: PresenceChanged, now: float) -> None:
+        virtual_label = what.label
+        in_reach_at_s = socket.bound_at_s + REACH_S
+        remedy = text("Scan it again with the card of its socket.")
+        if not virtual_label and now < in_reach_at_s:
             reason = text("A unit was already in socket {socket}.", socket=socket.name)
-            remedy = text("Scan it again with the card of its socket.")
             self._drop_label(socket, _dropped(reason, remedy))
+        elif now - what.unobserved_s < in_reach_at_s <= now:
+            reason = text("This computer stalled: the unit may have been exchanged meanwhile.")
+            self._drop_label(socket, Refused(codes.NOT_OBSERVED.name, reason, remedy))
         elif virtual_label and virtual_label != socket.label:
             reason = text(
                 "The unit in socket {socket} has the label {label}.",

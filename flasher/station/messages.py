@@ -176,6 +176,8 @@ class PresenceChanged:
     unit may have been put in."""
     is_in_bootloader: bool = False
     """Only bootloader announcements are received, no frames of an application."""
+    unobserved_s: float = 0.0
+    """The unit may have been in the socket for so long already: the process did not receive."""
     number: int = 0
     """Number of this change, counting up; always 0 for virtual units."""
 

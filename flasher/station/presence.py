@@ -234,6 +234,8 @@ class Presence:
         self._probed_at: float | None = None
         self._number = 0
         """Number of the last change."""
+        self._missed = (0.0, float("-inf"))
+        """Begin and end of the last unobserved time."""
         self.begin()
         self._requests = [each.request for each in self.watchers if each.request is not None]
 
@@ -275,6 +277,8 @@ class Presence:
         """Another unit may have been put in during unobserved time."""
         self._resumed_at = float("-inf")
         """End of the last unobserved time in which a unit could be exchanged."""
+        self._has_backlog = False
+        """Frames that were received, or wait, may have been sent in that time."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """Process a frame of an idle bus."""
@@ -283,15 +287,19 @@ class Presence:
             # The rest of an announcement that began earlier does not count.
             if watcher.received_at == now and watcher.has_sent_message:
                 self._received_at = now
+                self._has_backlog |= now - self._resumed_at <= BACKLOG_S
 
     def miss(self, missed_s: float, now: float) -> None:
         """Add unobserved time, up to now."""
         if missed_s > PAUSE_S:
-            self._resumed_at = now
+            self._resumed_at, self._has_backlog = now, True
+            self._missed = (now - missed_s, now)
         for watcher in self.watchers:
             watcher.miss(missed_s)
         if self._received_at is not None:
             self._received_at += missed_s
+        if self._began_at is not None:
+            self._began_at += missed_s
 
     def probe(self, now: float) -> list[Frame]:
         """Frames to send now: a version request to each target that has one, when due."""
@@ -310,8 +318,9 @@ class Presence:
             self._began_at = now
         is_present = self._received_at is not None and now - self._received_at < SILENCE_S
         in_bootloader = is_present and self._is_in_bootloader(now)
-        if now - self._resumed_at <= BACKLOG_S:
+        if self._has_backlog:
             self._was_missed |= in_bootloader
+            self._has_backlog = False
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not is_present:
             return None
@@ -329,7 +338,7 @@ class Presence:
         is_other = None not in (self._reported_serial, serial) and self._reported_serial != serial
         if self.is_there and (is_power_up or is_other or not is_present):
             self.exchanged_number = self._number
-        if was_missed:
+        if was_missed or self._was_missed:  # a run may begin before the next call
             self.missed_number = self._number
         self.is_there, self._reported_in_bootloader = is_present, in_bootloader
         self._reported_power_ups = self._power_ups
@@ -337,8 +346,10 @@ class Presence:
             self._forget_unit()
             return PresenceChanged(is_there=False, number=self._number)
         self._reported_serial = serial
+        missed_since, missed_until = self._missed
         return PresenceChanged(
             is_there=True,
+            unobserved_s=now - missed_since if now - missed_until <= SILENCE_S else 0.0,
             how="boot version" if is_power_up or in_bootloader else "traffic",
             serial=serial,
             is_power_up=is_power_up,

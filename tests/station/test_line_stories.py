@@ -448,6 +448,22 @@ def test_a_label_whose_card_was_forgotten_is_not_taken_for_one_that_was_scanned_
     assert played.text == ""
 
 
+def test_a_unit_that_came_in_a_stall_is_not_the_one_of_the_card_before() -> None:
+    """The run begins in the moment in which the arrival of the other unit is read, 2.1 s late."""
+    played = told(
+        "line sockets=1 recipe=plain ; unit label=1 number=maker ; unit label=2 number=own"
+        " pace=slow ; person name=jo source=jo ; person name=al ;"
+        " @22.676289 put unit=2 socket=A ; @27.084739 label by=al unit=2 ;"
+        " @29.332889 pull unit=2 ; @29.582889 put unit=1 socket=A ;"
+        " @32.743273 dip socket=A seconds=0.05 ; @34.748137 label by=al unit=1 ;"
+        " @34.815496 pull unit=1 ; @38.315496 put unit=1 socket=A ;"
+        " @43.060074 label by=jo unit=1 ; @43.530433 stall socket=A seconds=4.0 ;"
+        " @45.0 card by=al unit=1 ; @45.1 pull unit=1 ; @45.4 put unit=2 socket=A ;"
+        " @45.5 label by=al unit=1 ; @50.0 look"
+    )
+    assert played.text == ""
+
+
 def test_what_cannot_be_saved_is_never_green_and_the_line_goes_on() -> None:
     played = told(
         "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"

@@ -25,7 +25,7 @@ from flasher.station.events import (
     UnitRemoved,
     WorkerFailed,
 )
-from flasher.station.line import READ_S
+from flasher.station.line import IDENTIFY_S, REACH_S, READ_S
 from flasher.station.messages import (
     Abort,
     AdapterDown,
@@ -250,6 +250,23 @@ def test_a_unit_that_was_there_before_its_socket_was_named_is_not_begun(line: Li
     line.say("A", PresenceChanged(is_there=True, how="traffic", serial=""))
     assert line.last(ScanRefused).code == "FORGOTTEN"
     assert line.of(RunStarted) == []
+
+
+@pytest.mark.parametrize(
+    ("unobserved_s", "refusals"),
+    [(0.0, []), (0.9, []), (1.1, ["NOT_OBSERVED"]), (4.0, ["NOT_OBSERVED"])],
+)
+def test_a_unit_that_came_unobserved_may_have_been_there_before_its_socket_was_named(
+    line: LineBench, unobserved_s: float, refusals: list[str]
+) -> None:
+    line.scan(SERIAL)
+    line.bench.clock.go_on(REACH_S + 1.0)
+    came = PresenceChanged(is_there=True, how="traffic", serial="", unobserved_s=unobserved_s)
+    line.say("A", came)
+    assert [each.code for each in line.of(ScanRefused)] == refusals
+    line.bench.clock.go_on(IDENTIFY_S)
+    line.turn()
+    assert len(line.of(RunStarted)) == (not refusals)
 
 
 def test_who_does_not_say_who_it_is_needs_the_card_of_its_socket(line: LineBench) -> None:
