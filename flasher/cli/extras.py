@@ -10,6 +10,7 @@ from typing import Final
 from flasher.errors import ErrorCode, UsageError
 
 _PACKAGES: Final = {
+    "cluster": ("distributed",),
     "mf4": ("asammdf",),
     "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("itsdangerous", "pygal", "starlette", "uvicorn"),

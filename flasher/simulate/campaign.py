@@ -14,9 +14,10 @@ import platform
 import random
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import islice
 from math import log2
 from pathlib import Path
 from typing import Final, TypeVar
@@ -55,7 +56,7 @@ class Batch:
     """Name of a planted mistake."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Found:
     """Violation, and the plan that shows it."""
 
@@ -126,7 +127,7 @@ class Result:
         """Raises ValueError for results of different campaigns."""
         if self.campaign != other.campaign:
             raise ValueError(f"results of two campaigns: {self.campaign} and {other.campaign}")
-        violations = sorted({*self.violations, *other.violations}, key=lambda each: each.seed)
+        violations = sorted({*self.violations, *other.violations})
         names = self.tallies.keys() | other.tallies.keys()
         return Result(
             campaign=self.campaign,
@@ -188,6 +189,11 @@ def batches(first: int, runs: int, count: int) -> Iterator[Batch]:
         part_end = min(start + CANARY_EVERY, end)
         for begin in range(start, part_end, count):
             yield Batch(key, begin, min(count, part_end - begin))
+
+
+def share(batches: Iterable[Batch], number: int, count: int) -> Iterator[Batch]:
+    """Yield the batches of shard `number` (from 1 on) of `count`: every count-th one."""
+    return islice(batches, number - 1, None, count)
 
 
 def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
@@ -272,7 +278,7 @@ class _Sums:
                 for name, counts in sorted(self._tallies.items())
             },
             reached=frozenset(self.reached - {""}),
-            violations=tuple(self._found[:VIOLATIONS_MAX]),
+            violations=tuple(sorted(set(self._found))[:VIOLATIONS_MAX]),
             violation_count=len(self._found),
             excused=self._excused,
             canaries_found=_sorted(self._canaries[True]),

@@ -46,6 +46,13 @@ def test_the_violations_of_the_lowest_seeds_are_kept_and_all_are_counted() -> No
     assert forth.violation_count == 30
 
 
+def test_violations_of_one_seed_have_an_order_in_every_process() -> None:
+    kinds = [f"KIND {number}" for number in range(15)]
+    found = tuple(Found(1, kind, "text", "plan") for kind in reversed(kinds))
+    result = Result("key", violations=found) + Result("key")
+    assert [each.kind for each in result.violations] == sorted(kinds)
+
+
 def test_results_of_two_campaigns_are_not_added() -> None:
     with pytest.raises(ValueError, match="two campaigns: one and other"):
         Result("one") + Result("other")

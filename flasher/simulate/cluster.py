@@ -1,0 +1,225 @@
+"""Runs batches on a Dask cluster. Needs the extra `cluster`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import platform
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from typing import Final
+
+from distributed import Client, Future, KilledWorker, Scheduler, Worker, WorkerPlugin, as_completed
+from distributed.core import Status
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.simulate.campaign import Batch, Result, campaign_key, run_batch
+from flasher.simulate.workers import BATCH_S, OnResult, Pace, RunBatch, run_alone
+
+ALLOWED_FAILURES: Final = 20
+"""Workers that may die with a batch before it runs alone."""
+_FEW_CORES: Final = 50
+_LONG_BATCH_S: Final = 15.0
+"""For more cores: the scheduler handles some hundred batches a second."""
+_WINDOW: Final = 3
+"""Batches in the cluster for each worker."""
+_CONNECT_S: Final = 10.0
+_WORKER_S: Final = 60.0
+"""Time in which the first worker has to be there."""
+_GATHER_S: Final = 10.0
+_POLL_S: Final = 0.05
+_PLUGIN: Final = "flasher-same-code"
+
+_log: Final = logging.getLogger("flasher.simulate")
+_one_at_a_time: Final = threading.Lock()
+"""A worker may have several threads, but runs share the tables of their process."""
+
+
+class SameCode(WorkerPlugin):
+    """Closes a worker that joins with other code or another Python."""
+
+    name = _PLUGIN
+
+    def __init__(self) -> None:
+        self.campaign, self.python = campaign_key(), platform.python_version()
+
+    async def setup(self, worker: Worker) -> None:
+        if self.campaign != campaign_key():
+            why = _other_code(worker.address, campaign_key(), platform.python_version(), self)
+            _log.error("%s", why.what)
+            # After an exception the worker would take batches all the same; it cannot close until
+            # it is registered, and takes none while it is paused.
+            worker.status = Status.paused
+            self._closing = asyncio.create_task(worker.close(reason=why.what))
+
+
+def run_on_cluster(
+    address: str,
+    batches: Iterable[Batch],
+    *,
+    on_result: OnResult,
+    is_stopped: Callable[[], bool],
+    run_one: RunBatch = run_batch,
+) -> None:
+    """Run batches, cut by time, on the workers of the scheduler at `address`; report each result
+    as it comes. Once stopped, the results of batches that are not done are lost.
+
+    Raises UsageError without a scheduler or a worker, and for workers of other code or Python.
+    """
+    with _connected(address) as client:
+        todo = _Todo(client, batches, run_one)
+        try:
+            while not is_stopped() and todo.submit():
+                ended = todo.ended()
+                for batch, result in ended:
+                    on_result(batch, result)
+                if not ended:
+                    time.sleep(_POLL_S)
+        finally:
+            todo.cancel()
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Client]:
+    shown = printable(address)
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"No scheduler of a Dask cluster answers at {shown}.",
+            cause=printable(str(error)),
+            remedy="Start one with `dask scheduler`; it prints its address.",
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKER_S)
+        except TimeoutError as error:
+            raise UsageError(
+                f"The Dask cluster at {shown} has no worker.",
+                remedy=f"Start one for each core: `dask worker {shown} --nthreads 1`.",
+            ) from error
+        _check_code(client)
+        client.register_plugin(SameCode())
+        allowed = client.run_on_scheduler(_allow_failures(ALLOWED_FAILURES))
+        try:
+            yield client
+        finally:
+            if client.status == "running":
+                client.run_on_scheduler(_allow_failures(allowed))
+                client.unregister_worker_plugin(_PLUGIN)
+
+
+def _allow_failures(limit: int) -> Callable[[Scheduler], int]:
+    """Return a function that sets the limit on the scheduler. It is nested, so that Dask sends its
+    code: the scheduler needs no flasher.
+    """
+
+    def set_limit(dask_scheduler: Scheduler) -> int:
+        before: int = dask_scheduler.allowed_failures
+        dask_scheduler.allowed_failures = limit
+        return before
+
+    return set_limit
+
+
+def _check_code(client: Client) -> None:
+    """Raise UsageError if a worker has no flasher, or another one."""
+    own = SameCode()
+    pythons = client.run(platform.python_version, on_error="return")
+    for worker, campaign in client.run(campaign_key, on_error="return").items():
+        if campaign != own.campaign:
+            raise _other_code(worker, campaign, pythons.get(worker), own)
+
+
+def _other_code(worker: str, campaign: object, python: object, own: SameCode) -> UsageError:
+    its = "no flasher" if isinstance(campaign, Exception) else f"flasher {campaign}"
+    return UsageError(
+        f"The worker {printable(worker)} has {printable(str(its))} on Python {python}; this "
+        f"campaign has flasher {own.campaign} on Python {own.python}.",
+        cause="flasher or Python was changed, or the worker was started before",
+        remedy="Install the same checkout and Python on each worker, then start the workers again.",
+    )
+
+
+def _play(run_one: RunBatch, batch: Batch) -> Result:
+    with _one_at_a_time:
+        return run_one(batch, lambda: False)
+
+
+def _play_alone(run_one: RunBatch, batch: Batch) -> Result:
+    with _one_at_a_time:
+        return run_alone(batch, run_one=run_one)
+
+
+def _lost(cause: str) -> UsageError:
+    return UsageError(
+        "The Dask cluster lost a batch.",
+        cause=cause,
+        remedy="Mend and start the cluster, then run again with the same --ledger.",
+    )
+
+
+class _Todo:
+    """Batches that are left, and those that the cluster has."""
+
+    def __init__(self, client: Client, batches: Iterable[Batch], run_one: RunBatch) -> None:
+        self._client = client
+        self._run_one = run_one
+        self._pace = Pace()
+        self._parts = self._pace.cut(batches)
+        self._window = 1
+        self._running: dict[object, tuple[Future, Batch]] = {}
+        # Not `with_results`: it never yields a batch whose result got lost, and that then failed.
+        self._completed = as_completed(loop=client.loop)
+
+    def submit(self) -> bool:
+        """Fill the window; False when all is done."""
+        if len(self._running) < self._window:
+            workers = len(self._client.nthreads())
+            self._window = _WINDOW * max(1, workers)
+            self._pace.aimed_s = BATCH_S if workers <= _FEW_CORES else _LONG_BATCH_S
+        while len(self._running) < self._window:
+            batch = next(self._parts, None)
+            if batch is None:
+                break
+            self._submit(_play, batch)
+        return bool(self._running)
+
+    def _submit(self, play: Callable[[RunBatch, Batch], Result], batch: Batch) -> None:
+        key = (play.__name__, batch.campaign, batch.canary, batch.first, batch.count)
+        future = self._client.submit(play, self._run_one, batch, key=key)
+        self._running[future.key] = future, batch
+        self._completed.add(future)
+
+    def ended(self) -> list[tuple[Batch, Result]]:
+        """Return the results that have come since; batches whose workers died run alone."""
+        results = []
+        for future in self._completed.next_batch(block=False):
+            _, batch = self._running[future.key]
+            try:
+                if future.status in ("lost", "pending"):
+                    raise TimeoutError  # noqa: TRY301
+                result = future.result(timeout=_GATHER_S)
+            except TimeoutError:
+                # Its worker died before it gave the result, which another one now computes.
+                self._completed.add(future)
+                continue
+            except KilledWorker as error:
+                if future.key[0] == _play_alone.__name__:
+                    raise _lost("its workers died of something else than a batch") from error
+                self._submit(_play_alone, batch)
+            except CancelledError as error:
+                raise _lost("its scheduler ended or was restarted") from error
+            else:
+                self._pace.add(result)
+                results.append((batch, result))
+            del self._running[future.key]
+            future.release()
+        return results
+
+    def cancel(self) -> None:
+        self._client.cancel([future for future, _ in self._running.values()], force=True)
