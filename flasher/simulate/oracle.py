@@ -40,7 +40,8 @@ class Violation(NamedTuple):
     """Broken promise: FALSE (a success that is none), DISHONEST (a wrong statement about the
     device), OVERDUE (the run did not end), LATE (it ended after its deadline), UNDOCUMENTED (an
     exit code), FOREIGN (a frame to another device), REPEATED (a packet sent again after its ACK),
-    LOST (a device that the tool cannot bring back), CRASH; UNSEEN is none (`is_excused`).
+    LOST (a device that the tool cannot bring back), UNDETECTED (a damaged message was taken),
+    CRASH; UNSEEN is none (`is_excused`).
     """
 
     kind: str
