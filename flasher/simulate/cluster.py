@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Final
 
 from distributed import Client, Future, KilledWorker, Scheduler, Worker, WorkerPlugin, as_completed
@@ -34,7 +34,11 @@ _GATHER_S: Final = 10.0
 _POLL_S: Final = 0.05
 _PLUGIN: Final = "flasher-same-code"
 
+_SCHEDULER_ENDED: Final = "its scheduler ended or was restarted"
+
 _log: Final = logging.getLogger("flasher.simulate")
+# It warns of each worker that dies, on the terminal; what that means is handled here.
+logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
 _one_at_a_time: Final = threading.Lock()
 """A worker may have several threads, but runs share the tables of their process."""
 
@@ -73,14 +77,20 @@ def run_on_cluster(
     with _connected(address) as client:
         todo = _Todo(client, batches, run_one)
         try:
-            while not is_stopped() and todo.submit():
-                ended = todo.ended()
+            while not is_stopped():
+                try:
+                    are_left, ended = todo.submit(), todo.ended()
+                except OSError as error:
+                    raise _lost(_SCHEDULER_ENDED) from error
                 for batch, result in ended:
                     on_result(batch, result)
+                if not are_left:
+                    return
                 if not ended:
                     time.sleep(_POLL_S)
         finally:
-            todo.cancel()
+            with suppress(OSError):
+                todo.cancel()
 
 
 @contextmanager
@@ -108,9 +118,10 @@ def _connected(address: str) -> Iterator[Client]:
         try:
             yield client
         finally:
-            if client.status == "running":
-                client.run_on_scheduler(_allow_failures(allowed))
-                client.unregister_worker_plugin(_PLUGIN)
+            with suppress(OSError):
+                if client.status == "running":
+                    client.run_on_scheduler(_allow_failures(allowed))
+                    client.unregister_worker_plugin(_PLUGIN)
 
 
 def _allow_failures(limit: int) -> Callable[[Scheduler], int]:
@@ -213,7 +224,7 @@ class _Todo:
                     raise _lost("its workers died of something else than a batch") from error
                 self._submit(_play_alone, batch)
             except CancelledError as error:
-                raise _lost("its scheduler ended or was restarted") from error
+                raise _lost(_SCHEDULER_ENDED) from error
             else:
                 self._pace.add(result)
                 results.append((batch, result))

@@ -139,6 +139,25 @@ def test_a_worker_of_other_code_that_joins_is_closed() -> None:
         assert not client.nthreads()
 
 
+def test_a_cluster_that_ends_is_reported() -> None:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=100
+    ) as made:
+
+        def end(_batch: Batch, _result: Result) -> None:
+            made.close()
+
+        with pytest.raises(UsageError, match="lost a batch") as lost:
+            run_on_cluster(
+                made.scheduler_address,
+                without_canaries(1000, 1000),
+                on_result=end,
+                is_stopped=never,
+                run_one=run_slowly,
+            )
+    assert "--ledger" in lost.value.remedy
+
+
 def test_an_address_without_a_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clusters, "_CONNECT_S", 0.5)
     for address in ("127.0.0.1:1", "no address:x"):
