@@ -18,6 +18,7 @@ device is the one to be upgraded; a second one is its twin, which has the same C
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
@@ -29,9 +30,11 @@ from flasher.simulate.independent import Choices
 
 Sender = Literal["any", "host", "device"]
 _NUMBERED: Final = ("packet", "frame", "flash")
+_SECONDS: Final = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
 _WHEN: Final = re.compile(
-    r"@(?:(?P<at>\d+(?:\.\d+)?(?:e-?\d+)?)|(?P<what>packet|frame|flash|reset|update|end)(?P<number>\d*))"
-    r"(?:\+(?P<plus>\d+(?:\.\d+)?(?:e-?\d+)?))?"
+    rf"@(?:(?P<at>{_SECONDS})"
+    rf"|(?:(?P<counted>{'|'.join(_NUMBERED)})(?P<number>\d*)|(?P<what>reset|update|end))"
+    rf"(?:\+(?P<plus>{_SECONDS}))?)"
 )
 
 
@@ -52,11 +55,11 @@ class When:
     @classmethod
     def parse(cls, text: str) -> When:
         found = _WHEN.fullmatch(text)
-        if found is None:
+        seconds = float((found and (found["at"] or found["plus"])) or 0)
+        if found is None or not math.isfinite(seconds):
             raise ValueError(f"{text!r} is not a time of a plan")
-        if found["at"]:
-            return cls(plus_s=float(found["at"]))
-        return cls(found["what"], int(found["number"] or 0), float(found["plus"] or 0))
+        what = found["counted"] or found["what"] or ""
+        return cls(what, int(found["number"] or 0), seconds)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -449,11 +452,15 @@ def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
                 raise ValueError(f"{word!r}: it is one of {', '.join(get_args(hint))}")
             values[name] = text
         elif hint is bool:
-            values[name] = {"true": True, "false": False}[text]
+            if text not in ("true", "false"):
+                raise ValueError(f"{word!r}: it is true or false")
+            values[name] = text == "true"
         elif hint is int:
             values[name] = int(text, 0)
         elif hint is float:
             values[name] = float(text)
+            if not math.isfinite(values[name]):
+                raise ValueError(f"{word!r}: it is not finite")
         else:
             values[name] = text
     return values

@@ -34,6 +34,7 @@ MODULES: Final = {
     "recipe": "line",
     "station": "line",
     "scans": "line",
+    "plan": "plans",
     "trace-asc": "traces",
     "trace-blf": "traces",
     "trace-csv": "traces",

@@ -43,6 +43,11 @@ def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
         assert drawn(seed) == plan
 
 
+@each("line", ["@99999999999999999 drop", "@0.0000000001 drop", "@packet3+1e20 drop"])
+def test_long_and_short_times_are_read_as_they_are_printed(line: str) -> None:
+    assert Plan.parse(str(Plan.parse(line))) == Plan.parse(line)
+
+
 @each(
     "line",
     [
@@ -53,6 +58,12 @@ def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
         "independent erase=soon",
         "@packet3 tool does=sing",
         "mock nonsense=1",
+        "job others=yes",
+        "load every=nan",
+        "adapter lost=inf",
+        "@reset5 drop",
+        "@1.5+3 drop",
+        "@1e400 drop",
     ],
 )
 def test_what_is_no_plan_is_refused(line: str) -> None:
