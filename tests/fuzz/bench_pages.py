@@ -112,6 +112,7 @@ def take_request(data: bytes) -> None:
 
 
 def _requests() -> Iterator[bytes]:
+    upload = f"POST {UPLOAD}?name=".encode()
     for path in ("/", "/bench/events", "/bench/sheet", "/bench/sheet?save", *KEPT):
         yield f"GET {path}".encode()
     yield b"GET /kept?serial=W1&lang=de"
@@ -125,13 +126,14 @@ def _requests() -> Iterator[bytes]:
         field = "path" if word == "folder" else "name"
         yield b"POST /bench/order\n\n" + json.dumps({"order": word, field: name}).encode()
     yield b'POST /bench/order\n\n{"order": "stop"}'
+    yield b"GET /kept/story?trace=" + browser.MARK + b">"
+    yield upload + browser.MARK + b">.hex\n\n:00"
     # These broke it.
     yield b"POST /bench/order\n\n" + b"[" * 2000
     yield b'POST /bench/order\n\n{"order": "adapter", "name": []}'
     yield b'POST /bench/order\n\n{"order": "image", "name": 3}'
     yield b'POST /bench/order\n\n{"order": "folder", "path": "~no_such_user"}'
     yield b'POST /bench/order\n\n{"order": "folder", "path": "' + b"a" * 1000 + b'"}'
-    upload = f"POST {UPLOAD}?name=".encode()
     yield upload + b"x.hex\n\n:00000001FF\n"
     yield upload + b"x.bin\n\n" + bytes(range(64))
     yield upload + b"x.bin.toml\n\n" + b"format = 1\n"

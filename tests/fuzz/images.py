@@ -21,7 +21,7 @@ from tests.fuzz.harness import Choices, Harness, own_words, written
 from tests.hostile.files import SAMPLES
 from tests.protocol.cases import feed_all, make_reassembler, messages_of
 
-_PLANNED_MAX: Final = 4096
+_PLANNED_MAX: Final = 600
 """Bytes of an image whose packets are checked: gaps are filled, to many times an input's size."""
 _RAW: Final = 1 << 7
 """Flag of an input: the file is all that follows."""

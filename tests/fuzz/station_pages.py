@@ -132,6 +132,13 @@ def _requests() -> Iterator[bytes]:
     yield f"POST {SIGN_INS}/end\n\ntoken={browser.TOKEN}&number=1".encode()
     yield f"POST {SIGN_INS}/end\n\ntoken={browser.TOKEN}&all=1".encode()
     yield f"POST {CHECK}\n\nflasher record 1\n".encode()
+    for path in (
+        "/runs?search=",
+        "/images?image=",
+        "/audit?event=",
+        "/units?serial=W2605002&lang=",
+    ):
+        yield f"GET {path}".encode() + browser.MARK + b">"
     # These broke it.
     yield f"POST {LINE}/scan\n\n".encode() + b"[" * 2000
     yield b"GET /yield?to=0001-01-05"
