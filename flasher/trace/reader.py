@@ -10,16 +10,15 @@ merged into the file is read too.
 
 from __future__ import annotations
 
-import gc
 import gzip
 import math
 import os
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager, redirect_stderr
+from contextlib import closing, contextmanager
 from functools import partial
-from io import BufferedIOBase, BytesIO, StringIO
+from io import BufferedIOBase
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final, TextIO, cast
@@ -28,10 +27,12 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.files import opened
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.text import printable
-from flasher.python_can import can, load_mf4
+from flasher.python_can import can
 from flasher.trace.blf import UnpackedBlf
 from flasher.trace.bounds import FILE_MAX_SIZE, BoundedLines, Bounds, UnfitError, check_unpacked
+from flasher.trace.mf4 import frames_of_measurement
 from flasher.trace.pcapng import frames_of_capture
+from flasher.trace.recorder import DATA_MAX, frame_of, is_classic
 
 _FRAMES: Final = "SELECT ts, arbitration_id, extended, remote, error, data FROM messages"
 _IS_TABLE: Final = (
@@ -52,7 +53,6 @@ _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
 _PIECE_SIZE: Final = 65_536
 _TIME_MAX_S: Final = 1e11
 """About the year 5000. No clock gives a later time, or its negative."""
-_DATA_MAX: Final = 8
 _LINE_READERS: Final = {
     ".asc": can.ASCReader,
     ".csv": can.CSVReader,
@@ -127,7 +127,8 @@ def _frames(
         whole = source.read(_WHOLE_MAX_SIZE + 1)
         if len(whole) > _WHOLE_MAX_SIZE:
             raise UnfitError(f"it has more than {_WHOLE_MAX_SIZE:,} bytes")
-        reader = _mf4_reader(whole)
+        yield from frames_of_measurement(whole)
+        return
     else:
         reader = _LINE_READERS[suffix](
             cast(
@@ -135,26 +136,8 @@ def _frames(
                 BoundedLines(source, None if isinstance(source, gzip.GzipFile) else size, bounds),
             )
         )
-    for message in reader:
-        # Not every format marks CAN FD; no other frame has as many bytes.
-        if not message.is_fd and len(message.data) <= _DATA_MAX:
-            yield message.timestamp, _frame(message)
-
-
-def _mf4_reader(whole: bytes) -> can.MF4Reader:
-    """Open an .mf4 file. Raises UnfitError, and NotImplementedError without the package."""
-    load_mf4()
-    # After a failed open, asammdf prints on stderr when its objects are collected: that is done
-    # here, while stderr is redirected.
-    with redirect_stderr(StringIO()):
-        try:
-            return can.MF4Reader(BytesIO(whole))
-        except NotImplementedError:
-            raise
-        except Exception:  # noqa: BLE001  whatever it meets in a foreign file
-            reason = "it is not a measurement file of version 4, or it is cut off"
-        gc.collect()
-    raise UnfitError(reason)
+    for message in filter(is_classic, reader):
+        yield message.timestamp, frame_of(message)
 
 
 def _check(at_s: float, frame: Frame) -> None:
@@ -164,17 +147,6 @@ def _check(at_s: float, frame: Frame) -> None:
     is_long = frame.is_extended or frame.is_error
     if not 0 <= frame.can_id <= (EXTENDED_ID_MAX if is_long else STANDARD_ID_MAX):
         raise UnfitError(f"a frame has the id {frame.can_id:#x}")
-
-
-def _frame(message: can.Message) -> Frame:
-    return Frame(
-        message.arbitration_id,
-        bytes(message.data),
-        # An error frame has no id of its own; some formats give it the longer form.
-        message.is_extended_id and not message.is_error_frame,
-        message.is_remote_frame,
-        message.is_error_frame,
-    )
 
 
 # -- databases ------------------------------------------------------------------------------------
@@ -202,7 +174,7 @@ def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[fl
             )
             if not all(kinds):
                 raise UnfitError("a row lacks its time, its id or its data")
-            if len(data) <= _DATA_MAX:  # the table does not mark CAN FD
+            if len(data) <= DATA_MAX:  # the table does not mark CAN FD
                 yield (
                     float(at_s),
                     Frame(can_id, data, bool(extended) and not error, bool(remote), bool(error)),

@@ -23,6 +23,8 @@ _CANDUMP_ERROR: Final = 0x2000_0080
 _INTERFACE_MAX: Final = 15
 """Maximum length of a Linux interface name: can-utils have no room for more."""
 _NOT_IN_NAME: Final = re.compile(r"[^A-Za-z0-9.:_-]")
+DATA_MAX: Final = 8
+"""Bytes of a CAN frame that is not CAN FD."""
 _COMMIT_FRAMES: Final = 500
 """Maximum number of frames that are lost when the process is killed."""
 ONE_TOOL_CHANNEL: Final = "conformance"
@@ -41,6 +43,23 @@ def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0)
         is_rx=not sent,
         channel=channel,
     )
+
+
+def frame_of(message: can.Message) -> Frame:
+    """Convert a python-can message to a frame."""
+    return Frame(
+        message.arbitration_id,
+        bytes(message.data),
+        # An error frame has no id of its own; some formats give it the longer form.
+        message.is_extended_id and not message.is_error_frame,
+        message.is_remote_frame,
+        message.is_error_frame,
+    )
+
+
+def is_classic(message: can.Message) -> bool:
+    """True unless it is CAN FD, which not every format marks: only CAN FD has more bytes."""
+    return not message.is_fd and len(message.data) <= DATA_MAX
 
 
 class Writer(Protocol):

@@ -211,7 +211,15 @@ def test_a_recording_that_grows_faster_than_it_is_read_has_an_end(tmp_path: Path
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_measurement_file_that_ends_the_process_of_its_library_is_refused() -> None:
+    """Fuzzing found it: asammdf ends with a segmentation fault."""
+    pytest.importorskip("asammdf", reason="needs the extra mf4")
+    with pytest.raises(UsageError) as caught:
+        list(read_trace(Path(__file__).parent / "damaged.mf4"))
+    assert "it is damaged" in caught.value.cause
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("data", [b"", b"MDF     4.10", b"MDF     4.10    " + bytes(200)])
 def test_an_invalid_measurement_file_is_refused_with_its_cause(tmp_path: Path, data: bytes) -> None:
     pytest.importorskip("asammdf", reason="needs the extra mf4")
