@@ -170,7 +170,7 @@ def merge(name: str, folder: Path) -> str:
     shutil.copytree(seeds, merged)
     sources = [path for path in (own / "corpus", kept) if path.is_dir()]
     # Edges alone, not how often each was passed: a hundredth of the files.
-    options = ["-merge=1", "-use_counters=0", f"-max_len={find(name).max_size}"]
+    options = ["-set_cover_merge=1", "-use_counters=0", f"-max_len={find(name).max_size}"]
     done = _run(name, [*options, merged, *sources])
     if done.returncode:
         return f"{name}: {_cause(done.stdout)}"
@@ -212,15 +212,13 @@ def main() -> int:
             "atheris is not installed: it is in the extra `dev`, for Linux on x86-64 and Python up "
             "to 3.13"
         )
-    needs = {name: find(name).needs for name in names or MODULES}
-    wanted = [name for name, package in needs.items() if not package or find_spec(package)]
     folder = options.folder.resolve()
     work = merge if options.merge else partial(fuzz, seconds=options.seconds)
     if not options.merge:
         sys.stdout.write(HEAD)
     is_bad = False
     with ThreadPoolExecutor(options.jobs) as pool:
-        for done in pool.map(lambda name: work(name, folder), wanted):
+        for done in pool.map(lambda name: work(name, folder), names or MODULES):
             sys.stdout.write(f"{done}\n")
             sys.stdout.flush()
             if isinstance(done, Outcome) and (done.failure or done.findings):

@@ -41,7 +41,6 @@ MODULES: Final = {
     "trace-db": "traces",
     "trace-gz": "traces",
     "trace-log": "traces",
-    "trace-mf4": "traces",
     "trace-pcap": "traces",
     "trace-pcapng": "traces",
     "trace-trc": "traces",
@@ -69,8 +68,6 @@ class Harness:
     max_size: int = 4096
     words: Callable[[], Iterable[str | bytes]] = tuple
     """What the format is made of, for the fuzzer's dictionary."""
-    needs: str = ""
-    """A package that may be missing."""
 
     def take(self, data: bytes) -> None:
         """Run it on an input. Raises AssertionError beyond its limits, and any other error that the

@@ -20,5 +20,7 @@ with atheris.instrument_imports(include=_INSTRUMENTED):
     for seed in harness.seeds():  # what is imported by need is instrumented too
         harness.take(seed)
 
-atheris.Setup([sys.argv[0], *options], harness.take)
+# libFuzzer merges in processes of its own, which it starts by the first word.
+again = f"{sys.executable} -m tests.fuzz.instrumented {name}"
+atheris.Setup([again, *options], harness.take)
 atheris.Fuzz()

@@ -15,20 +15,13 @@ from sqlalchemy.exc import ArgumentError
 from tests.fuzz import __main__ as command
 from tests.fuzz.harness import CORPUS, MODULES, Harness, find
 
-_SLOW: Final = frozenset({"story", "trace-mf4", "station-pages", "certificate", "bench-pages"})
+_SLOW: Final = frozenset({"story", "station-pages", "certificate", "bench-pages"})
 """Harnesses that take their corpus in more than 0.3 s."""
 _CORPUS_MAX: Final = 200_000
 NAMES: Final = [
     pytest.param(name, marks=pytest.mark.slow if name in _SLOW else ()) for name in MODULES
 ]
 ONE_OF_EACH: Final = {module: name for name, module in reversed(MODULES.items())}
-
-
-def harness_of(name: str) -> Harness:
-    harness = find(name)
-    if harness.needs:
-        pytest.importorskip(harness.needs, reason=f"needs {harness.needs}")
-    return harness
 
 
 def take_all(harness: Harness, inputs: Iterable[bytes]) -> None:
@@ -41,13 +34,13 @@ def take_all(harness: Harness, inputs: Iterable[bytes]) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_harness_takes_its_corpus(name: str) -> None:
-    harness = harness_of(name)
+    harness = find(name)
     take_all(harness, harness.corpus(name))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_harness_has_a_seed_that_is_not_refused(name: str) -> None:
-    harness = harness_of(name)
+    harness = find(name)
     for seed in harness.seeds():
         try:
             harness.run(seed)
@@ -62,7 +55,7 @@ def test_a_harness_reports_a_fault_of_flasher(name: str, monkeypatch: pytest.Mon
     def fail(*_: object, **__: object) -> NoReturn:
         raise ValueError("planted")
 
-    harness = harness_of(name)
+    harness = find(name)
     seeds = list(harness.seeds())
     harness.take(seeds[0])  # what is made once is made before
     monkeypatch.setattr(harness.below, fail)
@@ -93,7 +86,7 @@ def test_a_harness_reports_a_fault_of_flasher(name: str, monkeypatch: pytest.Mon
 def test_a_harness_reports_what_does_not_hold(
     name: str, function: str, wrong: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    harness = harness_of(name)
+    harness = find(name)
     seeds = list(harness.seeds())
     monkeypatch.setattr(function, wrong)
     with pytest.raises(AssertionError):

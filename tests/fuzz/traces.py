@@ -1,4 +1,4 @@
-"""Harnesses of trace files, one for each format."""
+"""Harnesses of trace files, one for each format but .mf4: another process reads that, in C."""
 
 from __future__ import annotations
 
@@ -87,7 +87,6 @@ def _trace(
     seeds: Callable[[], Iterator[bytes]] | None = None,
     *,
     max_size: int = 4096,
-    needs: str = "",
 ) -> Harness:
     return Harness(
         partial(take_trace, suffix),
@@ -95,7 +94,6 @@ def _trace(
         "flasher.trace.reader.Bounds",
         (UsageError,),
         max_size,
-        needs=needs,
     )
 
 
@@ -105,7 +103,6 @@ HARNESSES: Final = {
     "trace-csv": _trace(".csv"),
     "trace-db": _trace(".db", max_size=16_384),
     "trace-log": _trace(".log"),
-    "trace-mf4": _trace(".mf4", max_size=32_768, needs="asammdf"),
     "trace-pcap": _trace(".pcap", _pcap),
     "trace-pcapng": _trace(".pcapng"),
     "trace-trc": _trace(".trc"),
