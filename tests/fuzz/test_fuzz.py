@@ -15,7 +15,7 @@ from sqlalchemy.exc import ArgumentError
 from tests.fuzz import __main__ as command
 from tests.fuzz.harness import CORPUS, MODULES, Harness, find
 
-_SLOW: Final = frozenset({"story", "station-pages", "certificate", "bench-pages"})
+_SLOW: Final = frozenset({"recipe", "story", "station-pages", "certificate", "bench-pages"})
 """Harnesses that take their corpus in more than 0.3 s."""
 _CORPUS_MAX: Final = 200_000
 NAMES: Final = [
