@@ -86,6 +86,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "conformance": CommandEntry(
             "bench.conformance:conformance", "test a bootloader against the protocol, case by case"
         ),
+        "simulate": CommandEntry(
+            "bench.simulate:simulate", "upgrade simulated devices with random faults, from seeds"
+        ),
     },
     "at the end of a production line": {
         "station": CommandEntry(

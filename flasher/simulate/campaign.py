@@ -109,7 +109,8 @@ class Result:
     endings: Mapping[str, int] = field(default_factory=dict)
     tallies: Mapping[str, Tally] = field(default_factory=dict)
     """By the name of a clause that a plan contains; `NO_FAULT` for plans without a fault."""
-    reached: frozenset[str] = frozenset()
+    reached: tuple[str, ...] = ()
+    """Sorted."""
     violations: tuple[Found, ...] = ()
     violation_count: int = 0
     excused: int = 0
@@ -137,7 +138,7 @@ class Result:
                 name: self.tallies.get(name, Tally()) + other.tallies.get(name, Tally())
                 for name in sorted(names)
             },
-            reached=self.reached | other.reached,
+            reached=tuple(sorted({*self.reached, *other.reached})),
             violations=tuple(violations[:VIOLATIONS_MAX]),
             violation_count=self.violation_count + other.violation_count,
             excused=self.excused + other.excused,
@@ -152,7 +153,7 @@ class Result:
     @property
     def never_reached(self) -> list[str]:
         """Places that no run reached, without those that none can reach."""
-        return sorted(places() - self.reached - UNREACHABLE.keys())
+        return sorted(places() - {*self.reached} - UNREACHABLE.keys())
 
     @property
     def is_blind(self) -> bool:
@@ -277,7 +278,7 @@ class _Sums:
                 name: Tally(**counts, times=_sorted(self._times[name]))
                 for name, counts in sorted(self._tallies.items())
             },
-            reached=frozenset(self.reached - {""}),
+            reached=tuple(sorted(self.reached - {""})),
             violations=tuple(sorted(set(self._found))[:VIOLATIONS_MAX]),
             violation_count=len(self._found),
             excused=self._excused,

@@ -1,0 +1,119 @@
+"""Plants mistakes in host, driver, bus, image and device model, and has simulated upgrades find
+each of them: `python -m tests.campaigns.simulated_bugs`, or with the names of some.
+
+The mistakes are those of `flasher/simulate/planted_bugs.toml`. With each, plans are drawn and
+played until one ends in a violation that it does not show without the mistake, for at most
+`--seconds` of computing time; that plan is shrunk. Prints what was found how, and after how long;
+fails when a mistake is not found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from flasher.simulate import plan as plans
+from flasher.simulate.draw import drawn
+from flasher.simulate.planting import UpgradeBug, swapped, upgrade_bugs
+from flasher.simulate.play import play
+from flasher.simulate.shrink import shows, shrink
+
+LIMIT_S: Final = 10.0
+
+
+@dataclass(frozen=True)
+class Hunted:
+    """What came of a mistake."""
+
+    bug: UpgradeBug
+    violation: str
+    """Empty when none was found."""
+    seconds: float
+    """Computing time until it was found, without the shrinking."""
+    runs: int
+    plan: str
+    faults: int
+
+    def lines(self) -> Iterator[str]:
+        kind = self.violation.partition(":")[0] or "NOT FOUND"
+        head = f"{self.bug.name:44} {self.bug.part:10} {kind:12} {self.seconds:5.1f} s"
+        yield f"{head} {self.runs:5} runs {self.faults:2} faults"
+        if self.violation:
+            yield f"    {self.violation}"
+            yield f"    {self.plan}"
+        else:
+            yield f"    {self.bug.breaks}"
+
+
+def hunt(bug: UpgradeBug, seed: int, limit_s: float, *, shrinks: bool) -> Hunted:
+    """Draw plans with a mistake. What is found counts only if the code without it is right."""
+    codes = bug.codes()
+    runs = 0
+    began_s = time.process_time()
+
+    def is_bad(plan: plans.Plan, kind: str) -> bool:
+        if not shows(plan, kind):
+            return False
+        with swapped(codes):
+            return not play(plan).violations
+
+    with swapped(codes):
+        while (took_s := time.process_time() - began_s) < limit_s:
+            plan = drawn(seed)
+            seed, runs = seed + 1, runs + 1
+            for violation in play(plan).violations:
+                if violation.is_excused or not is_bad(plan, violation.kind):
+                    continue
+                took_s = time.process_time() - began_s
+                if shrinks:
+                    plan = shrink(plan, violation.kind, is_bad=is_bad)
+                text = str(next(e for e in play(plan).violations if e.kind == violation.kind))
+                return Hunted(bug, text, took_s, runs, str(plan), len([*plan.events]))
+    return Hunted(bug, "", took_s, runs, "", 0)
+
+
+def say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bugs", nargs="*", metavar="NAME", help="how names begin; all by default")
+    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
+    parser.add_argument("--seed", type=int, default=0, help="of the first plan")
+    parser.add_argument("--seconds", type=float, default=LIMIT_S, help="computing time for each")
+    parser.add_argument("--no-shrink", action="store_true")
+    chosen = parser.parse_args()
+    bugs = [bug for bug in upgrade_bugs() if bug.name.startswith(tuple(chosen.bugs) or "")]
+    if not bugs:
+        parser.error(f"no mistake has such a name: {', '.join(chosen.bugs)}")
+    found: list[Hunted] = []
+    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
+        search = partial(
+            hunt, seed=chosen.seed, limit_s=chosen.seconds, shrinks=not chosen.no_shrink
+        )
+        for future in as_completed([pool.submit(search, bug) for bug in bugs]):
+            found.append(future.result())
+            say("\n".join([*found[-1].lines(), ""]))
+    good = [each for each in found if each.violation]
+    say(f"{len(good)} of {len(bugs)} found")
+    if good:
+        seconds = statistics.median(each.seconds for each in good)
+        faults = statistics.median(each.faults for each in good)
+        say(f"medians: {seconds:.1f} s, {faults:g} faults")
+    return int(len(good) < len(bugs))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
