@@ -69,6 +69,8 @@ class _Device(_Node):
         self.on_event = on_event
         self.deadline: float | None = None
         """Deadline that the engine last asked for."""
+        self.has_changed = True
+        """It received or sent a frame since it was served."""
 
 
 class SimulatedBus:
@@ -100,6 +102,8 @@ class SimulatedBus:
         self._delivered_at: float | None = None
         """Time of a delivered frame to which devices answer: as exact as the wire, even if the
         clock woke late."""
+        self.is_awaited = False
+        """A host is waiting for a frame: nothing but the bus and its devices changes them."""
         self.faults = AdapterFaults()
         """Faults of the host's adapter: `unplug`, `bus_off` and `is_unacknowledged`."""
 
@@ -160,6 +164,9 @@ class SimulatedBus:
 
     def advance(self, limit: float) -> None:
         """Advance to the next event on the bus, at latest to `limit`."""
+        if not self.is_awaited:
+            for device in self._devices:
+                device.has_changed = True  # the caller may have changed its engine
         clock, faults = self.clock, self.faults
         now = clock.now()
         if faults.due_at <= now:
@@ -198,6 +205,9 @@ class SimulatedBus:
         """Call every engine that is due; each device queues one frame at a time."""
         anything_happened = False
         for device in self._devices:
+            if not device.has_changed and (device.deadline is None or device.deadline > now):
+                continue
+            device.has_changed = False
             engine = device.engine
             device.deadline = engine.deadline()
             if device.deadline is not None and device.deadline <= now:
@@ -214,6 +224,7 @@ class SimulatedBus:
         if anything_happened:
             for device in self._devices:
                 device.deadline = device.engine.deadline()
+                device.has_changed = True
 
     def _arbitrate(self) -> None:
         waiting = [node for node in self._nodes if node.outbox]
@@ -287,6 +298,7 @@ class SimulatedBus:
             for device in self._devices:
                 if device not in senders:
                     device.engine.receive(carried, ends_at)
+                    device.has_changed = True
             for host in self._hosts:
                 if host not in senders and self.faults.takes_part:
                     host.inbox.append(carried)
@@ -340,13 +352,17 @@ class SimulatedLink:
 
     def receive(self, deadline: float) -> Frame | None:
         """Advance the bus until a frame arrives or the deadline comes."""
-        inbox = self._host.inbox
+        bus, inbox = self._bus, self._host.inbox
         self._check_plugged("receiving")
-        while not inbox:
-            if self._bus.clock.now() >= deadline:
-                return None
-            self._bus.advance(deadline)
-            self._check_plugged("receiving")
+        try:
+            while not inbox:
+                if bus.clock.now() >= deadline:
+                    return None
+                bus.advance(deadline)
+                bus.is_awaited = True
+                self._check_plugged("receiving")
+        finally:
+            bus.is_awaited = False
         frame = inbox.popleft()
         self._health.count_frame(frame)
         return frame

@@ -260,6 +260,7 @@ class PlanBus(SimulatedBus):
         super().__init__(WELLING.bitrate_bps, clock)
         self.agenda = Agenda()
         self.attach(self.agenda)
+        (self._agenda_node,) = self._devices
         self.units: list[Unit] = []
         """Units that have been connected."""
         self.frame_faults: list[FrameFault] = []
@@ -304,8 +305,9 @@ class PlanBus(SimulatedBus):
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
         for device in self._devices:
-            if device not in senders and not frame.is_error:
+            if device not in senders and device is not self._agenda_node and not frame.is_error:
                 device.engine.receive(frame, now)
+                device.has_changed = True
         if self.faults.takes_part:
             for host in self._hosts:
                 if host not in senders:
@@ -433,7 +435,7 @@ class _Inbox(deque[Frame]):
 class PlanLink(SimulatedLink):
     """The host's adapter: returns its own frames as the plan has it, and pauses with its host."""
 
-    def __init__(self, bus: PlanBus, adapter: plans.Adapter, overdue_at: float = inf) -> None:
+    def __init__(self, bus: PlanBus, adapter: plans.Adapter, overdue_at: float) -> None:
         super().__init__(bus, adapter.queue)
         self.node = self._host
         self.node.inbox = self._inbox = _Inbox(bus.clock.now)
@@ -442,17 +444,21 @@ class PlanLink(SimulatedLink):
         self._echoes = Echoes()
         self._random = random.Random(adapter.seed)
         self._stalls_s = 0.0
-        self._is_killed = False
-        self._overdue_at = overdue_at
+        self._suffers = self._is_killed = self._is_overdue = False
         bus.host = self
+        bus.agenda.at(overdue_at, self._end)
 
     def stall(self, seconds: float) -> None:
         """Pause the host at its next call."""
         self._stalls_s += seconds
+        self._suffers = True
 
     def kill(self) -> None:
         """End the host's process at its next call."""
-        self._is_killed = True
+        self._is_killed = self._suffers = True
+
+    def _end(self, _now: float) -> None:
+        self._is_overdue = self._suffers = True
 
     def echo(self, frame: Frame, now: float) -> None:
         """Return a frame that has left."""
@@ -466,7 +472,7 @@ class PlanLink(SimulatedLink):
             else:
                 self._plan_bus.agenda.at(due_at, lambda _now: self._inbox.append(frame))
 
-    def _live(self) -> None:
+    def _suffer(self) -> None:
         clock = self._plan_bus.clock
         if self._is_killed:
             raise KilledError
@@ -474,22 +480,26 @@ class PlanLink(SimulatedLink):
             until, self._stalls_s = clock.now() + self._stalls_s, 0.0
             while clock.now() < until:
                 self._plan_bus.advance(until)
-        if clock.now() > self._overdue_at:
+        if self._is_overdue:
             raise OverdueError
+        self._suffers = False
 
     def send(self, frame: Frame) -> None:
-        self._live()
+        if self._suffers:
+            self._suffer()
         super().send(frame)
         self._echoes.sent(frame)
 
     def receive(self, deadline: float) -> Frame | None:
-        self._live()
+        if self._suffers:
+            self._suffer()
         frame = super().receive(deadline)
         if frame is None:
             return None
         return self._echoes.mark(frame, self._inbox.stamp_s, is_rx=True)
 
     def reopen(self) -> None:
-        self._live()
+        if self._suffers:
+            self._suffer()
         super().reopen()
         self._echoes.reopened()

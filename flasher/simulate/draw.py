@@ -93,10 +93,8 @@ class _Draw:
         return Plan((*clauses, *devices, *events))
 
     def _adapter(self) -> plans.Adapter:
-        kind = self._random.random()
-        if kind < 0.3:
-            return plans.Adapter(echoes=False)
         return plans.Adapter(
+            echoes=self._is(0.7),
             delay=self._between(1e-4, 0.3),
             jitter=self._between(1e-4, 0.02) if self._is(0.3) else 0.0,
             lost=round(self._random.uniform(0, 0.5), 3) if self._is(0.3) else 0.0,

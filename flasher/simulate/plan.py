@@ -106,7 +106,7 @@ class Adapter(Clause):
     """How the host's adapter returns its own frames, and how many it queues."""
 
     NAME = "adapter"
-    echoes: bool = True
+    echoes: bool = False
     delay: float = 0.0
     """Seconds from the end of a frame to its echo."""
     jitter: float = 0.0
