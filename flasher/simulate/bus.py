@@ -269,7 +269,7 @@ class PlanBus(SimulatedBus):
         self.is_garbled = False
         """The host's adapter has another bit rate: it receives error frames only."""
         self.heard: set[Any] = set()
-        """Engines that began a message alone that reached the tool; the player empties it. General
+        """Units and engines that began a message alone that reached the tool; the player empties it. General
         feedback does not count: an application sends it to all that is not for it.
         """
         self._watch = watch

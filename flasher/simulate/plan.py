@@ -22,6 +22,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
+from functools import cache
 from typing import Any, ClassVar, Final, Literal, get_args, get_origin, get_type_hints
 
 from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
@@ -438,9 +439,12 @@ def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
+_type_hints = cache(get_type_hints)
+
+
 def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
     """The fields that words of the form name=value give."""
-    hints = get_type_hints(kind)
+    hints = _type_hints(kind)
     values: dict[str, Any] = {}
     for word in words:
         name, _, text = word.partition("=")

@@ -171,7 +171,7 @@ class Player:
     def _join(self, number: int, device: plans.Independent | plans.Mock, now: float) -> None:
         unit = self.units[number]
         engine = unit.engine
-        self.bus.attach(unit)
+        self.bus.attach(unit if self._is_disturbed(number, device) else engine)
         self.bus.units.append(unit)
         if device.begins == "application" and device.application == "old" and device.when is None:
             if isinstance(engine, IndependentDevice):
@@ -181,6 +181,14 @@ class Player:
         if device.begins != "off":
             unit.power_on(now)
         self._update_acknowledgement()
+
+    def _is_disturbed(self, number: int, device: plans.Device) -> bool:
+        """True if more than the supply of a device fails."""
+        return bool(device.drift) or any(
+            (isinstance(each, plans.Answer | plans.Hang) and each.device == number)
+            or (each.when is not None and each.when.what == "flash")
+            for each in self.plan.clauses
+        )
 
     def _update_acknowledgement(self) -> None:
         has_units = any(unit.has_power for unit in self.units)
@@ -369,7 +377,7 @@ class Player:
                 at_end=content,
                 now=self._content(unit),
                 took_part=unit in self._at_update or unit.application != unit.before,
-                was_heard=unit in heard,
+                was_heard=not heard.isdisjoint((unit, unit.engine)),
                 was_at_update=unit in self._at_update,
             )
             for unit, content in zip(self.units, at_end, strict=True)
