@@ -23,10 +23,8 @@ INBOX_FRAMES: Final = 4096
 """Frames that an adapter's driver keeps for a computer that pauses."""
 ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=True)
 """Form error of the bus, as Linux reports it."""
-_COMMANDS: Final = {b"\x42\x05": "reset", b"\xa1\x0b": "update", b"\xa3\x85": "packet"} | {
-    b"\xa4\x01": "end"
-}
 _ROUNDING_S: Final = 1e-9
+_UPDATE: Final = b"\xa1\x0b"
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", b"\x55\x03"
 _NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
 
@@ -98,6 +96,8 @@ class Unit:
         self._rate = 1.0 + drift
         """Seconds of its clock in one second."""
         self._hangs_until = -inf
+        self._hung_s = 0.0
+        """Time for which its clock has stood still, or will until the end of the hang."""
         self._answers: list[plans.Answer] = []
         self._late: deque[tuple[float, list[Frame]]] = deque()
         """Messages in the place of others, with their times."""
@@ -132,7 +132,7 @@ class Unit:
     def power_cut(self, now: float) -> None:
         if self.engine.has_power:
             self.engine.power_cut(self._own_time(now))
-        self._hangs_until = -inf
+        self._end_hang(now)
         self._late.clear()
         self._under_way.clear()
         self._bytes_left = 0
@@ -141,12 +141,20 @@ class Unit:
         if not self.engine.has_power:
             self.engine.power_on(self._own_time(now))
 
-    def hang(self, until: float) -> None:
-        self._hangs_until = until
+    def hang(self, until: float, now: float) -> None:
+        """Stop its processor, and with it its clock."""
+        begins_at = max(now, self._hangs_until)
+        if until > begins_at:
+            self._hung_s += until - begins_at
+            self._hangs_until = until
 
-    def end_faults(self) -> None:
-        """Run on without a fault; a power supply that is off stays off."""
+    def _end_hang(self, now: float) -> None:
+        self._hung_s -= max(0.0, self._hangs_until - now)
         self._hangs_until = -inf
+
+    def end_faults(self, now: float) -> None:
+        """Run on without a fault; a power supply that is off stays off."""
+        self._end_hang(now)
         self._answers.clear()
         if isinstance(self.engine, IndependentDevice):
             self.engine.flash.failures_left = 0
@@ -169,7 +177,7 @@ class Unit:
 
     def deadline(self) -> float | None:
         due = self.engine.deadline()
-        own = inf if due is None else due / self._rate
+        own = inf if due is None else due / self._rate + self._hung_s
         if self._late:
             own = min(own, self._late[0][0])
         return None if own == inf else max(own, self._hangs_until)
@@ -211,9 +219,10 @@ class Unit:
 
     def _own_time(self, now: float) -> float:
         """Time on its clock; a deadline is not missed by rounding."""
-        if self._rate == 1.0:
+        if self._rate == 1.0 and not self._hung_s:
             return now
-        own, due = now * self._rate, self.engine.deadline()
+        own = (max(now, self._hangs_until) - self._hung_s) * self._rate
+        due = self.engine.deadline()
         return due if due is not None and own < due < own + _ROUNDING_S else own
 
     def _watch_flash(self, now: float) -> None:
@@ -244,7 +253,8 @@ class Unit:
             command = _NUMBERED_ANSWERS.get(change.becomes, command)
             number = (int.from_bytes(data, "little") + change.shift) % 0x10000
             frames = frames_of(frames[0].can_id, REPORT, command, number.to_bytes(2, "little"))
-        self._late.append((now + change.late, frames))
+        copies = 2 if change.becomes == "twice" else 1
+        self._late.append((now + change.late, frames * copies))
 
 
 class Watcher(Protocol):
@@ -269,8 +279,8 @@ class PlanBus(SimulatedBus):
         self.is_garbled = False
         """The host's adapter has another bit rate: it receives error frames only."""
         self.heard: set[Any] = set()
-        """Units and engines that began a message alone that reached the tool; the player empties it. General
-        feedback does not count: an application sends it to all that is not for it.
+        """Units and engines that began a message alone that reached the tool; the player empties
+        it. General feedback does not count: an application sends it to all that is not for it.
         """
         self._watch = watch
 
@@ -399,15 +409,6 @@ def _flipped(frame: Frame, bit: int) -> Frame:
     return frame._replace(data=bytes(data))
 
 
-def message_begun(frame: Frame) -> tuple[str, int] | None:
-    """The host's message that begins with this frame, and the number of its packet."""
-    data = frame.data
-    if data[:3] != b"\x55\xaa\x16" or len(data) < 8:
-        return None
-    name = _COMMANDS.get(data[4:6])
-    return None if name is None else (name, data[7] if name == "packet" else 0)
-
-
 class _Inbox(deque[Frame]):
     """Frames that have arrived at an adapter, with the time of each."""
 
@@ -445,6 +446,8 @@ class PlanLink(SimulatedLink):
         self._random = random.Random(adapter.seed)
         self._stalls_s = 0.0
         self._suffers = self._is_killed = self._is_overdue = False
+        self.on_update: Callable[[float], None] = lambda _now: None
+        """Called when an update command is handed to the adapter."""
         bus.host = self
         bus.agenda.at(overdue_at, self._end)
 
@@ -489,6 +492,8 @@ class PlanLink(SimulatedLink):
             self._suffer()
         super().send(frame)
         self._echoes.sent(frame)
+        if frame.data[4:6] == _UPDATE and frame.data[:2] == _HEADER:
+            self.on_update(self._plan_bus.clock.now())
 
     def receive(self, deadline: float) -> Frame | None:
         if self._suffers:

@@ -86,6 +86,10 @@ class _Draw:
                 short=draw.choice((5, 5, 0, 1, 64, draw.randrange(96))),
                 image=self._seed % 1000,
                 others=needs_others or self._is(0.7),
+                attempts=draw.randint(1, 4) if self._is(0.1) else 0,
+                tries=draw.choice((1, 2, 10, 20)) if self._is(0.1) else 0,
+                timeout=round(draw.uniform(2.0, 60.0), 1) if self._is(0.1) else 0.0,
+                gap=round(draw.uniform(0.001, 0.08), 3) if self._is(0.05) else 0.0,
             )
         ]
         if self._is(0.5):
@@ -159,6 +163,7 @@ class _Draw:
             among("after_complete", 0.4, "restarts"),
             f"start={self._between(0.01, 2.0)}" if self._is(0.5) else "",
             among("after_refusal", 0.3, "waits"),
+            among("answers", 0.1, "false"),
             among("app_upgrade", 0.3, "silent"),
         )
         return " ".join(word for word in words if word)
@@ -180,6 +185,7 @@ class _Draw:
             among("after_complete", 0.4, "restarts"),
             f"start_delay_s={self._between(0.01, 2.0)}" if self._is(0.4) else "",
             among("upgrade_in_application", 0.3, "silence"),
+            among("battery_use", 0.1, "riding") if self._target == "bms" else "",
             f"erase_time_s={self._between(0.0005, 0.5)}" if self._is(0.5) else "",
             f"program_time_s={self._between(0.0001, 0.2)}" if self._is(0.5) else "",
         )
@@ -263,7 +269,7 @@ class _Draw:
         return plans.Unsolicited(when=when, what=what, number=number, count=count)  # type: ignore[arg-type]
 
     def _answer(self, when: When) -> plans.Clause:
-        becomes = self._random.choice(("same", "same", "ack", "nak", "silence"))
+        becomes = self._random.choice(("same", "ack", "nak", "silence", "twice", "twice"))
         return plans.Answer(
             when=when,
             device=self._which(),

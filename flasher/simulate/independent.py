@@ -90,6 +90,8 @@ class Choices:
     start: float = 0.1
     """From the end of the bootloader to an application that answers."""
     after_refusal: Literal["announces", "waits"] = "announces"
+    answers: bool = True
+    """The application answers version requests."""
     app_upgrade: Literal["confirms", "silent"] = "confirms"
     """Upgrade messages to the application (R17)."""
 
@@ -315,7 +317,7 @@ class IndependentDevice:
                 self._say(NAK, self._wanted.to_bytes(2, "little"), now)
 
     def _hear_in_application(self, mode: int, command: int, data: bytes, now: float) -> None:
-        if mode == READ and self._has_queries:
+        if mode == READ and self._has_queries and self._choices.answers:
             if command == READ_VERSION:
                 self._say(VERSION, self._version_information(), now, self._reports_id)
             elif command == READ_RUNNING:

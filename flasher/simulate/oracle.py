@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 
 from flasher.errors import ExitCode
 from flasher.host.outcome import DeviceLeft
-from flasher.protocol.frame import Frame
 from flasher.simulate import plan as plans
+from flasher.simulate.wire_rules import WireRules
 
 DOCUMENTED: Final = frozenset(
     {
@@ -28,20 +28,31 @@ DOCUMENTED: Final = frozenset(
 """Exit codes of `flasher flash --help` that a plan can cause."""
 LATEST: Final = 1.001
 """Latest end as a share of the announced deadline: a message that has begun is finished."""
-REPEAT_MARGIN_S: Final = 0.05
-"""A repetition that was queued before the ACK came begins at most so much later."""
-_CAUSES_REPETITION: Final = (
-    plans.OnFrames, plans.Noise, plans.Unsolicited, plans.Answer, plans.Tool, plans.Load,
-    plans.Stall, plans.Kill, plans.Restart, plans.Power, plans.Hang, plans.Unplug, plans.BusOff,
+_LIES_AT_THE_END: Final = (
+    plans.Answer, plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.FlashFails,
 )  # fmt: skip
+"""Faults after which a right host may take a complete image for a refused one."""
+_LOOKS_LIKE_TWO: Final = (plans.Unsolicited, plans.Answer, plans.Tool, plans.Noise, plans.OnFrames)
+"""Faults after which one device may look like two."""
 
 
 class Violation(NamedTuple):
-    """Broken promise: FALSE (a success that is none), DISHONEST (a wrong statement about the
-    device), OVERDUE (the run did not end), LATE (it ended after its deadline), UNDOCUMENTED (an
-    exit code), FOREIGN (a frame to another device), REPEATED (a packet sent again after its ACK),
-    LOST (a device that the tool cannot bring back), UNDETECTED (a damaged message was taken),
-    CRASH; UNSEEN is none (`is_excused`).
+    """Broken promise, of one of these kinds.
+
+    FALSE         a success that is none, or a version that nobody reported
+    DISHONEST     a wrong statement about what the device has
+    OVERDUE       the run did not end
+    LATE          it ended after its deadline
+    UNDOCUMENTED  an exit code
+    FOREIGN       a frame to another device
+    WIRE          a message that must not be sent then (`wire_rules`)
+    STATISTICS    impossible counts
+    ACCUSED       one device reported as two
+    CORRUPT       a device that would start what is no image
+    LOST          a device that the tool cannot bring back
+    CRASH         an exception of the code under test
+    KILLED        the process of the simulation died
+    UNSEEN        excused, see `is_excused`
     """
 
     kind: str
@@ -69,6 +80,10 @@ class Claim:
     """None where only `needs_rescue` is reported."""
     needs_rescue: bool
     attempts: int = 0
+    acknowledged: int = 0
+    """Packets."""
+    reports_version: bool = False
+    """It names the version that the new application reports."""
     where: str = ""
     is_overdue: bool = False
 
@@ -93,6 +108,7 @@ class Facts:
 
     plan: plans.Plan
     request_id: int
+    rules: WireRules
     host_ids: set[int] = field(default_factory=set)
     """CAN ids of the host's frames."""
     before: str = "old"
@@ -103,28 +119,11 @@ class Facts:
     took_s: float = 0.0
     limit_s: float = 1.0
     """Announced deadline."""
-    repeated: int = 0
-    """Packets that were sent again after their ACK."""
-    _acknowledged: dict[int, float] = field(default_factory=dict)
 
     def begin_run(self, before: str) -> None:
+        """Begin with another process of the host."""
         self.before, self.may_have_erased = before, False
-        self._acknowledged.clear()
-
-    def host_begins(self, what: str, number: int, now: float) -> None:
-        """Record a message of the host; `number` is the low byte of its packet's."""
-        if what == "update":
-            self._acknowledged.clear()
-        elif what == "packet":
-            acknowledged_at = self._acknowledged.get(number)
-            if acknowledged_at is not None and now - acknowledged_at > REPEAT_MARGIN_S:
-                self.repeated += 1
-
-    def device_sends(self, frame: Frame, now: float) -> None:
-        if frame.data[:6] == b"\x55\xaa\x0c\x04\xc2\x02" and len(frame.data) == 8:
-            number = frame.data[6]
-            self._acknowledged.setdefault(number, now)
-            self._acknowledged.pop((number + 1) % 256, None)  # numbers come round after 255
+        self.rules.begin_run()
 
 
 def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
@@ -142,17 +141,37 @@ def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
     if facts.host_ids - {facts.request_id}:
         ids = ", ".join(f"0x{each:03X}" for each in sorted(facts.host_ids - {facts.request_id}))
         yield Violation("FOREIGN", f"frames with the id {ids}")
-    is_steady = len(facts.units) == 1 and not any(
-        isinstance(each, _CAUSES_REPETITION) for each in facts.plan.clauses
-    )
-    if facts.repeated and is_steady:
-        yield Violation("REPEATED", f"{facts.repeated} packets were sent again after their ACK")
+    for text in facts.rules.broken():
+        yield Violation("WIRE", text)
+    yield from _judge_report(facts, claim)
     yield from _judge_contents(facts, claim)
+
+
+def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
+    """Check what a run reports beside its success."""
+    plan = facts.plan
+    device = plan.devices[0]
+    is_riding = "battery_use=riding" in str(device) and device.begins == "application"
+    if is_riding and facts.may_have_erased and not [*plan.events]:
+        yield Violation("WIRE", "an update command to a battery that is in use")
+    if claim.acknowledged > plan.job.packets:
+        text = f"{claim.acknowledged} acknowledged packets of {plan.job.packets}"
+        yield Violation("STATISTICS", text)
+    # Of a killed run, the device may be left in its transfer: the way out of it is not counted.
+    counts_attempts = plan.job.attempts and not _has(plan, (plans.Kill,))
+    if counts_attempts and claim.attempts > plan.job.attempts:
+        text = f"{claim.attempts} attempts, and {plan.job.attempts} were allowed"
+        yield Violation("STATISTICS", text)
+    if claim.reports_version and not facts.rules.has_version_answer:
+        yield Violation("FALSE", "a version is reported, and the device sent none")
+    is_single = len(plan.devices) == 1 and not _has(plan, _LOOKS_LIKE_TWO)
+    if "two_devices" in claim.ending and is_single:
+        yield Violation("ACCUSED", "two devices are reported, and there is one")
 
 
 def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     contents = [each.now for each in facts.units]
-    if any(isinstance(each, plans.Tool) for each in facts.plan.clauses):
+    if _has(facts.plan, (plans.Tool,)):
         # What another tool did after the end is not the host's.
         contents = ["new" if each.at_end == "new" else each.now for each in facts.units]
     present = [each for each in facts.units if each.was_at_update]
@@ -165,8 +184,13 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     for twin, unit in zip(twins, facts.units[1:], strict=True):
         if claim.is_ok and twin != "new" and unit.took_part:
             yield Violation(false, f"success, and its twin has {twin}")
+    if content == "other" and len(contents) == 1 and not _has(facts.plan, (plans.Tool,)):
+        yield Violation("CORRUPT", "the device would start what is neither old nor new")
     if not facts.may_have_erased:
         return  # whoever erased it, it was not the host
+    is_refused = claim.left is DeviceLeft.NO_APPLICATION and content == "new"
+    if is_refused and len(contents) == 1 and not _has(facts.plan, _LIES_AT_THE_END):
+        yield Violation("DISHONEST", "no application is reported, and the device has the new one")
     # Another tool may erase a device that was complete, while its version is asked.
     is_others = claim.left is DeviceLeft.NEW and "second_tool" in claim.ending
     has_lost = content == "none" != facts.before
@@ -174,3 +198,7 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("DISHONEST", "no need of rescue, and the device has no application")
     if claim.left is DeviceLeft.UNTOUCHED and content != facts.before:
         yield Violation("DISHONEST", f"untouched, and the device has {content}")
+
+
+def _has(plan: plans.Plan, kinds: tuple[type[plans.Clause], ...]) -> bool:
+    return any(isinstance(each, kinds) for each in plan.clauses)

@@ -100,6 +100,8 @@ class Job(Clause):
     attempts: int = 0
     tries: int = 0
     timeout: float = 0.0
+    gap: float = 0.0
+    """Seconds between the frames of a message."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,8 +267,8 @@ class Answer(OnDevice):
     """The next answer of the device is another one, or comes later."""
 
     NAME = "answer"
-    becomes: Literal["same", "ack", "nak", "silence"] = "same"
-    """An ACK becomes a NAK of the same number, and the reverse."""
+    becomes: Literal["same", "ack", "nak", "silence", "twice"] = "same"
+    """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice."""
     shift: int = 0
     """Added to the number of an ACK or NAK."""
     late: float = 0.0

@@ -30,7 +30,6 @@ from flasher.simulate.bus import (
     PlanBus,
     PlanLink,
     Unit,
-    message_begun,
 )
 from flasher.simulate.independent import (
     ACK,
@@ -51,6 +50,7 @@ from flasher.simulate.independent import (
 )
 from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
 from flasher.simulate.reached import fault_place
+from flasher.simulate.wire_rules import WireRules
 
 NEW_VERSION: Final = "V1r2r0_20240601"
 """Version that the new image reports."""
@@ -62,7 +62,7 @@ OVERDUE_S: Final = 60.0
 _VECTORS: Final = struct.pack("<4I", 0x2000_5000, 0x0800_4101, 0, 0)
 """Vector table of a Cortex-M: stack pointer, reset vector, no NMI and no hard fault handler."""
 _BOOT_NAMES: Final = {"bms": b"BMS", "wmc": b"WMC", "obc": b"PBU"}
-_OPERATOR_S: Final = 2.0
+_OPERATOR_S: Final = 8.0
 """Time in which the operator of the recovery follows a prompt; the supply is then off so long."""
 
 
@@ -141,7 +141,7 @@ class Player:
         self._phase = "idle"
         """Last message that the host began."""
         self._reached: set[str] = set()
-        self._facts = Facts(plan, self.target.request_id)
+        self._facts = Facts(plan, self.target.request_id, WireRules(plan))
         self._at_update: list[Unit] = []
         """Units on the bus when the last update command began."""
         for number, device in enumerate(plan.devices):
@@ -216,7 +216,7 @@ class Player:
             self._begins("frame", self._frames, now)
         if sender == "host":
             self._facts.host_ids.add(frame.can_id)
-            begun = message_begun(frame)
+            begun = self._facts.rules.host_sends(frame, now)
             if begun is not None:
                 what, number = begun
                 self._phase = what
@@ -224,10 +224,9 @@ class Player:
                     self._facts.may_have_erased = True
                     self._at_update = self._present
                     self.bus.heard.clear()
-                self._facts.host_begins(what, number, now)
                 self._begins(what, number, now)
-        elif sender == "device":
-            self._facts.device_sends(frame, now)
+        else:
+            self._facts.rules.others_send(frame, now)
 
     def _begins(self, what: str, number: int, now: float) -> None:
         if not self._waiting:
@@ -298,7 +297,7 @@ class Player:
                 unit.power_cut(now)
                 unit.power_on(now)
             case plans.Hang(seconds=seconds):
-                unit.hang(now + seconds)
+                unit.hang(now + seconds, now)
             case plans.FlashFails(count=count) if isinstance(unit.engine, IndependentDevice):
                 unit.engine.flash.failures_left += count
 
@@ -412,6 +411,7 @@ class Player:
         """Run the command once; None if its process was killed."""
         self._phase = "idle"
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
+        link.on_update = self._facts.rules.update_handed_over
         self._is_interrupted = False
         device = api.Connection(link, self.clock, "the bus of the plan").device(self.target)
         try:
@@ -445,14 +445,14 @@ class Player:
         unit.power_on(self.clock.now())
         self._has_operator = True
         in_session = was_killed or claim.needs_rescue
-        options = replace(self._options, attempts=None, timeout_s=None)
+        options = replace(self._options, attempts=None, timeout_s=None, frame_gap_s=0.0)
         for name, run in (
             ("flash", replace(options, in_session=in_session)),
             ("rescue", replace(options, at_power_up=True)),
         ):
             limit_s = overall_timeout_s(self.image_plan, run)
             again = self._run(run, self.clock.now() + limit_s)
-            if again is not None and again.is_ok and unit.application == self.image_plan.image.data:
+            if again is not None and unit.application == self.image_plan.image.data:
                 return name
         return ""
 
@@ -472,7 +472,7 @@ class Player:
         self.bus.is_garbled = self.bus.is_unacknowledged = False
         self.bus.plug()
         for unit in self.units:
-            unit.end_faults()
+            unit.end_faults(self.clock.now())
 
     def _wait(self, until: float) -> None:
         link = self.bus.link()
@@ -497,6 +497,8 @@ class Player:
 def _options(job: plans.Job, options: UpgradeOptions) -> UpgradeOptions:
     if job.attempts:
         options = replace(options, attempts=job.attempts)
+    if job.gap:
+        options = replace(options, frame_gap_s=job.gap)
     if job.tries:
         options = replace(options, timings=replace(options.timings, packet_tries=job.tries))
     return replace(options, timeout_s=job.timeout) if job.timeout else options
@@ -515,6 +517,8 @@ def _claim_of(result: Result) -> Claim:
         left=outcome.device_left,
         needs_rescue=needs_rescue,
         attempts=outcome.statistics.attempts,
+        acknowledged=outcome.statistics.packets_acknowledged,
+        reports_version=bool(result.running_version),
         where=outcome.where,
     )
 
