@@ -176,7 +176,9 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
         contents = ["new" if each.at_end == "new" else each.now for each in facts.units]
     present = [each for each in facts.units if each.was_at_update]
     # Of two devices, one that sends nothing of its own in the transfer cannot be seen.
-    is_unseen = len(present) > 1 and not all(each.was_heard for each in present)
+    # A changed answer is not its own.
+    shows = all(each.was_heard for each in present) and not _has(facts.plan, (plans.Answer,))
+    is_unseen = len(present) > 1 and not shows
     false = "UNSEEN" if is_unseen else "FALSE"
     content, *twins = contents
     if claim.is_ok and content != "new":
