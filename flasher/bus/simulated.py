@@ -48,6 +48,8 @@ class _Node:
     def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
         """Frames to send, each with the time at which it was queued."""
+        self.has_changed = True
+        """It received or sent a frame since it was served."""
         self.tx_errors = 0
         """Transmit error counter: plus 8 for an error, minus 1 for a frame sent."""
 
@@ -69,8 +71,6 @@ class _Device(_Node):
         self.on_event = on_event
         self.deadline: float | None = None
         """Deadline that the engine last asked for."""
-        self.has_changed = True
-        """It received or sent a frame since it was served."""
 
 
 class SimulatedBus:
@@ -253,6 +253,7 @@ class SimulatedBus:
             self._sending, bits = (winners, frame), frame_bits(frame)
             for node in winners:
                 node.outbox.popleft()
+                node.has_changed = True
                 if node.tx_errors:
                     node.tx_errors -= 1
         taken_s = bits / self._bitrate_bps
@@ -315,6 +316,7 @@ def _count_error(node: _Node) -> None:
     if node.tx_errors >= _OFF:
         node.tx_errors = 0
         node.outbox.popleft()
+        node.has_changed = True
 
 
 class SimulatedLink:

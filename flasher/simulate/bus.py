@@ -444,16 +444,16 @@ class PlanLink(SimulatedLink):
         self._adapter = adapter
         self._echoes = Echoes()
         self._random = random.Random(adapter.seed)
-        self._stalls_s = 0.0
+        self._stalls_until = -inf
         self._suffers = self._is_killed = self._is_overdue = False
         self.on_update: Callable[[float], None] = lambda _now: None
         """Called when an update command is handed to the adapter."""
         bus.host = self
         bus.agenda.at(overdue_at, self._end)
 
-    def stall(self, seconds: float) -> None:
-        """Pause the host at its next call."""
-        self._stalls_s += seconds
+    def stall(self, until: float) -> None:
+        """Pause the host: no call returns before."""
+        self._stalls_until = max(self._stalls_until, until)
         self._suffers = True
 
     def kill(self) -> None:
@@ -479,10 +479,8 @@ class PlanLink(SimulatedLink):
         clock = self._plan_bus.clock
         if self._is_killed:
             raise KilledError
-        if self._stalls_s:
-            until, self._stalls_s = clock.now() + self._stalls_s, 0.0
-            while clock.now() < until:
-                self._plan_bus.advance(until)
+        while clock.now() < self._stalls_until:
+            self._plan_bus.advance(self._stalls_until)
         if self._is_overdue:
             raise OverdueError
         self._suffers = False
@@ -499,6 +497,8 @@ class PlanLink(SimulatedLink):
         if self._suffers:
             self._suffer()
         frame = super().receive(deadline)
+        if self._suffers:
+            self._suffer()
         if frame is None:
             return None
         return self._echoes.mark(frame, self._inbox.stamp_s, is_rx=True)

@@ -183,8 +183,8 @@ class Player:
         self._update_acknowledgement()
 
     def _is_disturbed(self, number: int, device: plans.Device) -> bool:
-        """True if more than the supply of a device fails."""
-        return bool(device.drift) or any(
+        """True if more than the supply of a device fails, or its flash operations are traced."""
+        return bool(device.drift or self._tap) or any(
             (isinstance(each, plans.Answer | plans.Hang) and each.device == number)
             or (each.when is not None and each.when.what == "flash")
             for each in self.plan.clauses
@@ -273,7 +273,7 @@ class Player:
             case plans.BusOff(seconds=seconds):
                 bus.bus_off(seconds)
             case plans.Stall(seconds=seconds) if link is not None:
-                link.stall(seconds)
+                link.stall(now + seconds)
             case plans.Kill(again=again, rescue=rescue) if link is not None:
                 self._again_after_s, self._has_operator = again, rescue
                 link.kill()

@@ -265,18 +265,18 @@ def traced(device: plans.Independent | plans.Mock, *clauses: plans.Clause) -> Tr
 
 
 def _messages(frames: Sequence[tuple[float, plans.Sender | None, Frame]]) -> Iterator[Span]:
-    open_messages: dict[int, tuple[int, int]] = {}
-    """Per CAN id, number of the first frame, and of the last."""
+    open_messages: dict[tuple[plans.Sender | None, int], tuple[int, int]] = {}
+    """Per sender and CAN id, number of the first frame, and of the last."""
     for number, (now, sender, frame) in enumerate(frames, 1):
         if frame.data.startswith(b"\x55\xaa"):
             size = frame.data[3] + 9
-            open_messages[frame.can_id] = number, size
-        first, size = open_messages.get(frame.can_id, (0, 0))
+            open_messages[sender, frame.can_id] = number, size
+        first, size = open_messages.get((sender, frame.can_id), (0, 0))
         if first:
             size -= len(frame.data)
-            open_messages[frame.can_id] = first, size
+            open_messages[sender, frame.can_id] = first, size
             if size <= 0:
-                del open_messages[frame.can_id]
+                del open_messages[sender, frame.can_id]
                 began_at, _, head = frames[first - 1]
                 command = int.from_bytes(head.data[4:6], "big")
                 yield Span(sender, command, first, number, began_at - _frame_s(head), now)
