@@ -284,12 +284,15 @@ class UpgradeSession(Runner[Result]):
     def _verified(self) -> Stage[Verification]:
         level, self._checking = self._level, Level.NONE
         self.listen_always(self._plan.target.answer_id)
+        was_cancelled = False
         with contextlib.suppress(SecondToolSeen):  # the device has the image anyway
-            yield from self.await_second_device()
+            was_cancelled = yield from self.await_second_device()
         if self.duplicates.evidence:
             return Verification(level, Verdict.TWO_DEVICES, None, self.duplicates.evidence)
         found = NOT_ASKED
-        if level is not Level.NONE:
+        if was_cancelled and level is not Level.NONE:
+            found = self._interrupted(Verification(level, Verdict.INTERRUPTED))
+        elif level is not Level.NONE:
             found = yield from self._checked(Level.VERSION)
         if level is Level.MEMORY and found.ok:
             found = yield from self._checked(Level.MEMORY, found.running_version)
@@ -306,8 +309,12 @@ class UpgradeSession(Runner[Result]):
         except SecondToolSeen as tool:
             # The device has the image; its answers may be for the other tool.
             return Verification(level, Verdict.SECOND_TOOL, None, tool.description)
+        return self._interrupted(found)
+
+    def _interrupted(self, found: Verification) -> Verification:
+        """Return a verification that the user, or the overall deadline, has ended."""
         if found.verdict is Verdict.INTERRUPTED and self.now >= (self.deadline_at or inf):
-            return Verification(level, Verdict.NO_ANSWER, None, "the overall deadline passed")
+            return Verification(found.level, Verdict.NO_ANSWER, None, "the overall deadline passed")
         return found
 
     # -- beside the stages -----------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 from flasher.errors import ExitCode
 from flasher.host.outcome import DeviceLeft
@@ -36,7 +36,8 @@ _LOOKS_LIKE_TWO: Final = (plans.Unsolicited, plans.Answer, plans.Tool, plans.Noi
 """Faults after which one device may look like two."""
 
 
-class Violation(NamedTuple):
+@dataclass(frozen=True)
+class Violation:
     """Broken promise, of one of these kinds.
 
     FALSE         a success that is none, or a version that nobody reported

@@ -115,7 +115,7 @@ class Player:
         plan: plans.Plan,
         options: UpgradeOptions | None = None,
         *,
-        log: Callable[[str], None] | None = None,
+        log: Callable[[str], object] | None = None,
         tap: Callable[[Frame, plans.Sender | None, float], None] | None = None,
     ) -> None:
         job = plan.job

@@ -65,7 +65,7 @@ def _simpler_clauses(clause: plans.Clause) -> Iterator[plans.Clause]:
     for known in fields(clause):
         value = getattr(clause, known.name)
         if known.name not in ("when", "choices") and value != known.default:
-            yield replace(clause, **{known.name: known.default})
+            yield replace(clause, **{known.name: known.default})  # type: ignore[arg-type]
     packets = getattr(clause, "packets", 0)
     if packets > 3:
         yield replace(clause, packets=max(3, packets // 2))  # type: ignore[call-arg]

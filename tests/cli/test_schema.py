@@ -86,6 +86,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),
         ("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),
+        ("simulate", "replay", "job packets=3 ; mock"),
         ("history",),
         ("info", *MOCK),
         ("info", "-t", "wmc", "--mock", "--mock-speed", "0"),

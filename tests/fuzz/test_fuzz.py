@@ -5,12 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
 import pytest
-from sqlalchemy.exc import ArgumentError
 
 from tests.fuzz import __main__ as command
 from tests.fuzz.harness import CORPUS, MODULES, Harness, find
@@ -107,14 +105,6 @@ def test_time_and_memory_of_an_input_are_limited(
     harness = Harness(lambda _data: None, list, "")
     with pytest.raises(AssertionError, match=reason):
         harness.take(b"")
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(raises=ArgumentError, strict=True)
-def test_the_open_fault_of_the_audit_trail_is_open() -> None:
-    """Its page fails for a time without rows. Mended, `take_request` need not excuse it."""
-    station_pages = import_module("tests.fuzz.station_pages")
-    station_pages._station().ask(station_pages.OPEN)
 
 
 # -- corpus ----------------------------------------------------------------------------------------

@@ -499,6 +499,13 @@ def test_the_audit_trail_in_pages(client: TestClient, overview: Overview) -> Non
     assert "begun" in client.get("/audit?event=begun").text
 
 
+@pytest.mark.parametrize("period", ["from=2099-01-01", "to=2000-01-02"])
+def test_a_period_without_audit_rows_is_an_empty_page(client: TestClient, period: str) -> None:
+    answer = client.get(f"/audit?{period}")
+    assert answer.status_code == 200
+    assert '<td class="keep first">' not in answer.text
+
+
 def test_every_event_of_the_trail_can_be_chosen(overview: Overview) -> None:
     assert {row.event for row in overview.audit(PageCursor(), size=500).rows} <= set(chain.EVENTS)
 

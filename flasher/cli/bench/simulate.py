@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -17,22 +16,43 @@ import click
 
 from flasher.cli import values
 from flasher.cli.bar import Bar
+from flasher.cli.extras import need
 from flasher.cli.files import check_writable
 from flasher.cli.framework import argument, group, option, option_set, typed_values
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
-from flasher.processes import end_with_parent
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
-from flasher.simulate.campaign import NO_FAULT, Batch, Found, Result, Tally
-from flasher.simulate.play import Verdict
+from flasher.simulate.campaign import (
+    NO_FAULT,
+    Batch,
+    Found,
+    Result,
+    Tally,
+    batches,
+    campaign_key,
+    run_batch,
+    share,
+)
+from flasher.simulate.ledger import Ledger
+from flasher.simulate.ledger import merge as merge_ledgers
+from flasher.simulate.plan import Plan
+from flasher.simulate.play import Player, Verdict
+from flasher.simulate.shrink import shrink
+from flasher.simulate.sweep import PartResult, parts
+from flasher.simulate.sweep import run as run_part
+from flasher.simulate.workers import KILLED, OnResult
+from flasher.simulate.workers import run as run_in_processes
+from flasher.trace.recorder import Recorder
 
 _EXAMPLES: Final = """\
 examples:
   flasher simulate
   flasher simulate --for 600 --jobs 4
   flasher simulate --seed 1000000 --runs 20000 --keep-going --json
+  flasher simulate --runs 1000000 --jobs 8 --ledger campaign.jsonl
+  flasher simulate sweep limits
   flasher simulate replay 'job packets=3 ; independent erase=0.05 ; @packet2 power'
 
 A run is an upgrade by the production code on a simulated bus. Its seed decides device, adapter and
@@ -52,9 +72,15 @@ _ENDLESS: Final = 10**12
 """Runs that no campaign reaches."""
 TRACE_FILE: Final = "--trace-file"
 
-DOCUMENTS: Final = (Result, Verdict)
 
 _what = partial(option, panel="what is run, and how")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise click.BadParameter(f"{text!r} is not a part of a campaign, as 3/8")
+    return int(number), int(count)
 
 
 @dataclass(frozen=True)
@@ -77,6 +103,18 @@ class Campaign:
         "--jobs", type=values.count, default="1", metavar="N", brief=True,
         help="run on N processes side by side",
     )]  # fmt: skip
+    shard: Annotated[tuple[int, int] | None, _what(
+        "--shard", type=_shard, metavar="I/N",
+        help="run the part I of N parts, as in a job array; `simulate merge` adds them up",
+    )]  # fmt: skip
+    ledger: Annotated[Path | None, _what(
+        "--ledger", type=values.FilePath("jsonl", gives=Path), metavar="FILE",
+        help="save what is done in this file, and go on with what it lacks",
+    )]  # fmt: skip
+    dask: Annotated[str | None, _what(
+        "--dask", metavar="ADDRESS",
+        help="run on the workers of this Dask scheduler (extra `cluster`), as tcp://host:8786",
+    )]  # fmt: skip
     keep_going: Annotated[bool, _what(
         "--keep-going", is_flag=True, help="do not end at the first violation",
     )]  # fmt: skip
@@ -96,72 +134,87 @@ def simulate(output: Output, chosen: Campaign) -> int:
     """Upgrade simulated devices with random faults, and compare what the tool claims with what is
     in their flash.
     """
-    from flasher.simulate.campaign import Result, batches, campaign_key  # noqa: PLC0415  slow
-
     most = chosen.runs or (_RUNS if chosen.for_s is None else _ENDLESS)
+    todo: Iterable[Batch] = batches(chosen.seed, most, _BATCH)
+    if chosen.shard is not None:
+        todo = share(todo, *chosen.shard)
     began_s = time.perf_counter()
     total = Result(campaign_key())
     with (
         stop_on_signal(lambda: output.progress("Ending.")) as stopped,
         Bar(output, leave=False, unit=" runs" if most < _ENDLESS else " s") as bar,
+        ExitStack() as files,
     ):
+        ledger: Ledger | None = None
+        if chosen.ledger is not None:
+            whole = None if most == _ENDLESS else most
+            ledger = files.enter_context(Ledger(chosen.ledger, chosen.seed, whole))
+            total, todo = ledger.result, ledger.left(todo)
+            output.progress(ledger.notice or f"{counted(total.runs, 'run')} found in the ledger")
+        before = total.runs
 
         def is_over() -> bool:
             is_late = chosen.for_s is not None and time.perf_counter() - began_s >= chosen.for_s
             has_failed = total.violation_count > 0 and not chosen.keep_going
             return is_late or has_failed or stopped()
 
-        for result in _results(batches(chosen.seed, most, _BATCH), chosen.jobs, is_over):
+        def add(batch: Batch, result: Result) -> None:
+            nonlocal total
             total += result
+            if ledger is not None:
+                ledger.add(batch, result)
+            took_s = time.perf_counter() - began_s
             if most < _ENDLESS:
-                bar.move_to(total.runs, most)
+                bar.move_to(total.runs, -(-most // (chosen.shard or (1, 1))[1]))
             elif chosen.for_s is not None:
-                took_s = time.perf_counter() - began_s
                 bar.move_to(min(round(took_s), chosen.for_s), chosen.for_s)
+
+        _run(todo, chosen, add, is_over)
+        was_stopped = stopped()
     took_s = time.perf_counter() - began_s
-    if total.violations and not stopped():
+    first = next(iter(total.violations), None)
+    if first is not None and first.kind != KILLED and not was_stopped:
         output.progress("Shrinking the first violation.")
-        total = replace(total, violations=(_shrunk(total.violations[0]), *total.violations[1:]))
-    _tell(total, took_s, output)
-    failed = total.violation_count or total.is_blind or (chosen.strict and total.never_reached)
-    code = ExitCode.PARTIAL if failed else ExitCode.OK
-    if stopped() and not total.violation_count:
+        total = replace(total, violations=(_shrunk(first), *total.violations[1:]))
+    rate = 60 * (total.runs - before) / took_s if took_s else 0.0
+    output.result(f"{counted(total.runs, 'run')}, {rate:,.0f} a minute")
+    _tell(total, output)
+    code = _exit_code(total, is_strict=chosen.strict, is_shard=chosen.shard is not None)
+    if was_stopped and code is ExitCode.OK:
         code = ExitCode.INTERRUPTED
     return output.document(total, exit_code=code)
 
 
-def _results(todo: Iterable[Batch], jobs: int, is_over: Callable[[], bool]) -> Iterator[Result]:
-    """Yield the results of batches as they come, until it is over."""
-    from flasher.simulate.campaign import run_batch  # noqa: PLC0415  slow
+def _run(
+    todo: Iterable[Batch], chosen: Campaign, add: OnResult, is_over: Callable[[], bool]
+) -> None:
+    """Run batches here, on processes, or on a cluster."""
+    if chosen.dask is not None:
+        need("--dask", "cluster")
+        from flasher.simulate.cluster import run_on_cluster  # noqa: PLC0415  an extra
 
-    if jobs == 1:
+        run_on_cluster(chosen.dask, todo, on_result=add, is_stopped=is_over)
+    elif chosen.jobs > 1:
+        run_in_processes(todo, chosen.jobs, on_result=add, is_stopped=is_over)
+    else:
         for batch in todo:
             if is_over():
-                return
-            yield run_batch(batch, is_over)
-        return
-    waiting = iter(todo)
-    with ProcessPoolExecutor(jobs, initializer=end_with_parent) as pool:
-        futures = {pool.submit(run_batch, batch) for batch in islice(waiting, 2 * jobs)}
-        while futures:
-            ended, futures = wait(futures, return_when="FIRST_COMPLETED")
-            for future in ended:
-                yield future.result()
-            if not is_over():
-                futures |= {pool.submit(run_batch, each) for each in islice(waiting, len(ended))}
+                break
+            add(batch, run_batch(batch, is_over))
+
+
+def _exit_code(total: Result, *, is_strict: bool, is_shard: bool = False) -> ExitCode:
+    is_blind = bool(total.canaries_missed) if is_shard else total.is_blind
+    failed = total.violation_count or is_blind or (is_strict and total.never_reached)
+    return ExitCode.PARTIAL if failed else ExitCode.OK
 
 
 def _shrunk(found: Found) -> Found:
-    from flasher.simulate.plan import Plan  # noqa: PLC0415  slow
-    from flasher.simulate.shrink import shrink  # noqa: PLC0415  slow
-
     return replace(found, plan=str(shrink(Plan.parse(found.plan), found.kind)))
 
 
-def _tell(total: Result, took_s: float, output: Output) -> None:
+def _tell(total: Result, output: Output) -> None:
     """Print the sum of a campaign."""
-    rate = 60 * total.runs / took_s if took_s else 0.0
-    output.result(f"{counted(total.runs, 'run')} in {took_s:.0f} s, {rate:,.0f} a minute")
     if total.tallies:
         output.table(_rows(total.tallies), indent=2)
     never = total.never_reached
@@ -216,11 +269,7 @@ def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
     """Play a plan, as printed with a violation, exactly as it was: - reads it from standard input.
     With -v, every frame, fault and event is printed.
     """
-    from flasher.simulate.plan import Plan  # noqa: PLC0415  slow
-    from flasher.simulate.play import Player  # noqa: PLC0415  slow
-    from flasher.trace.recorder import Recorder  # noqa: PLC0415
-
-    line = click.get_text_stream("stdin").read() if text == "-" else text
+    line = sys.stdin.read() if text == "-" else text
     try:
         plan = Plan.parse(line)
     except ValueError as error:
@@ -236,7 +285,7 @@ def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
             if recorder is not None:
                 recorder(frame, sent=sender == "host", now=now)
 
-        log = output.result if output.verbosity > 0 else None
+        log: Callable[[str], object] | None = output.result if output.verbosity > 0 else None
         verdict = Player(plan, log=log, tap=record).play()
     output.result(f"{verdict.ending}, exit code {verdict.exit_code}, {verdict.took_s:.2f} s")
     if verdict.where:
@@ -250,3 +299,93 @@ def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
         output.result(f"{word} {each.kind}: {printable(each.text)}")
     failed = any(not each.is_excused for each in verdict.violations)
     return output.document(verdict, exit_code=ExitCode.PARTIAL if failed else ExitCode.OK)
+
+
+@dataclass(frozen=True)
+class MergedCampaign:
+    """Sum of the ledgers of a campaign."""
+
+    result: Result
+    missing: Sequence[tuple[int, int]]
+    """Seeds that no file contains: first, and the one after the last."""
+    missing_canaries: Sequence[int]
+
+
+@simulate.action("merge", exit_codes=(ExitCode.PARTIAL,))
+@argument(
+    "files", nargs=-1, required=True, type=values.FilePath("jsonl", gives=Path), metavar="FILE..."
+)
+def merge(output: Output, *, files: tuple[Path, ...]) -> int:
+    """Add the ledgers of a campaign up: of its shards, or of several sessions."""
+    merged = merge_ledgers(files)
+    for notice in merged.notices:
+        output.progress(notice)
+    output.result(counted(merged.result.runs, "run"))
+    _tell(merged.result, output)
+    for first, end in merged.missing:
+        output.result(f"MISSING: seeds {first} to {end - 1}")
+    for seed in merged.missing_canaries:
+        output.result(f"MISSING: the canary at seed {seed}")
+    code = _exit_code(merged.result, is_strict=False)
+    if merged.missing or merged.missing_canaries:
+        code = ExitCode.PARTIAL
+    document = MergedCampaign(merged.result, merged.missing, merged.missing_canaries)
+    return output.document(document, exit_code=code)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Parts of a sweep that were run."""
+
+    parts: Sequence[PartResult]
+
+
+@simulate.action("sweep", exit_codes=(ExitCode.PARTIAL, ExitCode.INTERRUPTED))
+@argument("names", nargs=-1, metavar="[PART...]")
+@_what("--list", "is_list", is_flag=True, brief=True, help="list the parts, and end")
+@_what(
+    "--every", type=values.count, default="1", metavar="N", brief=True,
+    help="run every Nth case only",
+)  # fmt: skip
+def sweep(output: Output, *, names: tuple[str, ...], is_list: bool, every: int) -> int:
+    """Try every single fault, pair of faults, power cut and time limit in an upgrade of 4 packets,
+    and all small errors against the CRC: all parts, or those that are named.
+    """
+    known = {each.name: each for each in parts()}
+    if unknown := [name for name in names if name not in known]:
+        raise UsageError(
+            f"The sweep has no part {printable(unknown[0])}.",
+            remedy=f"Name one of: {', '.join(known)}.",
+        )
+    if is_list:
+        output.table([(each.name, f"{each.count:,}", each.what) for each in known.values()])
+        return output.document(None)
+    done: list[PartResult] = []
+    with stop_on_signal(lambda: output.progress("Ending.")) as stopped:
+        for name in names or known:
+            part = known[name].taken(every)
+            with Bar(output, leave=False, unit=" cases", desc=name) as bar:
+                found = run_part(part, stopped, _progress(bar, part.count))
+            done.append(found)
+            output.result(f"{name}: {found.runs:,} of {counted(part.count, 'case')}")
+            output.table(
+                [(ending, f"{count:,}") for ending, count in found.endings.items()], indent=2
+            )
+            for each in found.violations:
+                output.result(f"VIOLATION {each.kind}: {printable(each.text)}")
+                output.result(f"  case {each.seed}; replay: {replay_line(each.plan)}")
+            if stopped():
+                break
+        was_stopped = stopped()
+    failed = any(each.violations for each in done)
+    code = ExitCode.PARTIAL if failed else ExitCode.OK
+    if was_stopped and not failed:
+        code = ExitCode.INTERRUPTED
+    return output.document(Sweep(done), exit_code=code)
+
+
+def _progress(bar: Bar, count: int) -> Callable[[int, int], None]:
+    return lambda runs, _violations: bar.move_to(runs, count)
+
+
+DOCUMENTS: Final = (Result, Verdict, MergedCampaign, Sweep)

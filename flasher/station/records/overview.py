@@ -384,6 +384,8 @@ class Overview:
             bounds = select(func.min(row_id), func.max(row_id)).where(*within)
             with self._database.reading() as connection:
                 low, high = connection.execute(bounds).one()
+            if low is None:
+                return Page((), None, None)
             query = query.where(audit.id >= low, audit.id <= high, *within)
         return self._page(_AUDIT, query, audit.id, cursor, size)
 

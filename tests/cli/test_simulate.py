@@ -1,0 +1,136 @@
+"""`flasher simulate`: campaigns, replay, ledgers, sweeps."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from flasher.cli.bench import simulate as command
+from flasher.cli.main import main
+from flasher.errors import ExitCode
+from flasher.simulate import campaign, planting
+from flasher.simulate.campaign import Batch, Result, campaign_key
+from flasher.simulate.planting import swapped, upgrade_bugs
+from tests.loops import each
+
+LOST = "job packets=3 ; independent erase=0.05 ; @packet2 power"
+
+
+def planted(name: str) -> planting.Codes:
+    return next(bug for bug in upgrade_bugs() if bug.name == name).codes()
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A canary is found in the first runs of a campaign."""
+    monkeypatch.setattr(campaign, "CANARIES", ("last-program-unit-lost",))
+    monkeypatch.setattr(command, "_BATCH", 3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_a_campaign_prints_what_happened_and_what_was_reached(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["simulate", "--runs", "6"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert out.startswith("6 runs, ")
+    assert "places reached" in out
+    assert out.endswith("1 canary found\nno violation\n")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_a_violation_ends_the_campaign_with_the_shortest_plan_and_its_replay(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(campaign, "CANARIES", ("one-packet-more-for-whole-sizes",))
+    monkeypatch.setattr(campaign, "swapped", lambda _codes: nullcontext())
+    with swapped(planted("last-program-unit-lost")):
+        assert main(["simulate", "--runs", "40"]) == ExitCode.PARTIAL
+        out = capsys.readouterr().out
+        assert "VIOLATION FALSE: success, and the device has " in out
+        line = next(each for each in out.splitlines() if "replay: " in each)
+        plan = line.partition("replay ")[2].strip("'")
+        assert len(plan.split(" ; ")) <= 2, plan
+        assert main(["simulate", "replay", plan]) == ExitCode.PARTIAL
+    assert main(["simulate", "replay", plan]) == ExitCode.OK
+
+
+def test_a_replay_is_the_same_each_time_and_leaves_a_trace(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    trace = tmp_path / "run.log"
+    assert main(["simulate", "replay", LOST, "--trace-file", str(trace)]) == ExitCode.OK
+    first = capsys.readouterr().out
+    assert main(["simulate", "replay", LOST]) == ExitCode.OK
+    assert capsys.readouterr().out == first
+    assert "in the device's flash: new" in first
+    assert main(["explain", str(trace)]) == ExitCode.OK
+    assert "verdict: completed" in capsys.readouterr().out
+
+
+def test_what_is_no_plan_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "replay", "job packets=many"]) == ExitCode.USAGE
+    assert "The plan cannot be read: " in capsys.readouterr().err
+
+
+@each("text", ["0/3", "4/3", "3", "a/b"])
+def test_what_is_no_shard_is_refused(text: str) -> None:
+    assert main(["simulate", "--shard", text]) == ExitCode.USAGE
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_shards_with_ledgers_add_up_to_the_whole_campaign(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    files = [tmp_path / f"{number}.jsonl" for number in (1, 2)]
+    for number, file in enumerate(files, 1):
+        args = ["simulate", "--runs", "9", "--shard", f"{number}/2", "--ledger", str(file)]
+        assert main(args) == ExitCode.OK
+    assert main(["simulate", "--runs", "9", "--json"]) == ExitCode.OK
+    whole = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert main(["simulate", "merge", *map(str, files), "--json"]) == ExitCode.OK
+    merged = json.loads(capsys.readouterr().out.splitlines()[-1])["result"]
+    for key in merged.keys() - {"cpu_s"}:
+        assert merged[key] == whole[key], key
+    assert main(["simulate", "merge", str(files[0])]) == ExitCode.PARTIAL
+    assert "MISSING: seeds " in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_a_campaign_goes_on_where_its_ledger_ends(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    args = ["simulate", "--ledger", str(tmp_path / "done.jsonl"), "--json", "--runs"]
+    assert main([*args, "3"]) == ExitCode.OK
+    assert main([*args, "6"]) == ExitCode.OK
+    captured = capsys.readouterr()
+    assert json.loads(captured.out.splitlines()[-1])["runs"] == 6
+    assert "3 runs found in the ledger" in captured.err
+
+
+def test_a_blind_campaign_fails(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_batch(batch: Batch, *_: object) -> Result:
+        missed = {batch.canary: 1} if batch.canary else {}
+        return Result(campaign_key(), runs=batch.count, canaries_missed=missed)
+
+    monkeypatch.setattr(command, "run_batch", run_batch)
+    assert main(["simulate", "--runs", "5"]) == ExitCode.PARTIAL
+    assert "BLIND: the planted mistake " in capsys.readouterr().out
+
+
+def test_parts_of_the_sweep_are_listed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "sweep", "--list"]) == ExitCode.OK
+    assert capsys.readouterr().out.startswith("frames ")
+    assert main(["simulate", "sweep", "limits", "--every", "100"]) == ExitCode.OK
+    assert "limits: 5 of 5 cases" in capsys.readouterr().out
+    assert main(["simulate", "sweep", "nonsense"]) == ExitCode.USAGE
+    assert "The sweep has no part nonsense." in capsys.readouterr().err
