@@ -32,8 +32,10 @@ _LIES_AT_THE_END: Final = (
     plans.Answer, plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.FlashFails,
 )  # fmt: skip
 """Faults after which a right host may take a complete image for a refused one."""
-_LOOKS_LIKE_TWO: Final = (plans.Unsolicited, plans.Answer, plans.Tool, plans.Noise, plans.OnFrames)
-"""Faults after which one device may look like two."""
+_LOOKS_LIKE_TWO: Final = (
+    plans.Unsolicited, plans.Answer, plans.Tool, plans.Noise, plans.OnFrames, plans.Load,
+)  # fmt: skip
+"""Faults after which one device may look like two: other traffic may have its CAN ids."""
 
 
 @dataclass(frozen=True)
