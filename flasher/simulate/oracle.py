@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from flasher.bus.link import SEND_LIMIT_S
 from flasher.errors import ExitCode
 from flasher.host.outcome import DeviceLeft
 from flasher.simulate import plan as plans
@@ -28,12 +29,14 @@ DOCUMENTED: Final = frozenset(
 """Exit codes of `flasher flash --help` that a plan can cause."""
 LATEST: Final = 1.001
 """Latest end as a share of the announced deadline: a message that has begun is finished."""
+_BLOCKS: Final = (plans.Load, plans.Unplug, plans.BusOff)
+"""Faults in which the adapter may take no frame for some time."""
 _LIES_AT_THE_END: Final = (
     plans.Answer, plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.FlashFails,
 )  # fmt: skip
 """Faults after which a right host may take a complete image for a refused one."""
 _LOOKS_LIKE_TWO: Final = (
-    plans.Unsolicited, plans.Answer, plans.Tool, plans.Noise, plans.OnFrames, plans.Load,
+    plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.Load,
 )  # fmt: skip
 """Faults after which one device may look like two: other traffic may have its CAN ids."""
 
@@ -138,7 +141,10 @@ def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("UNDOCUMENTED", f"exit code {claim.exit_code}")
     if claim.is_ok != (claim.exit_code == ExitCode.OK):
         yield Violation("UNDOCUMENTED", "success and exit code differ")
-    if facts.took_s > LATEST * facts.limit_s:
+    # An adapter that can send nothing is waited for.
+    blocked_s = SEND_LIMIT_S if not facts.plan.job.others or _has(facts.plan, _BLOCKS) else 0.0
+    paused_s = sum(each.seconds for each in facts.plan.clauses if isinstance(each, plans.Stall))
+    if facts.took_s > LATEST * facts.limit_s + blocked_s + paused_s:
         share = facts.took_s / facts.limit_s
         yield Violation("LATE", f"ended at {share:.4f} of the announced deadline")
     if facts.host_ids - {facts.request_id}:
@@ -154,8 +160,9 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
     """Check what a run reports beside its success."""
     plan = facts.plan
     device = plan.devices[0]
-    is_riding = "battery_use=riding" in str(device) and device.begins == "application"
-    if is_riding and facts.may_have_erased and not [*plan.events]:
+    is_running = device.begins == "application" and device.application == "old"
+    is_riding = "battery_use=riding" in str(device) and is_running
+    if is_riding and len(plan.devices) == 1 and facts.may_have_erased and not [*plan.events]:
         yield Violation("WIRE", "an update command to a battery that is in use")
     if claim.acknowledged > plan.job.packets:
         text = f"{claim.acknowledged} acknowledged packets of {plan.job.packets}"
@@ -168,6 +175,9 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
     if claim.reports_version and not facts.rules.has_version_answer:
         yield Violation("FALSE", "a version is reported, and the device sent none")
     is_single = len(plan.devices) == 1 and not _has(plan, _LOOKS_LIKE_TWO)
+    # Answers that come twice again and again are those of two devices.
+    answers = [each for each in plan.clauses if isinstance(each, plans.Answer)]
+    is_single &= not answers or answers == [plans.Answer(when=answers[0].when, becomes="twice")]
     if "two_devices" in claim.ending and is_single:
         yield Violation("ACCUSED", "two devices are reported, and there is one")
 
@@ -196,8 +206,9 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     is_refused = claim.left is DeviceLeft.NO_APPLICATION and content == "new"
     if is_refused and len(contents) == 1 and not _has(facts.plan, _LIES_AT_THE_END):
         yield Violation("DISHONEST", "no application is reported, and the device has the new one")
-    # Another tool may erase a device that was complete, while its version is asked.
-    is_others = claim.left is DeviceLeft.NEW and "second_tool" in claim.ending
+    # Another tool may erase a device that was complete, while its version is asked. Its commands
+    # are those of this tool: an adapter of unknown kind may be returning its own.
+    is_others = claim.left is DeviceLeft.NEW and _has(facts.plan, (plans.Tool,))
     has_lost = content == "none" != facts.before
     if not (claim.needs_rescue or claim.is_ok or is_others) and has_lost:
         yield Violation("DISHONEST", "no need of rescue, and the device has no application")

@@ -39,7 +39,7 @@ def test_a_campaign_prints_what_happened_and_what_was_reached(
     out = capsys.readouterr().out
     assert out.startswith("6 runs, ")
     assert "places reached" in out
-    assert out.endswith("1 canary found\nno violation\n")
+    assert out.endswith("canaries found: 1\nno violation\n")
 
 
 @pytest.mark.slow

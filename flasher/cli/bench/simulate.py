@@ -225,7 +225,7 @@ def _tell(total: Result, output: Output) -> None:
         output.result(f"BLIND: the planted mistake {name} was not found {counted(count, 'time')}")
     found = sum(total.canaries_found.values())
     if found:
-        output.result(f"{counted(found, 'canary')} found")
+        output.result(f"canaries found: {found}")
     elif total.is_blind and not total.canaries_missed:
         output.result("BLIND: no canary was tried")
     for each in total.violations:
