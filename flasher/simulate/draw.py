@@ -13,6 +13,10 @@ from flasher.simulate.plan import Plan, When
 
 TWIN_SHARE: Final = 0.1
 """Share of the plans with two devices; their images are long, and take half of the time."""
+_TOOL_DOES: Final = (
+    "asks", "asks", "writes", "resets", "updates", "packets", "refused", "ends", "unknown",
+    "damaged",
+)  # fmt: skip
 _HOW_MANY: Final = (0, 1, 1, 1, 2, 2, 2, 3, 3, 4, 6)
 
 
@@ -303,7 +307,7 @@ class _Draw:
     def _tool(self, when: When) -> plans.Clause:
         return plans.Tool(
             when=when,
-            does=self._random.choice(("asks", "asks", "writes", "resets", "updates", "packets")),
+            does=self._random.choice(_TOOL_DOES),
             count=self._random.choice((1, 1, 2, 5, 20)),
             every=self._between(0.01, 1.5),
         )

@@ -334,7 +334,12 @@ class Tool(Clause):
     """A second tool sends."""
 
     NAME = "tool"
-    does: Literal["asks", "writes", "resets", "updates", "packets"] = "asks"
+    does: Literal[
+        "asks", "writes", "resets", "updates", "packets", "refused", "ends", "unknown", "damaged"
+    ] = "asks"
+    """`refused` is an update command of size 0, `unknown` a command of no document, `damaged` a
+    packet with a wrong checksum.
+    """
     count: int = 1
     every: float = 0.2
 

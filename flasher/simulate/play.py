@@ -35,6 +35,7 @@ from flasher.simulate.independent import (
     ACK,
     BOOT_VERSION,
     COMPLETE,
+    END,
     FEEDBACK,
     NAK,
     PACKET,
@@ -329,24 +330,27 @@ class Player:
 
     def _foreign(self, does: str, turn: int) -> list[Frame]:
         packets = self.plan.job.packets
+        packet = (
+            b"\1" + (turn + 1).to_bytes(2, "little") + packets.to_bytes(2, "little") + b"\xa5" * 128
+        )
+        update = self.target.update_text.encode()
         mode, command, data = {
             "asks": (READ, READ_VERSION, b""),
             "writes": (WRITE, 0x3A10, b"second tool.    "),
             "resets": (WRITE, RESET, b"RESET"),
             "updates": (
-                WRITE,
-                UPDATE,
-                self.target.update_text.encode()
-                + len(self.image_plan.image.data).to_bytes(4, "little"),
+                WRITE, UPDATE, update + len(self.image_plan.image.data).to_bytes(4, "little")
             ),
-            "packets": (
-                WRITE,
-                PACKET,
-                b"\1" + (turn + 1).to_bytes(2, "little") + packets.to_bytes(2, "little")
-                + b"\xa5" * 128,
-            ),
+            "packets": (WRITE, PACKET, packet),
+            "refused": (WRITE, UPDATE, update + bytes(4)),
+            "ends": (WRITE, END, b"\4"),
+            "unknown": (WRITE, 0x7777, b"?"),
+            "damaged": (WRITE, PACKET, packet),
         }[does]  # fmt: skip
-        return frames_of(self.target.request_id, mode, command, data)
+        frames = frames_of(self.target.request_id, mode, command, data)
+        if does == "damaged":
+            frames[-1] = Frame(frames[-1].can_id, bytes(frames[-1].data[:-2]) + b"\0\xf0")
+        return frames
 
     # -- the host --------------------------------------------------------------------------------
 
