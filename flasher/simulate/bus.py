@@ -97,7 +97,7 @@ class Unit:
         """Seconds of its clock in one second."""
         self._hangs_until = -inf
         self._hung_s = 0.0
-        """Time for which its clock has stood still, or will until the end of the hang."""
+        """Time for which its clock has been stopped, or will be until the end of the hang."""
         self._answers: list[plans.Answer] = []
         self._late: deque[tuple[float, list[Frame]]] = deque()
         """Messages in the place of others, with their times."""

@@ -69,7 +69,7 @@ class Choices:
     """After the window, without an application (R14)."""
     erase: float = 0.3
     deaf_in_erase: bool = False
-    """The processor stands still while its flash is erased."""
+    """The processor halts while its flash is erased."""
     update_again: Literal["requests", "erases", "ignored"] = "requests"
     """Update command before packet 1 (R25)."""
     update_in_transfer: Literal["starts_over", "ignored"] = "starts_over"

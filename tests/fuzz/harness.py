@@ -55,7 +55,7 @@ MODULES: Final = {
 
 @dataclass(frozen=True)
 class Harness:
-    """One part of flasher that reads what somebody else wrote."""
+    """Part of flasher that reads input from outside."""
 
     run: Callable[[bytes], None]
     """Raises AssertionError if a property does not hold."""

@@ -1,4 +1,4 @@
-"""Harnesses of what is told of a trace: its story, and the bundle of a failed command."""
+"""Harnesses of the story of a trace, and of the bundle of a failed command."""
 
 from __future__ import annotations
 
