@@ -12,7 +12,7 @@ from typing import Final
 from flasher import api
 from flasher.bus.link import VirtualClock
 from flasher.errors import FlasherError
-from flasher.events import PowerCycleAwaited
+from flasher.events import BootVersionSeen, PowerCycleAwaited
 from flasher.host.identity import Identity
 from flasher.host.options import UpgradeOptions, overall_timeout_s
 from flasher.host.session import Result
@@ -137,6 +137,8 @@ class Player:
         self._is_interrupted = False
         self._has_operator = False
         """Somebody follows the prompts of `flasher rescue`."""
+        self._is_prompted = False
+        """A prompt is on the screen."""
         self._again_after_s = 0.0
         """Time from the kill of the host's process until the same command runs again."""
         self._phase = "idle"
@@ -464,8 +466,16 @@ class Player:
         if self._log is not None:
             self._log(f"{self.clock.now():.6f}     {event}")
         if self._has_operator and isinstance(event, PowerCycleAwaited):
-            cut_at = self.clock.now() + _OPERATOR_S
-            self.bus.agenda.at(cut_at, lambda at: self._cut(self.units[0], _OPERATOR_S, at))
+            self._is_prompted = True
+            self.bus.agenda.at(self.clock.now() + _OPERATOR_S, self._follow_prompt)
+        elif isinstance(event, BootVersionSeen):
+            self._is_prompted = False
+
+    def _follow_prompt(self, now: float) -> None:
+        """Switch the unit off, unless the upgrade goes on already."""
+        if self._is_prompted:
+            self._is_prompted = False
+            self._cut(self.units[0], _OPERATOR_S, now)
 
     def _end_faults(self) -> None:
         """Cancel what has not happened yet, and end what lasts."""
