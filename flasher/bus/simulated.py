@@ -48,8 +48,6 @@ class _Node:
     def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
         """Frames to send, each with the time at which it was queued."""
-        self.has_changed = True
-        """It received or sent a frame since it was served."""
         self.tx_errors = 0
         """Transmit error counter: plus 8 for an error, minus 1 for a frame sent."""
 
@@ -102,8 +100,6 @@ class SimulatedBus:
         self._delivered_at: float | None = None
         """Time of a delivered frame to which devices answer: as exact as the wire, even if the
         clock woke late."""
-        self.is_awaited = False
-        """A host is waiting for a frame: nothing but the bus and its devices changes them."""
         self.faults = AdapterFaults()
         """Faults of the host's adapter: `unplug`, `bus_off` and `is_unacknowledged`."""
 
@@ -164,9 +160,6 @@ class SimulatedBus:
 
     def advance(self, limit: float) -> None:
         """Advance to the next event on the bus, at latest to `limit`."""
-        if not self.is_awaited:
-            for device in self._devices:
-                device.has_changed = True  # the caller may have changed its engine
         clock, faults = self.clock, self.faults
         now = clock.now()
         if faults.due_at <= now:
@@ -205,9 +198,6 @@ class SimulatedBus:
         """Call every engine that is due; each device queues one frame at a time."""
         anything_happened = False
         for device in self._devices:
-            if not device.has_changed and (device.deadline is None or device.deadline > now):
-                continue
-            device.has_changed = False
             engine = device.engine
             device.deadline = engine.deadline()
             if device.deadline is not None and device.deadline <= now:
@@ -224,7 +214,6 @@ class SimulatedBus:
         if anything_happened:
             for device in self._devices:
                 device.deadline = device.engine.deadline()
-                device.has_changed = True
 
     def _arbitrate(self) -> None:
         waiting = [node for node in self._nodes if node.outbox]
@@ -253,7 +242,6 @@ class SimulatedBus:
             self._sending, bits = (winners, frame), frame_bits(frame)
             for node in winners:
                 node.outbox.popleft()
-                node.has_changed = True
                 if node.tx_errors:
                     node.tx_errors -= 1
         taken_s = bits / self._bitrate_bps
@@ -299,7 +287,6 @@ class SimulatedBus:
             for device in self._devices:
                 if device not in senders:
                     device.engine.receive(carried, ends_at)
-                    device.has_changed = True
             for host in self._hosts:
                 if host not in senders and self.faults.takes_part:
                     host.inbox.append(carried)
@@ -316,7 +303,6 @@ def _count_error(node: _Node) -> None:
     if node.tx_errors >= _OFF:
         node.tx_errors = 0
         node.outbox.popleft()
-        node.has_changed = True
 
 
 class SimulatedLink:
@@ -356,15 +342,11 @@ class SimulatedLink:
         """Advance the bus until a frame arrives or the deadline comes."""
         bus, inbox = self._bus, self._host.inbox
         self._check_plugged("receiving")
-        try:
-            while not inbox:
-                if bus.clock.now() >= deadline:
-                    return None
-                bus.advance(deadline)
-                bus.is_awaited = True
-                self._check_plugged("receiving")
-        finally:
-            bus.is_awaited = False
+        while not inbox:
+            if bus.clock.now() >= deadline:
+                return None
+            bus.advance(deadline)
+            self._check_plugged("receiving")
         frame = inbox.popleft()
         self._health.count_frame(frame)
         return frame

@@ -317,7 +317,6 @@ class PlanBus(SimulatedBus):
         for device in self._devices:
             if device not in senders and device is not self._agenda_node and not frame.is_error:
                 device.engine.receive(frame, now)
-                device.has_changed = True
         if self.faults.takes_part:
             for host in self._hosts:
                 if host not in senders:
