@@ -20,15 +20,21 @@ def shows(plan: plans.Plan, kind: str) -> bool:
 
 
 def shrink(
-    plan: plans.Plan, kind: str, *, is_bad: Callable[[plans.Plan, str], bool] = shows
+    plan: plans.Plan,
+    kind: str,
+    *,
+    is_bad: Callable[[plans.Plan, str], bool] = shows,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> plans.Plan:
-    """Return the shortest plan found that still ends in a violation of this kind."""
+    """Return the shortest plan found, until it is over, that still ends in a violation of this
+    kind.
+    """
     tries = TRIES
 
     def is_still_bad(shorter: plans.Plan) -> bool:
         nonlocal tries
         tries -= 1
-        return tries >= 0 and is_bad(shorter, kind)
+        return tries >= 0 and not is_over() and is_bad(shorter, kind)
 
     events = [*plan.events]
     lasting = [each for each in plan.clauses if each not in events]

@@ -39,7 +39,7 @@ def test_a_campaign_prints_what_happened_and_what_was_reached(
     out = capsys.readouterr().out
     assert out.startswith("6 runs, ")
     assert "places reached" in out
-    assert out.endswith("canaries found: 1\nno violation\n")
+    assert out.endswith("canaries found: 1\nno violation in 6 runs\n")
 
 
 @pytest.mark.slow
@@ -98,6 +98,9 @@ def test_shards_with_ledgers_add_up_to_the_whole_campaign(
     merged = json.loads(capsys.readouterr().out.splitlines()[-1])["result"]
     for key in merged.keys() - {"cpu_s"}:
         assert merged[key] == whole[key], key
+    # A canary that is in another part is not missed in this one.
+    assert main(["simulate", "--runs", "9", "--shard", "2/2"]) == ExitCode.OK
+    assert "no canary in this part" in capsys.readouterr().out
     assert main(["simulate", "merge", str(files[0])]) == ExitCode.PARTIAL
     assert "MISSING: seeds " in capsys.readouterr().out
 

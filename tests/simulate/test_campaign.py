@@ -8,6 +8,8 @@ import pytest
 
 from flasher.simulate import campaign
 from flasher.simulate.campaign import Batch, Found, Result, batches, campaign_key, run_batch
+from flasher.simulate.plan import Plan
+from flasher.simulate.shrink import shrink
 
 
 def summed(sizes: int) -> Result:
@@ -80,3 +82,15 @@ def test_a_campaign_without_a_canary_that_was_found_is_blind(
     assert missed.canaries_missed == {campaign.CANARIES[0]: 1}
     assert missed.is_blind
     assert Result("key").is_blind
+
+
+def test_shrinking_ends_when_it_is_over() -> None:
+    plan = Plan.parse("job packets=3 ; mock ; @packet1 drop ; @packet2 drop ; @packet3 power")
+    played: list[Plan] = []
+
+    def is_bad(shorter: Plan, _kind: str) -> bool:
+        played.append(shorter)
+        return True
+
+    assert shrink(plan, "LOST", is_bad=is_bad, is_over=lambda: len(played) == 1) == played[0]
+    assert len([*played[0].events]) < 3

@@ -27,7 +27,6 @@ from flasher.protocol.text import printable
 from flasher.simulate.campaign import (
     NO_FAULT,
     Batch,
-    Found,
     Result,
     Tally,
     batches,
@@ -170,16 +169,20 @@ def simulate(output: Output, chosen: Campaign) -> int:
                 bar.move_to(min(round(took_s), chosen.for_s), chosen.for_s)
 
         _run(todo, chosen, add, is_over)
+        took_s = time.perf_counter() - began_s
+        first = next(iter(total.violations), None)
+        if first is not None and first.kind != KILLED and not stopped():
+            output.progress("Shrinking the first violation; Ctrl-C ends that.")
+            plan = shrink(Plan.parse(first.plan), first.kind, is_over=stopped)
+            total = replace(
+                total, violations=(replace(first, plan=str(plan)), *total.violations[1:])
+            )
         was_stopped = stopped()
-    took_s = time.perf_counter() - began_s
-    first = next(iter(total.violations), None)
-    if first is not None and first.kind != KILLED and not was_stopped:
-        output.progress("Shrinking the first violation.")
-        total = replace(total, violations=(_shrunk(first), *total.violations[1:]))
     rate = 60 * (total.runs - before) / took_s if took_s else 0.0
     output.result(f"{counted(total.runs, 'run')}, {rate:,.0f} a minute")
-    _tell(total, output)
-    code = _exit_code(total, is_strict=chosen.strict, is_shard=chosen.shard is not None)
+    is_shard = chosen.shard is not None
+    _tell(total, output, is_shard=is_shard)
+    code = _exit_code(total, is_strict=chosen.strict, is_shard=is_shard)
     if was_stopped and code is ExitCode.OK:
         code = ExitCode.INTERRUPTED
     return output.document(total, exit_code=code)
@@ -209,11 +212,7 @@ def _exit_code(total: Result, *, is_strict: bool, is_shard: bool = False) -> Exi
     return ExitCode.PARTIAL if failed else ExitCode.OK
 
 
-def _shrunk(found: Found) -> Found:
-    return replace(found, plan=str(shrink(Plan.parse(found.plan), found.kind)))
-
-
-def _tell(total: Result, output: Output) -> None:
+def _tell(total: Result, output: Output, *, is_shard: bool = False) -> None:
     """Print the sum of a campaign."""
     if total.tallies:
         output.table(_rows(total.tallies), indent=2)
@@ -226,6 +225,8 @@ def _tell(total: Result, output: Output) -> None:
     found = sum(total.canaries_found.values())
     if found:
         output.result(f"canaries found: {found}")
+    elif is_shard and not total.canaries_missed:
+        output.result("no canary in this part: `flasher simulate merge` judges that")
     elif total.is_blind and not total.canaries_missed:
         output.result("BLIND: no canary was tried")
     for each in total.violations:
@@ -234,7 +235,7 @@ def _tell(total: Result, output: Output) -> None:
     if total.violation_count > len(total.violations):
         output.result(f"{total.violation_count:,} violations in all")
     if not total.violation_count:
-        output.result("no violation")
+        output.result(f"no violation in {counted(total.runs, 'run')}")
 
 
 def _rows(tallies: Mapping[str, Tally]) -> Iterator[Sequence[str]]:
