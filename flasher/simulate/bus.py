@@ -17,15 +17,23 @@ from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.simulate import plan as plans
-from flasher.simulate.independent import ACK, NAK, REPORT, IndependentDevice, frames_of
+from flasher.simulate.independent import (
+    ACK,
+    FEEDBACK,
+    NAK,
+    REPORT,
+    UPDATE,
+    IndependentDevice,
+    frames_of,
+)
 
 INBOX_FRAMES: Final = 4096
 """Frames that an adapter's driver keeps for a computer that pauses."""
 ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=True)
 """Form error of the bus, as Linux reports it."""
 _ROUNDING_S: Final = 1e-9
-_UPDATE: Final = b"\xa1\x0b"
-_HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", b"\x55\x03"
+_UPDATE: Final = UPDATE.to_bytes(2, "big")
+_HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
 _NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
 
 

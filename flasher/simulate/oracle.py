@@ -13,21 +13,10 @@ from flasher.protocol.spec import FRAMES_PER_PACKET
 from flasher.simulate import plan as plans
 from flasher.simulate.wire_rules import WireRules
 
-DOCUMENTED: Final = frozenset(
-    {
-        ExitCode.OK,
-        ExitCode.IMAGE,
-        ExitCode.BUS,
-        ExitCode.NO_ANSWER,
-        ExitCode.WRONG_DEVICE,
-        ExitCode.TRANSFER,
-        ExitCode.REFUSED,
-        ExitCode.UNCONFIRMED,
-        ExitCode.VERIFICATION,
-        ExitCode.INTERRUPTED,
-    }
-)
-"""Exit codes of `flasher flash --help` that a plan can cause."""
+DOCUMENTED: Final = frozenset(ExitCode) - {
+    ExitCode.INTERNAL, ExitCode.USAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
+}  # fmt: skip
+"""Exit codes that a plan can cause."""
 LATEST: Final = 1.001
 """Latest end as a share of the announced deadline: a message that has begun is finished."""
 _BLOCKS: Final = (plans.Load, plans.Unplug, plans.BusOff)

@@ -62,7 +62,6 @@ OVERDUE_S: Final = 60.0
 """A run that is so much later than its announced deadline has not ended."""
 _VECTORS: Final = struct.pack("<4I", 0x2000_5000, 0x0800_4101, 0, 0)
 """Vector table of a Cortex-M: stack pointer, reset vector, no NMI and no hard fault handler."""
-_BOOT_NAMES: Final = {"bms": b"BMS", "wmc": b"WMC", "obc": b"PBU"}
 _OPERATOR_S: Final = 8.0
 """Time in which the operator of the recovery follows a prompt; the supply is then off so long."""
 
@@ -89,7 +88,6 @@ class Verdict:
     """Empty if the host was right."""
     recovered: str = ""
     """Command that brought the device back after a run without success; empty if none had to."""
-    had_twin: bool = False
     runs: int = 1
     reached: frozenset[str] = frozenset()
     """What the run passed through: faults with the phase in which they happened."""
@@ -323,7 +321,7 @@ class Player:
         command, data = {
             "ack": (ACK, number),
             "nak": (NAK, number),
-            "boot": (BOOT_VERSION, _BOOT_NAMES[self.target.name] + b"V1.0.0"),
+            "boot": (BOOT_VERSION, self.target.boot_name.encode() + b"V1.0.0"),
             "request": (REQUEST, b"\0\0"),
             "complete": (COMPLETE, b"\0\0"),
             "feedback": (FEEDBACK, b"ACK"),
@@ -406,7 +404,6 @@ class Player:
             share_of_bus_time=took_s / self.image_plan.wire_s,
             violations=tuple(violations),
             recovered=recovered,
-            had_twin=len(self.units) > 1,
             runs=runs,
             reached=frozenset(self._reached),
             wire=self._digest.hexdigest()[:16],

@@ -12,14 +12,23 @@ from typing import Final, NamedTuple
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
-from flasher.simulate.independent import ACK, BOOT_VERSION, VERSION
+from flasher.simulate.independent import (
+    ACK,
+    BOOT_VERSION,
+    END,
+    PACKET,
+    RESET,
+    UPDATE,
+    VERSION,
+)
 
 REPEAT_MARGIN_S: Final = 0.05
 """A repetition that was queued before an answer came begins at most so much later."""
 _TOLERANCE_S: Final = 0.005
 """Frames before it on the bus make a frame later than the host sends it."""
-_COMMANDS: Final = {b"\x42\x05": "reset", b"\xa1\x0b": "update", b"\xa3\x85": "packet"} | {
-    b"\xa4\x01": "end"
+_COMMANDS: Final = {
+    command.to_bytes(2, "big"): name
+    for command, name in ((RESET, "reset"), (UPDATE, "update"), (PACKET, "packet"), (END, "end"))
 }
 _CAUSES_REPETITION: Final = (
     plans.OnFrames, plans.Noise, plans.Unsolicited, plans.Answer, plans.Tool, plans.Load,
