@@ -10,20 +10,16 @@ fails when a mistake is not found.
 
 from __future__ import annotations
 
-import argparse
-import os
-import statistics
 import sys
 import time
 import tomllib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 from flasher.simulate.planting import Bug, Edit, swapped
+from tests.campaigns.hunts import run
 from tests.campaigns.line_world.play import draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 from tests.campaigns.line_world.world import STUCK
@@ -80,6 +76,10 @@ class Found:
     def acts(self) -> int:
         return len(Story.parse(self.story).acts)
 
+    @property
+    def is_found(self) -> bool:
+        return bool(self.kind)
+
     def lines(self) -> Iterator[str]:
         head = f"{self.bug.name:34} {self.kind or 'NOT FOUND':12} {self.seconds:5.1f} s"
         yield f"{head} {self.steps:6} steps" + (f" {self.acts:3} acts" if self.kind else "")
@@ -117,43 +117,13 @@ def find(bug: LineBug, seed: int, limit_s: float, *, shrinks: bool) -> Found:
     return Found(bug, "", "", took_s, steps, "", not_ours)
 
 
-def _say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("bugs", nargs="*", metavar="NAME", help="how names begin; all by default")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
-    parser.add_argument("--seed", type=int, default=0, help="of the first story")
-    parser.add_argument(
-        "--seconds", type=float, default=LIMIT_S, help="computing time for each, without shrinking"
-    )
-    parser.add_argument("--no-shrink", action="store_true")
-    chosen = parser.parse_args()
-    bugs = [bug for bug in read_bugs() if bug.name.startswith(tuple(chosen.bugs) or "")]
-    if not bugs:
-        parser.error(f"no mistake has such a name: {', '.join(chosen.bugs)}")
-    found: list[Found] = []
-    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
-        search = partial(
-            find, seed=chosen.seed, limit_s=chosen.seconds, shrinks=not chosen.no_shrink
-        )
-        for future in as_completed([pool.submit(search, bug) for bug in bugs]):
-            found.append(future.result())
-            _say("\n".join([*found[-1].lines(), ""]))
-    good = [each for each in found if each.kind]
-    _say(f"{len(good)} of {len(bugs)} found")
-    if good:
-        seconds = statistics.median(each.seconds for each in good)
-        steps = statistics.median(each.steps for each in good)
-        acts = statistics.median(each.acts for each in good)
-        _say(f"medians: {seconds:.1f} s, {steps:g} steps, {acts:g} acts of the shrunk story")
-    return int(len(good) < len(bugs))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(
+        run(
+            __doc__,
+            read_bugs(),
+            find,
+            limit_s=LIMIT_S,
+            figures={"steps": lambda each: each.steps, "acts of the story": lambda each: each.acts},
+        )
+    )

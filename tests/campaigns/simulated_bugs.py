@@ -9,15 +9,10 @@ fails when a mistake is not found.
 
 from __future__ import annotations
 
-import argparse
-import os
-import statistics
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 from flasher.simulate import plan as plans
@@ -25,6 +20,7 @@ from flasher.simulate.draw import drawn
 from flasher.simulate.planting import UpgradeBug, swapped, upgrade_bugs
 from flasher.simulate.play import play
 from flasher.simulate.shrink import shows, shrink
+from tests.campaigns.hunts import run
 
 LIMIT_S: Final = 10.0
 
@@ -41,6 +37,10 @@ class Hunted:
     runs: int
     plan: str
     faults: int
+
+    @property
+    def is_found(self) -> bool:
+        return bool(self.violation)
 
     def lines(self) -> Iterator[str]:
         kind = self.violation.partition(":")[0] or "NOT FOUND"
@@ -80,40 +80,13 @@ def hunt(bug: UpgradeBug, seed: int, limit_s: float, *, shrinks: bool) -> Hunted
     return Hunted(bug, "", took_s, runs, "", 0)
 
 
-def say(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("bugs", nargs="*", metavar="NAME", help="how names begin; all by default")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at once")
-    parser.add_argument("--seed", type=int, default=0, help="of the first plan")
-    parser.add_argument("--seconds", type=float, default=LIMIT_S, help="computing time for each")
-    parser.add_argument("--no-shrink", action="store_true")
-    chosen = parser.parse_args()
-    bugs = [bug for bug in upgrade_bugs() if bug.name.startswith(tuple(chosen.bugs) or "")]
-    if not bugs:
-        parser.error(f"no mistake has such a name: {', '.join(chosen.bugs)}")
-    found: list[Hunted] = []
-    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
-        search = partial(
-            hunt, seed=chosen.seed, limit_s=chosen.seconds, shrinks=not chosen.no_shrink
-        )
-        for future in as_completed([pool.submit(search, bug) for bug in bugs]):
-            found.append(future.result())
-            say("\n".join([*found[-1].lines(), ""]))
-    good = [each for each in found if each.violation]
-    say(f"{len(good)} of {len(bugs)} found")
-    if good:
-        seconds = statistics.median(each.seconds for each in good)
-        faults = statistics.median(each.faults for each in good)
-        say(f"medians: {seconds:.1f} s, {faults:g} faults")
-    return int(len(good) < len(bugs))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(
+        run(
+            __doc__,
+            upgrade_bugs(),
+            hunt,
+            limit_s=LIMIT_S,
+            figures={"faults": lambda each: each.faults},
+        )
+    )
