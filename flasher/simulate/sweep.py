@@ -3,7 +3,7 @@
 A sweep has parts, each with its number of cases known before it runs. The places are those of the
 upgrade without faults, which is played first: its frames, messages and flash operations. `limits`
 has a plan just before, at and just after each time limit; `NOT_REACHED` names those that no plan
-reaches. `crc` plays nothing: it decides for all errors of a few bits by `flasher.simulate.errors`.
+reaches. `crc` plays nothing: `crc_errors` decides for all errors of a few bits.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from flasher.protocol.spec import BOOT_VERSION_BURST, FRAME_DATA_SIZE, MESSAGE_M
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.campaign import VIOLATIONS_MAX, Found
-from flasher.simulate.errors import ErrorsOfSize
+from flasher.simulate.crc_errors import ErrorsOfSize
 from flasher.simulate.independent import (
     ACK,
     BOOT_VERSION,

@@ -9,9 +9,9 @@ from itertools import combinations
 import pytest
 
 from flasher.protocol.timing import Timings
-from flasher.simulate import errors, sweep
+from flasher.simulate import crc_errors, sweep
 from flasher.simulate import plan as plans
-from flasher.simulate.errors import ErrorsOfSize
+from flasher.simulate.crc_errors import ErrorsOfSize
 from flasher.simulate.independent import ACK, BOOT_VERSION, END, PACKET
 from flasher.simulate.plan import Plan, When
 from flasher.simulate.planting import Bug, Edit, swapped, upgrade_bugs
@@ -216,7 +216,7 @@ def test_the_errors_that_a_short_crc_misses_are_as_many_as_those_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A CRC of 6 bits misses many, and is affine too."""
-    monkeypatch.setattr(errors, "BURST_BITS", 10)
+    monkeypatch.setattr(crc_errors, "BURST_BITS", 10)
     size = 11
     bits = [1 << 8 * (size - place) - 1 - bit for place in (2, 4, 6, 7, 8, 9) for bit in range(8)]
     rest = sum(1 << 8 * (size - 1 - place) for place in (0, 1, 3, 5, 10)) * 0xFF
@@ -233,7 +233,7 @@ def test_the_errors_that_a_short_crc_misses_are_as_many_as_those_tried(
     with swapped(short_crc().codes()):
         counts, violations = ErrorsOfSize(size).examine()
         for kind, each_error in tried.items():
-            found = errors.received(kind, errors.message_of(size), each_error)
+            found = crc_errors.received(kind, crc_errors.message_of(size), each_error)
             assert found == {name: counts[name] for name in found}
             assert found[f"{kind}: undetected"] > 0
     assert len(violations) >= len(tried)
