@@ -60,6 +60,10 @@ other tools, duplicate devices, pauses of this computer. Success is believed onl
 flash equals the image; after a failure the device must be brought back by the commands that the
 documentation advises. Nothing is sent to a real bus.
 
+In the table, `again` is how many failed runs the same command brought back without faults,
+`rescued` how many `flasher rescue` did, and `median time` that of the successful ones, as a
+multiple of the time on the bus.
+
 The first violation is printed as the shortest plan that shows it, with a command that replays it on
 any computer; exit code 12. Every campaign also plants a mistake into its own process (a canary),
 which it has to find; a campaign that misses it is blind, exit code 12 as well.
