@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from multiprocessing.connection import Connection
-from typing import Final
+from queue import SimpleQueue
+from threading import Event, Lock
+from typing import Final, Self
 
 from flasher.processes import end_with_parent, signals_blocked
 from flasher.simulate.campaign import NO_FAULT, Batch, Found, Result, Tally, run_batch
@@ -35,13 +28,12 @@ _FIRST_RUNS: Final = 10
 _NICENESS: Final = 10
 _POLL_S: Final = 0.1
 _JOIN_S: Final = 5.0
+_RUN_S: Final = 60.0
+"""CPU time that a run may take; most take some 10 ms."""
 
 RunBatch = Callable[[Batch, Callable[[], bool]], Result]
 """`campaign.run_batch`; a function that processes can import by its name."""
 OnResult = Callable[[Batch, Result], None]
-
-_stop: ctypes.c_bool
-"""In the processes. Without a lock: one that is killed would keep it."""
 
 
 class Pace:
@@ -80,72 +72,117 @@ def run(
     run_one: RunBatch = run_batch,
 ) -> None:
     """Run batches, cut by time, on `jobs` processes; report each result as it comes, once stopped
-    those of the runs until then. Batches whose process may have been killed run again, seed by
-    seed (`run_alone`).
+    those of the runs until then. A batch whose process is killed runs again, seed by seed
+    (`run_alone`). `is_stopped` is called from several threads.
     """
-    pace = Pace()
+    pace, parts_lock = Pace(), Lock()
     parts = pace.cut(batches)
+    ended = SimpleQueue[tuple[Batch, Result] | None]()
+    has_failed = Event()
 
-    def report(batch: Batch, result: Result) -> None:
-        pace.add(result)
-        on_result(batch, result)
+    def stops() -> bool:
+        return has_failed.is_set() or is_stopped()
 
-    while not is_stopped():
-        suspects = _run_in_pool(parts, jobs, report, is_stopped, run_one)
-        if not suspects:
-            return
-        alone = partial(run_alone, is_stopped=is_stopped, run_one=run_one)
-        with ThreadPoolExecutor(jobs) as threads:
-            for batch, result in zip(suspects, threads.map(alone, suspects), strict=True):
-                report(batch, result)
-
-
-def _run_in_pool(
-    parts: Iterator[Batch],
-    jobs: int,
-    report: OnResult,
-    is_stopped: Callable[[], bool],
-    run_one: RunBatch,
-) -> list[Batch]:
-    """Run batches until all are done, the run is stopped, or a process is killed; return those
-    whose results are then lost.
-    """
-    context = multiprocessing.get_context("spawn")
-    stop = context.RawValue(ctypes.c_bool)
-    running: dict[Future[Result], Batch] = {}
-    lost: list[Batch] = []
-    with ProcessPoolExecutor(jobs, context, _begin, (stop,)) as pool:
+    def run_parts() -> None:
         try:
-            while True:
-                while not (lost or is_stopped()) and len(running) <= jobs:
-                    batch = next(parts, None)
+            with _Worker(run_one) as worker:
+                while not stops():
+                    with parts_lock:
+                        batch = next(parts, None)
                     if batch is None:
-                        break
+                        return
                     try:
-                        with signals_blocked():
-                            running[pool.submit(_run_one, run_one, batch)] = batch
-                    except BrokenProcessPool:
-                        lost.append(batch)
-                if not running:
-                    return lost
-                for future in wait(running, _POLL_S, FIRST_COMPLETED).done:
-                    batch = running.pop(future)
-                    try:
-                        result = future.result()
-                    except BrokenProcessPool:
-                        lost.append(batch)
-                    else:
-                        report(batch, result)
-                if is_stopped():
-                    stop.value = True
+                        result = worker.run(batch, stops)
+                    except EOFError:
+                        result = run_alone(batch, stops, run_one)
+                    with parts_lock:
+                        pace.add(result)
+                    ended.put((batch, result))
+        except BaseException:
+            has_failed.set()
+            raise
         finally:
-            stop.value = True  # an error of one ends the others
+            ended.put(None)
+
+    with ThreadPoolExecutor(jobs) as threads:
+        try:
+            workers = [threads.submit(run_parts) for _ in range(jobs)]
+            for _ in workers:
+                for batch, result in iter(ended.get, None):
+                    on_result(batch, result)
+            for worker in workers:
+                worker.result()
+        finally:
+            has_failed.set()  # an error of one ends the others
 
 
-def _begin(stop: ctypes.c_bool) -> None:
-    global _stop  # noqa: PLW0603  a process of the pool has no other place
-    _stop = stop
-    _begin_process()
+class _Worker:
+    """A process that runs batches, one at a time, through a pipe of its own: a process that is
+    killed while it reads from a shared queue keeps the lock of the queue. A new process replaces
+    one that was killed.
+    """
+
+    def __init__(self, run_one: RunBatch) -> None:
+        self._run_one = run_one
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._pipe: Connection | None = None
+        self.exit_code: int | None = None
+        """Of the process that was killed last."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
+
+    def run(self, batch: Batch, is_stopped: Callable[[], bool]) -> Result:
+        """Run a batch; once stopped, return the result of the runs until then.
+
+        Raises EOFError if the process is killed, and the error that `run_one` raises.
+        """
+        if self._pipe is None:
+            self._pipe = self._started()
+        is_told = False
+        try:
+            self._pipe.send(batch)
+            while not self._pipe.poll(_POLL_S):
+                if is_stopped() and not is_told:
+                    self._pipe.send(None)
+                    is_told = True
+            result: Result | Exception = self._pipe.recv()
+        except (EOFError, OSError) as error:  # OSError: while it sent
+            if self._process is not None:
+                self._process.join(_JOIN_S)
+            self._end()
+            raise EOFError from error
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def _started(self) -> Connection:
+        context = multiprocessing.get_context("spawn")
+        pipe, far_end = context.Pipe()
+        # The workers of a cluster are daemons, which `multiprocessing` lets start no process so
+        # that none remains; this one ends with its parent.
+        config = multiprocessing.current_process()._config  # type: ignore[attr-defined]  # noqa: SLF001
+        is_daemon = config.pop("daemon", None)
+        try:
+            self._process = context.Process(target=_run_each, args=(self._run_one, far_end, _RUN_S))
+            with signals_blocked():
+                self._process.start()
+        finally:
+            far_end.close()
+            if is_daemon is not None:
+                config["daemon"] = is_daemon
+        return pipe
+
+    def _end(self) -> None:
+        if self._process is not None and self._pipe is not None:
+            self._process.kill()
+            self._process.join()
+            self.exit_code = self._process.exitcode
+            self._pipe.close()
+            self._pipe = None
 
 
 def _begin_process() -> None:
@@ -155,8 +192,36 @@ def _begin_process() -> None:
         os.nice(_NICENESS)
 
 
-def _run_one(run_one: RunBatch, batch: Batch) -> Result:
-    return run_one(batch, lambda: bool(_stop.value))
+def _run_each(run_one: RunBatch, pipe: Connection, run_s: float) -> None:
+    """In the process: run what comes through the pipe; anything that comes meanwhile is a stop."""
+    _begin_process()
+    while True:
+        try:
+            batch: Batch | None = pipe.recv()
+        except EOFError:  # the parent ended
+            return
+        if batch is None:  # a stop that came too late
+            continue
+        result: Result | Exception
+        try:
+            with _time_limit(run_s * batch.count):
+                result = run_one(batch, pipe.poll)
+        except Exception as error:  # noqa: BLE001  for the parent
+            result = error
+        pipe.send(result)
+
+
+@contextmanager
+def _time_limit(limit_s: float) -> Iterator[None]:
+    """End this process by SIGPROF if the block takes more CPU time. Does nothing on Windows."""
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+    signal.setitimer(signal.ITIMER_PROF, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
 
 
 def run_alone(
@@ -167,83 +232,40 @@ def run_alone(
     """
     total = Result(batch.campaign)
     seed, end, suspect = batch.first, batch.first + batch.count, -1
-    while seed < end and not is_stopped():
-        part = replace(batch, first=seed, count=1 if seed == suspect else end - seed)
-        with _process(run_one, part) as (process, results):
-            while seed < part.first + part.count and not is_stopped():
-                try:
-                    if not results.poll(_POLL_S):
-                        continue
-                    result: Result | Exception = results.recv()
-                except EOFError:
-                    process.join(_JOIN_S)
-                    if seed == suspect:
-                        result = _killed(batch, seed, process.exitcode)
-                    else:
-                        suspect = seed
-                        break
-                if isinstance(result, Exception):
-                    raise result
-                total += replace(result, canaries_missed={})
-                if total.canaries_found:
-                    return total
-                seed += 1
+    with _Worker(run_one) as worker:
+        while seed < end and not is_stopped():
+            try:
+                result = worker.run(replace(batch, first=seed, count=1), is_stopped)
+            except EOFError:
+                if seed != suspect:
+                    suspect = seed
+                    continue
+                result = _killed(batch, seed, worker.exit_code)
+            total += replace(result, canaries_missed={})
+            if total.canaries_found:
+                return total
+            seed += 1
     if batch.canary and seed == end:
         return replace(total, canaries_missed={batch.canary: 1})
     return total
-
-
-@contextmanager
-def _process(
-    run_one: RunBatch, batch: Batch
-) -> Iterator[tuple[multiprocessing.process.BaseProcess, Connection]]:
-    """Start a process that sends the result of each seed; it ends with the block."""
-    context = multiprocessing.get_context("spawn")
-    results, sending = context.Pipe(duplex=False)
-    # The workers of a cluster are daemons, which `multiprocessing` lets start no process so that
-    # none remains; this one ends with its parent.
-    config = multiprocessing.current_process()._config  # type: ignore[attr-defined]  # noqa: SLF001
-    is_daemon = config.pop("daemon", None)
-    try:
-        process = context.Process(target=_send_each, args=(run_one, batch, sending))
-        with signals_blocked():
-            process.start()
-    finally:
-        sending.close()
-        if is_daemon is not None:
-            config["daemon"] = is_daemon
-    try:
-        yield process, results
-    finally:
-        process.kill()
-        process.join()
-        results.close()
-
-
-def _send_each(run_one: RunBatch, batch: Batch, sending: Connection) -> None:
-    _begin_process()
-    for seed in range(batch.first, batch.first + batch.count):
-        try:
-            sending.send(run_one(replace(batch, first=seed, count=1), lambda: False))
-        except Exception as error:  # noqa: BLE001  for the parent
-            sending.send(error)
-            return
 
 
 def _killed(batch: Batch, seed: int, exit_code: int | None) -> Result:
     """Result of a run that ended its process."""
     if batch.canary:
         return Result(batch.campaign, canaries_found={batch.canary: 1}, canary_runs=1)
-    how = f"exit code {exit_code}"
+    how = f"ended its process: exit code {exit_code}"
     if exit_code is not None and exit_code < 0:
-        how = signal.Signals(-exit_code).name
+        how = f"ended its process: {signal.Signals(-exit_code).name}"
+        if how.endswith("SIGPROF"):
+            how = f"took more than {_RUN_S:g} s of CPU time"
     plan = drawn(seed)
     return Result(
         batch.campaign,
         runs=1,
         endings={"killed": 1},
         tallies={name: Tally(runs=1) for name in {each.NAME for each in plan.events} or {NO_FAULT}},
-        violations=(Found(seed, KILLED, f"the run ended its process: {how}", str(plan)),),
+        violations=(Found(seed, KILLED, f"the run {how}", str(plan)),),
         violation_count=1,
         digest=hashlib.sha256(f"{seed} {KILLED}".encode()).hexdigest()[:16],
     )

@@ -71,6 +71,18 @@ def run_killing_once(batch: Batch, is_stopped: Callable[[], bool] = lambda: Fals
     return run_quickly(batch, is_stopped)
 
 
+def run_endlessly(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
+    """Run `KILLER` never ends."""
+    while KILLER in range(batch.first, batch.first + batch.count):
+        pass
+    return run_quickly(batch, is_stopped)
+
+
+def run_failing(batch: Batch, _is_stopped: Callable[[], bool] = lambda: False) -> Result:
+    """The process raises an error, which no run of a campaign does."""
+    raise FileNotFoundError(batch.campaign)
+
+
 def run_slowly(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
     """Run as long as is stated, so that a process can be killed meanwhile."""
     time.sleep(0.02 * batch.count)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from flasher.simulate import workers
 from flasher.simulate.campaign import Batch, Found, Result, batches, campaign_key, run_batch
 from flasher.simulate.draw import drawn
 from flasher.simulate.workers import Pace, RunBatch, run, run_alone
@@ -18,6 +19,8 @@ from .quick import (
     FOLDER,
     KILLER,
     no_result,
+    run_endlessly,
+    run_failing,
     run_killing,
     run_killing_once,
     run_quickly,
@@ -101,16 +104,36 @@ def test_workers_that_are_killed_change_nothing() -> None:
 
     def kill_one(_batch: Batch, result: Result) -> None:
         results.append(result)
-        workers = multiprocessing.active_children()
-        if len(killed) < 2 and workers:
-            killed.append(workers[0].pid)
-            workers[0].kill()
+        alive = multiprocessing.active_children()
+        if len(killed) < 2 and alive:
+            killed.append(alive[0].pid)
+            alive[0].kill()
 
     run(some, 2, on_result=kill_one, is_stopped=never, run_one=run_slowly)
     assert len(set(killed)) == 2
     assert text_of(sum(results[1:], results[0])) == text_of(
         sum(map(run_quickly, some), no_result())
     )
+
+
+def test_a_run_without_an_end_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_RUN_S", 0.2)
+    found = run_alone(Batch(campaign_key(), KILLER, 2), never, run_endlessly)
+    assert [(each.seed, each.text) for each in found.violations if each.kind == "KILLED"] == [
+        (KILLER, "the run took more than 0.2 s of CPU time")
+    ]
+    assert found.runs == 2
+
+
+def test_an_error_of_a_process_ends_the_campaign() -> None:
+    with pytest.raises(FileNotFoundError):
+        run(
+            without_canaries(100_000, 100_000),
+            2,
+            on_result=lambda *_: None,
+            is_stopped=never,
+            run_one=run_failing,
+        )
 
 
 def test_alone_a_stopped_batch_has_its_first_runs() -> None:
