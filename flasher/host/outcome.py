@@ -81,7 +81,7 @@ def describe_progress(phase: Phase, packet: int | None, total_packets: int, atte
 
 @json_keys(
     "ending phase packet device_left boot_version running_version detail statistics"
-    " sent_into_silence"
+    " sent_into_silence unobserved_s"
 )
 @dataclass(frozen=True)
 class Outcome:
@@ -106,6 +106,9 @@ class Outcome:
     sent_into_silence: bool = False
     """A silent device got an update command, in case an earlier upgrade left it in its transfer
     (R26)."""
+    unobserved_s: float = 0.0
+    """Time since the update command in which the adapter was away, in seconds: whether another tool
+    wrote to the device then is not known, and the device cannot be asked."""
 
     @property
     def ok(self) -> bool:

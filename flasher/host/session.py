@@ -181,10 +181,10 @@ class UpgradeSession(Runner[Result]):
 
     def link_back(self, now: float) -> None:
         """Continue after the lost adapter was opened again."""
-        self.now = now
+        away_s, self.now = now - self.now, now
         self._losses += 1
         if self._checking is None:
-            self.interrupt(LinkRestored())
+            self.interrupt(LinkRestored(away_s))
 
     # -- from stage to stage ---------------------------------------------------------------------
 

@@ -84,7 +84,11 @@ _DEVICE_LEFT: Final = {
 
 
 class LinkRestored(Exception):  # noqa: N818  not an error
-    """The lost adapter was opened again."""
+    """The lost adapter was opened again, after `away_s` seconds."""
+
+    def __init__(self, away_s: float) -> None:
+        super().__init__(away_s)
+        self.away_s = away_s
 
 
 class SecondToolSeen(Exception):  # noqa: N818  not an error
@@ -125,6 +129,8 @@ class _Attempt:
     """Time of the first of the consecutive boot versions since end of transfer."""
     announced_last_at: float = 0.0
     running_version: str | None = None
+    unobserved_s: float = 0.0
+    """Time since the update command in which the adapter was away."""
 
 
 class UpgradeStage:
@@ -314,7 +320,8 @@ class UpgradeStage:
             is_stopping = self._ending is not None
             try:
                 came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
-            except LinkRestored:
+            except LinkRestored as restored:
+                self._at.unobserved_s += restored.away_s if self._is_updating else 0.0
                 self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * DROP_MARGIN)
                 self._heard_at = self._run.now  # it may have sent something meanwhile
                 self._dispatch(UpgradeEvent.LINK_BACK)
@@ -1019,6 +1026,7 @@ class UpgradeStage:
             detail=detail,
             waiver=self.unchecked.waiver if self.unchecked and ending is Ending.UNCHECKED else "",
             sent_into_silence=self._silence_was_answered,
+            unobserved_s=self._at.unobserved_s,
         )
 
 
@@ -1047,8 +1055,8 @@ class Upgrade(Runner[Outcome]):
 
     def link_back(self, now: float) -> None:
         """Continue after the lost adapter was opened again."""
-        self.now = now
-        self.interrupt(LinkRestored())
+        away_s, self.now = now - self.now, now
+        self.interrupt(LinkRestored(away_s))
 
     def second_tool(self, description: str, now: float) -> None:
         """Handle a frame of a second tool, described by `description`."""

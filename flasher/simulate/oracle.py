@@ -59,8 +59,9 @@ class Violation:
 
     @property
     def is_excused(self) -> bool:
-        """True for a success beside a device that sent nothing in the transfer: nothing on the bus
-        shows that it is there (docs/explanation/safety.md, "What stays unseen").
+        """True for a success beside a device that sent nothing in the transfer, or one that reports
+        that the adapter was away while another tool may have written to the device: the bus shows
+        neither (docs/explanation/safety.md, "What stays unseen").
         """
         return self.kind == "UNSEEN"
 
@@ -80,6 +81,8 @@ class Claim:
     """Packets."""
     reports_version: bool = False
     """It names the version that the new application reports."""
+    unobserved_s: float = 0.0
+    """Time of the transfer in which the adapter was away."""
     where: str = ""
     is_overdue: bool = False
 
@@ -184,6 +187,7 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     # A changed answer is not its own.
     shows = all(each.was_heard for each in present) and not _has(facts.plan, (plans.Answer,))
     is_unseen = len(present) > 1 and not shows
+    is_unseen |= claim.unobserved_s > 0 and _has(facts.plan, (plans.Tool,))
     false = "UNSEEN" if is_unseen else "FALSE"
     content, *twins = contents
     if claim.is_ok and content != "new":

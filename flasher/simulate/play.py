@@ -530,6 +530,7 @@ def _claim_of(result: Result) -> Claim:
         attempts=outcome.statistics.attempts,
         acknowledged=outcome.statistics.packets_acknowledged,
         reports_version=bool(result.running_version),
+        unobserved_s=outcome.unobserved_s,
         where=outcome.where,
     )
 

@@ -275,7 +275,9 @@ class UnitSteps:
         measured.append(Measurement(f"{name} transfer", statistics.transfer_s or 0.0, "s"))
         self._journal.verified(write, result.running_version)
         self._flashed.add(name)
-        return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}"
+        away_s = result.outcome.unobserved_s
+        away = f"; unobserved for {away_s:.1f} s, as the adapter was away" if away_s else ""
+        return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}{away}"
 
     def _check_flashed(self) -> None:
         """Compare the serial numbers of flashed targets before the next one is flashed: one that

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.cli.upgrade.text import verdict_of
+from flasher.cli.upgrade.text import summary_lines, verdict_of
 from flasher.errors import ErrorCode
 from flasher.events import Phase
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics
@@ -16,7 +16,9 @@ from flasher.host.session import Result
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verification
 from flasher.host.verify import Verdict as Verified
-from flasher.protocol.spec import TARGETS
+from flasher.image.plan import plan
+from flasher.protocol.spec import TARGETS, WELLING
+from tests.host.bench import Bench
 
 from .conftest import SAMPLES, Flasher
 
@@ -135,6 +137,22 @@ def test_an_upgrade_that_is_completed_and_runs_something_else_has_failed() -> No
     assert (line.word, line.colour) == ("FAILED", "red")
     assert line.text == (
         "BMS: completed, but the application runs another version than the image names  2.0 s"
+    )
+
+
+def test_a_transfer_in_which_the_adapter_was_away_is_good_and_not_green() -> None:
+    whole = plan(Bench().image, TARGETS["bms"], WELLING.bitrate_bps)
+    outcome = Outcome(
+        Ending.COMPLETED, Phase.END, DeviceLeft.NEW, TARGETS["bms"], 10, None, None, None,
+        Statistics(), unobserved_s=1.5,
+    )  # fmt: skip
+    result = Result(outcome, Verification(Level.VERSION, Verified.VERSION_RIGHT, "V1"))
+    line = verdict_of(result, [], 2.0)
+    assert (line.word, line.colour) == ("OK", "yellow")
+    assert line.text == "BMS runs V1 (version read back; unobserved for 1.50 s)  2.0 s"
+    assert (
+        "unobserved:   1.50 s of the transfer, while the adapter was away; if another tool may have"
+        " written to the device then, flash it again" in summary_lines(result, whole)
     )
 
 

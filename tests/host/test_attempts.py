@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from flasher import events
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
@@ -119,6 +121,41 @@ def test_an_adapter_that_is_back_in_the_transfer_sends_the_packet_in_flight_agai
     bench.say(Ack(2))
     assert bench.expect(Packet).number == 3
     assert not bench.seen(events.AttemptStarted)
+
+
+def test_a_transfer_reports_for_how_long_the_adapter_was_away_since_its_update_command() -> None:
+    bench = Bench(options=options(2))
+    bench.to_packet(2)
+    for away_s in (1.5, 0.25):
+        bench.now += away_s
+        bench.engine.link_back(bench.now)
+        bench.expect(Packet)
+    bench.say(Ack(2))
+    last = -(-bench.image.size_bytes // 128)
+    bench.on_to_packet(last, first=3)
+    bench.say(Ack(last))
+    bench.expect(EndOfTransfer)
+    bench.say(Complete())
+    assert bench.outcome.ok
+    assert bench.outcome.unobserved_s == pytest.approx(1.75, abs=0.01)
+
+
+def test_a_transfer_that_began_after_the_adapter_was_away_is_observed() -> None:
+    bench = Bench(options=options(3))
+    bench.to_packet(2)
+    bench.now += 2.0
+    bench.engine.link_back(bench.now)
+    bench.expect(Packet)
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.say(RequestTransfer())
+    last = -(-bench.image.size_bytes // 128)
+    bench.on_to_packet(last, first=1)
+    bench.say(Ack(last))
+    bench.expect(EndOfTransfer)
+    bench.say(Complete())
+    assert bench.outcome.ok
+    assert not bench.outcome.unobserved_s
 
 
 def test_a_packet_in_flight_that_is_not_answered_after_all_begins_again() -> None:

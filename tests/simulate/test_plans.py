@@ -109,6 +109,18 @@ def test_a_twin_that_sent_nothing_in_the_transfer_is_counted_by_itself() -> None
     assert all(each.is_excused for each in verdict.violations)
 
 
+def test_packets_of_another_tool_while_the_adapter_is_away_are_reported_as_unobserved() -> None:
+    """The device confirms them like the host's own, and then runs both images."""
+    verdict = play(
+        Plan.parse(
+            "job ; mock bad_packet=silence ; @flash6+0.23874 tool does=packets count=20 ;"
+            " @packet13+0.019723 unplug seconds=4.934275 wrong_rate=0.249305"
+        )
+    )
+    assert verdict.left == "other"
+    assert [*map(str, verdict.violations)] == ["UNSEEN: success, and the device has other"]
+
+
 def test_a_second_device_that_comes_after_the_transfer_is_no_fault_of_the_host() -> None:
     verdict = play(Plan.parse(f"{SHORT} ; @end+0.001 independent begins=off"))
     assert verdict.left == "new / old"

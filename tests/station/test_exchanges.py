@@ -501,6 +501,7 @@ def test_an_adapter_that_is_lost_in_the_transfer_may_come_back(tmp_path: Path) -
     result = bench.run()
     assert was_lost
     assert result.outcome is RunState.PASS, result
+    assert "unobserved for" in bench.step(StepName.FLASH, "bms").text
 
 
 def test_a_unit_that_is_exchanged_while_the_adapter_is_away_is_not_gone_on_with(

@@ -148,6 +148,8 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
         remark = "the image names no version to compare with"
     if outcome.ending is Ending.CONFIRMED_BY_VERSION:
         remark += ", but it did not report completion"
+    if outcome.unobserved_s:
+        remark += f"; unobserved for {duration(outcome.unobserved_s)}"
     warnings = sum(check.verdict in ("warned", "waived") for check in checks)
     remark += f"; {counted(warnings, 'warning')}" if warnings else ""
     if result.running_version is None:
@@ -156,6 +158,7 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
         text = f"{node} runs {result.running_version}{was} ({remark})"
     is_sure = verification.verdict in (Verdict.VERSION_RIGHT, Verdict.MEMORY_RIGHT)
     is_sure &= outcome.ending is Ending.COMPLETED and not warnings and not result.shutdown_heard
+    is_sure &= not outcome.unobserved_s
     return ClosingLine("OK", text + took, "green" if is_sure else "yellow")
 
 
@@ -182,9 +185,15 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
     sent = f"{byte_count(plan.image.size_bytes)} in {counted(plan.total_packets, 'packet')}"
     faults = f"{figures.repetitions} repeated, {figures.naks} NAK"
     whole = f"{counted(figures.attempts, 'attempt')}, {duration(figures.duration_s)} in all"
+    unobserved: list[str] = []
+    if outcome.unobserved_s:
+        away = f"{duration(outcome.unobserved_s)} of the transfer, while the adapter was away"
+        advice = "if another tool may have written to the device then, flash it again"
+        unobserved = [f"unobserved:   {away}; {advice}"]
     return [
         f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
         f"              {faults}, {whole}",
+        *unobserved,
         f"boot version: {outcome.boot_version or 'not announced: it sat in an open session'}",
         f"completed:    {wording(outcome.ending)}",
         f"running:      {_running(result)}",
