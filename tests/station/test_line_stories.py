@@ -601,6 +601,16 @@ UNDETECTABLE = {
             " @7.289 put unit=1 socket=A ; @12.0 look"
         ),
     ),
+    "starts, after it had come for a silent one whose label was scanned": (
+        COMPLETE,
+        (
+            "line sockets=2 recipe=bicycle ; unit label=1 answers=false ; unit label=2"
+            " application=new ; unit label=3 application=none answers=false ; person name=al ;"
+            " @3.0 put unit=1 socket=B ; @13.0 card by=al unit=1 ; @13.1 pull unit=1 ;"
+            " @14.0 put unit=3 socket=B ; @14.1 label by=al unit=1 ; @17.0 pull unit=3 ;"
+            " @18.0 put unit=2 socket=B"
+        ),
+    ),
     "without power": (
         SILENT,
         (
@@ -646,6 +656,20 @@ def test_a_unit_that_answers_something_else_can_be_detected(state: BootloaderSta
     alike = exchanges.reason_of(Violation("NUMBER", text, "A"))
     assert bool(alike) == (state in (BootloaderState.RESTARTING, BootloaderState.STARTING))
     assert exchanges.reason_of(Violation("NUMBER", text, "B")) == ""
+
+
+@pytest.mark.parametrize("is_silent", [True, False])
+def test_of_two_exchanges_both_have_to_be_undetectable(*, is_silent: bool) -> None:
+    exchanges, step = undetectable.Exchanges(), StepName.FLASH
+    first = undetectable.Pulled("W2605001", 3.0, None, None, was_silent=is_silent)
+    starts = BootloaderState.STARTING
+    second = undetectable.Pulled("W2605003", 9.0, starts, step, was_silent=False)
+    exchanges.pull("A", first)
+    exchanges.put("A", "W2605003", 3.5, is_new=False, is_alike=True)
+    exchanges.pull("A", second)
+    exchanges.put("A", "W2605002", 9.5, is_new=True, is_alike=True)
+    text = "the unit with the label W2605002 now says that it is W2605001"
+    assert bool(exchanges.reason_of(Violation("NUMBER", text, "A"))) == is_silent
 
 
 def test_what_somebody_could_detect_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,17 +107,35 @@ class Exchanges:
 
     def reason_of(self, violation: Violation) -> str:
         """Why nobody could detect what a violation comes from; empty where somebody could. It comes
-        from the last exchange in its socket of the two units that it names.
+        from the last exchange in its socket of the two units that it names, or from exchanges that
+        led from one to the other: all of them have to be undetectable.
         """
+        if violation.kind not in _KINDS:
+            return ""
         labels = set(_LABEL.findall(str(violation)))
-        of_both = [
-            each
-            for each in self._all
-            if each.socket == violation.socket and {each.pulled.label, each.label} <= labels
+        in_socket = [each for each in self._all if each.socket == violation.socket]
+        chains = (_chain(in_socket[:end], labels) for end in range(len(in_socket), 0, -1))
+        chain = next(filter(None, chains), [])
+        if violation.kind in _AFTER_ITS_ANSWER and not all(each.is_alike for each in chain):
+            return ""
+        reasons = [
+            next((name for name, is_so in UNDETECTABLE.items() if is_so(each)), "")
+            for each in chain
         ]
-        if violation.kind not in _KINDS or not of_both:
-            return ""
-        last = of_both[-1]
-        if violation.kind in _AFTER_ITS_ANSWER and not last.is_alike:
-            return ""
-        return next((name for name, is_so in UNDETECTABLE.items() if is_so(last)), "")
+        return reasons[-1] if reasons and all(reasons) else ""
+
+
+def _chain(exchanges: list[Exchange], labels: set[str]) -> list[Exchange]:
+    """Return the exchanges that lead from a unit with one of the labels to one with another, the
+    last one of `exchanges` at their end; the run went on with the units between. May be empty.
+    """
+    *before, last = exchanges
+    if last.label not in labels:
+        return []
+    chain = [last]
+    for each in reversed(before):
+        if chain[0].pulled.label in labels or chain[0].pulled.step is None:
+            break
+        if each.label == chain[0].pulled.label:
+            chain.insert(0, each)
+    return chain if chain[0].pulled.label in labels else []
