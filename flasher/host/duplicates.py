@@ -19,7 +19,7 @@ the first ACK (R16), an answer doubled by the link.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
@@ -87,13 +87,16 @@ class _Packet:
     """Copies and answers of one packet."""
 
     unacknowledged: int = 0
-    """Copies sent without an ACK, also in earlier attempts, because an ACK may be late."""
+    """Copies sent without an ACK, also in earlier attempts, because an ACK may be late; negative
+    for more ACKs than copies in this attempt.
+    """
     has_ack: bool = False
     has_nak: bool = False
     acked_at: float = -inf
     is_odd: bool = False
 
     def begin(self) -> None:
+        self.unacknowledged = max(0, self.unacknowledged)
         self.has_ack = self.has_nak = self.is_odd = False
 
     @property
@@ -113,6 +116,10 @@ class _Announcements:
     last_at: float = -inf
     times: deque[float] = field(default_factory=lambda: deque(maxlen=4))
     """Times of the last boot versions since a reset or an update command."""
+    rhythm: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=4))
+    """Times of the last boot versions since a reset, and whether an update command was sent before
+    it, since the previous one.
+    """
     is_documented: bool = False
     """Two consecutive boot versions came at the documented interval."""
 
@@ -245,6 +252,7 @@ class DuplicateDetector:
             announced.times.clear()
             if is_reset:
                 announced.boot = None
+                announced.rhythm.clear()
 
     # -- what comes -------------------------------------------------------------------------------
 
@@ -428,20 +436,29 @@ class DuplicateDetector:
         is_documented = self._shortest_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
         announced.last_at = now
+        announced.rhythm.append((now, not times))
         times.append(now)
-        if self._alternate(list(times), is_documented=announced.is_documented):
+        if self._alternate(announced.rhythm, is_documented=announced.is_documented):
             self._set_evidence(text("two bootloaders announced themselves alternately"))
 
-    def _alternate(self, times: list[float], *, is_documented: bool) -> bool:
+    def _alternate(self, rhythm: Collection[tuple[float, bool]], *, is_documented: bool) -> bool:
         """True if the last four boot versions come from two bootloaders. One that is twice as fast
-        as documented has equal intervals.
+        as documented has equal intervals; one may begin its burst anew at an update command.
         """
+        times = [each for each, _ in rhythm]
         if len(times) < 4 or not all(
             self._shortest_s <= later - earlier <= self._longest_s
             for earlier, later in zip(times, times[2:], strict=False)
         ):
             return False
         gaps = [later - earlier for earlier, later in pairwise(times)]
+        after_update = [is_after for _, is_after in rhythm][1:]
+        if all(
+            gap >= self._shortest_s
+            for gap, is_after in zip(gaps, after_update, strict=True)
+            if not is_after
+        ):
+            return False
         is_uneven = max(gaps) - min(gaps) > _TOLERANCE * self._timings.boot_version_spacing_s
         return is_documented or is_uneven
 

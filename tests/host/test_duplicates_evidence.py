@@ -456,11 +456,21 @@ def test_two_bootloaders_that_announce_themselves_alternately(
     assert Watch().announces(*ticks).evidence == evidence
 
 
-@each("command", [Command.RESET, Command.UPDATE])
-def test_announcements_before_a_reset_or_an_update_command_are_not_compared(
-    command: Command,
-) -> None:
-    assert Watch().announces(0, 20, 44).sends(command).announces(19).evidence == ""
+def test_announcements_before_a_reset_are_not_compared() -> None:
+    assert Watch().announces(0, 20, 44).sends(Command.RESET).announces(19).evidence == ""
+
+
+def test_bootloaders_that_alternate_are_two_also_where_neither_hears_an_update_command() -> None:
+    watch = Watch().announces(0, 44, 20).sends(Command.UPDATE).announces(43, 20)
+    assert watch.evidence == ALTERNATELY
+
+
+@each("early", [2, 20, 47])
+def test_one_that_begins_its_burst_anew_at_each_update_command_is_one(early: int) -> None:
+    watch = Watch().announces(0, 64)
+    for _ in range(3):
+        watch.sends(Command.UPDATE).announces(early - 1, 64)
+    assert watch.evidence == ""
 
 
 # -- the transfer ---------------------------------------------------------------------------------
@@ -491,6 +501,12 @@ def test_one_that_announces_itself_after_the_end_is_restarting() -> None:
     assert watch.hears(Complete()).evidence == (
         "a bootloader announced itself, yet the transfer was completed"
     )
+
+
+def test_an_answer_that_was_doubled_in_an_earlier_attempt_is_not_counted_again() -> None:
+    watch = Watch().sends(Command.UPDATE).hears(RequestTransfer()).sends(Command.PACKET, 1)
+    watch.hears(Ack(1), Ack(1)).transfers(2)
+    assert watch.evidence == ""
 
 
 def test_an_update_command_begins_another_transfer() -> None:
