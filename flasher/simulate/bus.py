@@ -19,6 +19,7 @@ from flasher.protocol.spec import WELLING
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
     ACK,
+    BOOT_VERSION,
     FEEDBACK,
     NAK,
     REPORT,
@@ -34,6 +35,7 @@ ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=Tr
 _ROUNDING_S: Final = 1e-9
 _UPDATE: Final = UPDATE.to_bytes(2, "big")
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
+_BOOT_VERSION: Final = BOOT_VERSION.to_bytes(2, "big")
 _NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
 
 
@@ -206,7 +208,9 @@ class Unit:
         if frame is None:
             return None
         if not self._bytes_left and frame.data[:3] == b"\x55\xaa\x0c":
-            if self._answers:
+            # Two confirmations of one message are those of two devices (R27).
+            is_feedback = frame.data[4:6] == _GENERAL_FEEDBACK
+            if self._answers and not (is_feedback and self._answers[0].becomes == "twice"):
                 self._change_answer(now)
                 return self.next_frame(now)
             self._bytes_left = frame.data[3] + 9
@@ -290,6 +294,10 @@ class PlanBus(SimulatedBus):
         """Units and engines that began a message alone that reached the tool; the player empties
         it. General feedback does not count: an application sends it to all that is not for it.
         """
+        self.burst_ends_at = inf
+        """Time up to which boot versions do not count either; set by the player. One device may
+        continue its burst after the update command, or begin it anew.
+        """
         self._watch = watch
 
     def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
@@ -318,7 +326,9 @@ class PlanBus(SimulatedBus):
                 self.host.echo(frame, ends_at)
         elif takes_part and len(senders) == 1 and word is not None:
             data = frame.data
-            if data[:2] == _HEADER and data[4:6] != _GENERAL_FEEDBACK:
+            is_ignored = data[4:6] == _GENERAL_FEEDBACK
+            is_ignored |= data[4:6] == _BOOT_VERSION and ends_at <= self.burst_ends_at
+            if data[:2] == _HEADER and not is_ignored:
                 self.heard.add(sender.engine)
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:

@@ -60,7 +60,7 @@ class Violation:
     @property
     def is_excused(self) -> bool:
         """True for a success beside a device that sent nothing in the transfer, or one that reports
-        that the adapter was away while another tool may have written to the device: the bus shows
+        that the adapter was away while another tool or device may have sent: the bus shows
         neither (docs/explanation/safety.md, "What stays unseen").
         """
         return self.kind == "UNSEEN"
@@ -187,7 +187,8 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     # A changed answer is not its own.
     shows = all(each.was_heard for each in present) and not _has(facts.plan, (plans.Answer,))
     is_unseen = len(present) > 1 and not shows
-    is_unseen |= claim.unobserved_s > 0 and _has(facts.plan, (plans.Tool,))
+    may_be_unseen = len(present) > 1 or _has(facts.plan, (plans.Tool,))
+    is_unseen |= claim.unobserved_s > 0 and may_be_unseen
     false = "UNSEEN" if is_unseen else "FALSE"
     content, *twins = contents
     if claim.is_ok and content != "new":

@@ -268,7 +268,8 @@ class Answer(OnDevice):
 
     NAME = "answer"
     becomes: Literal["same", "ack", "nak", "silence", "twice"] = "same"
-    """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice."""
+    """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice, unless
+    it is general feedback."""
     shift: int = 0
     """Added to the number of an ACK or NAK."""
     late: float = 0.0

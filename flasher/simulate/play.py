@@ -7,6 +7,7 @@ import random
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Final
 
 from flasher import api
@@ -22,6 +23,7 @@ from flasher.image.plan import plan as image_plan
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import PACKET_DATA_SIZE, TARGETS, WELLING
+from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.bus import (
     FrameFault,
@@ -218,13 +220,17 @@ class Player:
         if sender == "host":
             self._facts.host_ids.add(frame.can_id)
             begun = self._facts.rules.host_sends(frame, now)
+            self._facts.may_have_erased |= self._facts.rules.has_update
             if begun is not None:
                 what, number = begun
                 self._phase = what
                 if what == "update":
-                    self._facts.may_have_erased = True
                     self._at_update = self._present
                     self.bus.heard.clear()
+                    self.bus.burst_ends_at = inf
+                elif what == "packet":
+                    ends_at = now + DEFAULT_TIMINGS.leftover_boot_version_s
+                    self.bus.burst_ends_at = min(self.bus.burst_ends_at, ends_at)
                 self._begins(what, number, now)
         else:
             self._facts.rules.others_send(frame, now)

@@ -71,7 +71,9 @@ class WireRules:
 
     def begin_run(self) -> None:
         """Begin with another process of the host, which knows nothing of the one before."""
-        self._left = 0
+        self._left = self._update_left = 0
+        self.has_update = False
+        """A whole update command was sent."""
         self._had_gap = False
         self._kind = ""
         self._ended_at = float("-inf")
@@ -92,6 +94,11 @@ class WireRules:
         data = frame.data
         gap_s, self._ended_at = now - self._ended_at, now
         name = _COMMANDS.get(data[4:6]) if data[:3] == b"\x55\xaa\x16" else None
+        if name is not None:
+            self._update_left = data[3] + _MESSAGE_OVERHEAD if name == "update" else 0
+        if self._update_left:
+            self._update_left = max(0, self._update_left - len(data))
+            self.has_update |= not self._update_left
         if name is None:
             if self._left > 0:
                 limit_s = DEFAULT_TIMINGS.inter_frame_timeout_s + _TOLERANCE_S
@@ -106,7 +113,8 @@ class WireRules:
                 self._kind = ""
             return None
         is_short = gap_s < DEFAULT_TIMINGS.inter_frame_timeout_s - _TOLERANCE_S
-        if self._left > 0 and is_short and self._checks_messages:
+        # The device dropped a message whose rest came after a gap.
+        if self._left > 0 and is_short and self._checks_messages and not self._had_gap:
             self._break("a message begins while the device waits for the rest of another one")
         self._kind, self._had_gap = name, False
         self._number = data[7] if name == "packet" and len(data) > 7 else 0

@@ -109,6 +109,21 @@ def test_a_twin_that_sent_nothing_in_the_transfer_is_counted_by_itself() -> None
     assert all(each.is_excused for each in verdict.violations)
 
 
+def test_announcements_of_two_bursts_around_update_commands_may_be_those_of_one_device() -> None:
+    """The twin starts its application, which stays as it was and sends nothing."""
+    twin = "independent begins=boot restart=0.122 spacing=0.0521 listens=after_burst erase=0.058"
+    device = "independent restart=0.122 spacing=0.0521 listens=after_burst erase=0.058"
+    text = f"job target=wmc packets=12 ; {device} ; @reset+0.0985 {twin} ; @update restart device=1"
+    verdict = play(Plan.parse(text))
+    assert all(each.is_excused for each in verdict.violations), verdict
+
+
+def test_an_answer_that_is_doubled_before_a_restart_is_not_that_of_two_devices() -> None:
+    plan = "job packets=6 ; mock ; @packet3 answer becomes=twice ; @packet5 power seconds=0.12"
+    verdict = play(Plan.parse(plan))
+    assert (verdict.ending, verdict.violations) == ("completed", ())
+
+
 def test_packets_of_another_tool_while_the_adapter_is_away_are_reported_as_unobserved() -> None:
     """The device confirms them like the host's own, and then runs both images."""
     verdict = play(
