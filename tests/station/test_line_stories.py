@@ -159,6 +159,11 @@ STORIES = {
         " @10.5 pull unit=2 ; @58.0 put unit=2 socket=C ; @125.5 card by=jo unit=2 ;"
         " @126.0 label by=jo unit=2"
     ),
+    "a unit that is pulled as its application starts, after it was put where the power was off": (
+        "line sockets=1 ; unit label=3 ; person name=jo ; @3.0 dip socket=A seconds=4.0 ;"
+        " @3.1 put unit=3 socket=A ; @7.0 card by=jo unit=3 ; @7.4 label by=jo unit=3 ;"
+        " @7.5 pull unit=3"
+    ),
     "a unit that is pulled while the adapter is away": (
         "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
         " @7.0 label by=jo unit=1 ; @12.0 unplug socket=A seconds=0.5 ; @12.2 pull unit=1 ;"

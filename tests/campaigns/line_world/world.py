@@ -674,6 +674,7 @@ class World:
         return True
 
     def _switch_on(self, bay: Bay) -> None:
+        bay.disturbed_at = max(bay.disturbed_at, self.now)
         if bay.unit is not None:
             bay.unit.power_on(self.now)
 
