@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -45,17 +47,22 @@ def test_a_campaign_prints_what_happened_and_what_was_reached(
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_a_violation_ends_the_campaign_with_the_shortest_plan_and_its_replay(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(campaign, "CANARIES", ("one-packet-more-for-whole-sizes",))
     monkeypatch.setattr(campaign, "swapped", lambda _codes: nullcontext())
     with swapped(planted("last-program-unit-lost")):
-        assert main(["simulate", "--runs", "40"]) == ExitCode.PARTIAL
+        page = tmp_path / "campaign.html"
+        assert main(["simulate", "--runs", "40", "--html", str(page)]) == ExitCode.PARTIAL
         out = capsys.readouterr().out
         assert "VIOLATION FALSE: success, and the device has " in out
         line = next(each for each in out.splitlines() if "replay: " in each)
         plan = line.partition("replay ")[2].strip("'")
         assert len(plan.split(" ; ")) <= 2, plan
+        text = html.unescape(page.read_text("utf-8"))
+        assert re.search(r"[1-9]\d* violations? in \d+ upgrades", text)
+        assert f"<pre>{line.partition('replay: ')[2]}</pre>" in text
+        assert re.search(r'<td class="keep">[\w-]+</td><td class="number">\d+</td>', text)
         assert main(["simulate", "replay", plan]) == ExitCode.PARTIAL
     assert main(["simulate", "replay", plan]) == ExitCode.OK
 
@@ -101,8 +108,10 @@ def test_shards_with_ledgers_add_up_to_the_whole_campaign(
     # A canary that is in another part is not missed in this one.
     assert main(["simulate", "--runs", "9", "--shard", "2/2"]) == ExitCode.OK
     assert "no canary in this part" in capsys.readouterr().out
-    assert main(["simulate", "merge", str(files[0])]) == ExitCode.PARTIAL
+    page = tmp_path / "merged.html"
+    assert main(["simulate", "merge", str(files[0]), "--html", str(page)]) == ExitCode.PARTIAL
     assert "MISSING: seeds " in capsys.readouterr().out
+    assert "MISSING: seeds " in page.read_text("utf-8")
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ import click
 from flasher.cli import values
 from flasher.cli.bar import Bar
 from flasher.cli.extras import need
-from flasher.cli.files import check_writable
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, typed_values
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
@@ -86,6 +86,12 @@ def _shard(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
+_html: Final = option(
+    "--html", type=values.FilePath("html", gives=Path), metavar="FILE", panel="reports",
+    help="the campaign as one self-contained page",
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Campaign:
     """What a campaign runs."""
@@ -125,6 +131,7 @@ class Campaign:
         "--strict", is_flag=True,
         help="fail as well if no run reached some row of the tables, or some fault in some phase",
     )]  # fmt: skip
+    html: Annotated[Path | None, _html]
 
 
 @group(
@@ -137,6 +144,7 @@ def simulate(output: Output, chosen: Campaign) -> int:
     """Upgrade simulated devices with random faults, and compare what the tool claims with what is
     in their flash.
     """
+    check_writable(chosen.html, "--html", typed_values(but="html"))
     most = chosen.runs or (_RUNS if chosen.for_s is None else _ENDLESS)
     todo: Iterable[Batch] = batches(chosen.seed, most, _BATCH)
     if chosen.shard is not None:
@@ -187,6 +195,7 @@ def simulate(output: Output, chosen: Campaign) -> int:
     is_shard = chosen.shard is not None
     _tell(total, output, is_shard=is_shard)
     code = _exit_code(total, is_strict=chosen.strict, is_shard=is_shard)
+    _write_page(chosen.html, total, code, output, is_shard=is_shard)
     if was_stopped and code is ExitCode.OK:
         code = ExitCode.INTERRUPTED
     return output.document(total, exit_code=code)
@@ -224,15 +233,7 @@ def _tell(total: Result, output: Output, *, is_shard: bool = False) -> None:
     output.result(f"{len(total.reached)} places reached, {len(never)} never (-v lists them)")
     if output.verbosity > 0:
         output.results(f"  never: {each}" for each in never)
-    for name, count in total.canaries_missed.items():
-        output.result(f"BLIND: the planted mistake {name} was not found {counted(count, 'time')}")
-    found = sum(total.canaries_found.values())
-    if found:
-        output.result(f"canaries found: {found}")
-    elif is_shard and not total.canaries_missed:
-        output.result("no canary in this part: `flasher simulate merge` judges that")
-    elif total.is_blind and not total.canaries_missed:
-        output.result("BLIND: no canary was tried")
+    output.results(_canary_lines(total, is_shard=is_shard))
     for each in total.violations:
         output.result(f"VIOLATION {each.kind}: {printable(each.text)}")
         output.result(f"  seed {each.seed}; replay: {replay_line(each.plan)}")
@@ -242,12 +243,50 @@ def _tell(total: Result, output: Output, *, is_shard: bool = False) -> None:
         output.result(f"no violation in {counted(total.runs, 'run')}")
 
 
+def _canary_lines(total: Result, *, is_shard: bool) -> Iterator[str]:
+    for name, count in total.canaries_missed.items():
+        yield f"BLIND: the planted mistake {name} was not found {counted(count, 'time')}"
+    found = sum(total.canaries_found.values())
+    if found:
+        yield f"canaries found: {found}"
+    elif is_shard and not total.canaries_missed:
+        yield "no canary in this part: `flasher simulate merge` judges that"
+    elif total.is_blind and not total.canaries_missed:
+        yield "BLIND: no canary was tried"
+
+
+def _write_page(
+    path: Path | None,
+    total: Result,
+    code: ExitCode,
+    output: Output,
+    *,
+    is_shard: bool = False,
+    missing: Iterable[str] = (),
+) -> None:
+    """Write the page of a campaign; `missing`: lines about what a merged one lacks."""
+    if path is None:
+        return
+    from flasher.report.base import Status, render_page  # noqa: PLC0415  loads jinja2
+
+    times = [each for tally in total.tallies.values() for each in tally.times]
+    page = render_page(
+        "campaign.html",
+        total=total,
+        status=Status.GOOD if code is ExitCode.OK else Status.BAD,
+        canaries=[*_canary_lines(total, is_shard=is_shard)],
+        missing=[*missing],
+        tallies=[*_in_order(total.tallies)],
+        classes=range(min(times, default=0), max(times, default=-1) + 1),
+        replay=replay_line,
+    )
+    write_whole(path, page.encode("utf-8"), "--html")
+    output.progress(f"html: {printable(str(path))}")
+
+
 def _rows(tallies: Mapping[str, Tally]) -> Iterator[Sequence[str]]:
     yield ("fault", "runs", "upgraded", "again", "rescued", "median time")
-    for name in (NO_FAULT, *(each for each in tallies if each != NO_FAULT)):
-        tally = tallies.get(name)
-        if tally is None:
-            continue
+    for name, tally in _in_order(tallies):
         median = tally.median_time
         yield (
             name,
@@ -257,6 +296,11 @@ def _rows(tallies: Mapping[str, Tally]) -> Iterator[Sequence[str]]:
             f"{tally.by_rescue:,}",
             "" if median is None else f"{median:.1f} x",
         )
+
+
+def _in_order(tallies: Mapping[str, Tally]) -> Sequence[tuple[str, Tally]]:
+    """Return tallies by the name of the fault; runs without a fault come first."""
+    return sorted(tallies.items(), key=lambda each: each[0] != NO_FAULT)
 
 
 def replay_line(plan: str) -> str:
@@ -320,20 +364,22 @@ class MergedCampaign:
 @argument(
     "files", nargs=-1, required=True, type=values.FilePath("jsonl", gives=Path), metavar="FILE..."
 )
-def merge(output: Output, *, files: tuple[Path, ...]) -> int:
+@_html
+def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
     """Add the ledgers of a campaign up: of its shards, or of several sessions."""
+    check_writable(html, "--html", files)
     merged = merge_ledgers(files)
     for notice in merged.notices:
         output.progress(notice)
     output.result(counted(merged.result.runs, "run"))
     _tell(merged.result, output)
-    for first, end in merged.missing:
-        output.result(f"MISSING: seeds {first} to {end - 1}")
-    for seed in merged.missing_canaries:
-        output.result(f"MISSING: the canary at seed {seed}")
+    missing = [f"MISSING: seeds {first} to {end - 1}" for first, end in merged.missing]
+    missing += [f"MISSING: the canary at seed {seed}" for seed in merged.missing_canaries]
+    output.results(missing)
     code = _exit_code(merged.result, is_strict=False)
     if merged.missing or merged.missing_canaries:
         code = ExitCode.PARTIAL
+    _write_page(html, merged.result, code, output, missing=missing)
     document = MergedCampaign(merged.result, merged.missing, merged.missing_canaries)
     return output.document(document, exit_code=code)
 
