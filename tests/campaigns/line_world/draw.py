@@ -20,6 +20,7 @@ from tests.campaigns.line_world.world import HAND_S, Bay, World, label_of, last_
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
 _RECIPES: Final = {"writes": 10, "plain": 5, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
+_NUMBERS: Final = {"none": 5, "empty": 2.5, "maker": 4, "own": 2, "other": 1.5}
 _GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -30,9 +31,11 @@ def setup_of(chance: random.Random) -> Story:
     """What there is."""
     sockets = chance.choice((1, 1, 2, 2, 3))
     bare = chance.choice((0.1, 0.1, 0.5))
-    units = []
-    for label in range(1, sockets + chance.choice((1, 2, 3)) + 1):
-        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 2.5, 4, 2, 1.5))[0]
+    units, count = [], sockets + chance.choice((1, 2, 3))
+    numbers = chance.choices(list(_NUMBERS), list(_NUMBERS.values()), k=count)
+    if chance.random() < 0.4:  # one of each
+        numbers[: len(_NUMBERS)] = chance.sample(list(_NUMBERS), min(count, len(_NUMBERS)))
+    for label, number in enumerate(numbers, 1):
         firmware = "new" if chance.random() < (0.2 if number == "other" else 0.5) else "old"
         units.append(
             stories.UnitSetup(
@@ -88,7 +91,7 @@ class Teller:
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
         if people and self.chance.random() < 0.9:
             scenes = [self._scan_at_once, self._lose_station, self._cancel_label]
-            scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash]
+            scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash, self._take_out_again]
             scenes += 3 * [self._be_interrupted]
             if any(each.number == "other" for each in self.world.setup.units):
                 scenes += 3 * [self._scan_another_number]
@@ -254,7 +257,7 @@ class Teller:
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
             flashed = yield from self._await(StepName.FLASH)
-            yield self.chance.uniform(0.0, 1.0), None
+            yield self.chance.choice((0.3, 1.0)) * self.chance.random(), None
             if flashed is bay and bay.unit is not None:
                 yield from self._put_another(bay)
 
@@ -285,14 +288,27 @@ class Teller:
         others = [self._setup(each) for each in self._on_table() if each in new]
         if bay is not None and bay.unit is not None and others:
             unit = self._setup(self._number(bay))
-            other = self.chance.choice([e for e in others if e.number != unit.number] or others)
-            yield self.chance.uniform(0.0, 0.4), stories.Pull(unit=unit.label)
+            other = self._another(unit, others)
+            wait = self.chance.choice((0.1, 0.4)) * self.chance.random()
+            yield wait, stories.Pull(unit=unit.label)
             yield self.chance.choice(_GAPS_S), stories.Put(unit=other.label, socket=bay.name)
+
+    def _another(
+        self, unit: stories.UnitSetup, others: list[stories.UnitSetup]
+    ) -> stories.UnitSetup:
+        """Another unit, more often one that reports another number, or that it has none."""
+        if self.chance.random() < 0.7:
+            others = [each for each in others if each.number != unit.number] or others
+        if self.chance.random() < 0.4:
+            others = [each for each in others if each.number == "empty"] or others
+        return self.chance.choice(others)
 
     def _take_out_again(self, name: str) -> Iterator[Step]:
         """Scan a unit, and take it out as its run begins."""
         for bay in (yield from self._bring(1)):
             unit = self._number(bay)
+            # Often it has been there for some time.
+            yield self.chance.choice((0.0, 3.0)), None
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
             yield self.chance.uniform(0.0, 0.6), stories.Pull(unit=unit)
@@ -388,8 +404,10 @@ class Teller:
     def _put_another(self, bay: Bay) -> Iterator[Step]:
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
-        others = [each for each in self._on_table() if each != before] or [before]
-        unit = before if self.chance.random() < 0.1 else self.chance.choice(others)
+        others = [self._setup(each) for each in self._on_table() if each != before]
+        unit = before
+        if others and self.chance.random() < 0.9:
+            unit = self._another(self._setup(before), others).label
         yield self.chance.choice(_GAPS_S), stories.Put(unit=unit, socket=bay.name)
 
     def _swap(self, _name: str) -> Iterator[Step]:
