@@ -14,6 +14,7 @@ from flasher.bus.echoes import Echoes
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.mock.model import MockDevice
+from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.simulate import plan as plans
@@ -126,6 +127,10 @@ class Unit:
         if isinstance(engine, IndependentDevice):
             return engine.flash.application
         return engine.stored_image
+
+    @property
+    def runs_application(self) -> bool:
+        return self.engine.state in ("application", BootloaderState.APPLICATION)
 
     @property
     def operations_begun(self) -> int:
@@ -364,7 +369,9 @@ class FrameFault:
         self._until = now + getattr(clause, "seconds", inf)
         self._random = random.Random(getattr(clause, "seed", 0))
         self._held: list[Frame] = []
-        """Swapped frame that waits for the next one of its sender."""
+        """Swapped frame that waits for the next one of its sender; frames of a message that will
+        come again.
+        """
         self._sender = clause.sender
 
     def is_over(self, now: float) -> bool:
@@ -386,8 +393,8 @@ class FrameFault:
         match self._clause:
             case plans.Drop():
                 return rest
-            case plans.Double():
-                return [frame, frame, *rest]
+            case plans.Double(whole=whole):
+                return self._doubled(frame, rest, sender) if whole else [frame, frame, *rest]
             case plans.Swap():
                 return self._swap(frame, rest, sender)
             case plans.Delay(seconds=seconds):
@@ -407,6 +414,19 @@ class FrameFault:
                     return [frame, frame, *rest]
                 return [ERROR_FRAME, *rest] if drawn < lost + wrong + doubled + errors else frames
         raise AssertionError(self._clause)
+
+    def _doubled(self, frame: Frame, rest: list[Frame], sender: plans.Sender) -> list[Frame]:
+        held = self._held
+        if not held and frame.data[:2] != _HEADER:
+            return [frame, *rest]
+        held.append(frame)
+        self._sender = sender
+        if sum(len(each.data) for each in held) < held[0].data[3] + 9:
+            return [frame, *rest]
+        frames = [frame, *held, *rest]
+        held.clear()
+        self._sender = self._clause.sender
+        return frames
 
     def _swap(self, frame: Frame, rest: list[Frame], sender: plans.Sender) -> list[Frame]:
         if self._held:

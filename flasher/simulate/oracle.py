@@ -10,6 +10,7 @@ from flasher.bus.link import SEND_LIMIT_S
 from flasher.errors import ExitCode
 from flasher.host.outcome import DeviceLeft
 from flasher.protocol.spec import FRAMES_PER_PACKET
+from flasher.protocol.timing import DEFAULT_TIMINGS as TIMES
 from flasher.simulate import plan as plans
 from flasher.simulate.wire_rules import WireRules
 
@@ -25,6 +26,13 @@ _LIES_AT_THE_END: Final = (
     plans.Answer, plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.FlashFails,
 )  # fmt: skip
 """Faults after which a right host may take a complete image for a refused one."""
+_ATTEMPTS: Final = 3
+"""Attempts of an upgrade, unless the plan has another number (docs/explanation/upgrade.md)."""
+_BEGIN_S: Final = TIMES.boot_version_timeout_s + TIMES.request_transfer_timeout_s
+"""Longest time in which a device begins an attempt (R12)."""
+_COMPLETE_S: Final = TIMES.complete_timeout_s * TIMES.end_tries
+_CANNOT_SUCCEED: Final = ("battery_use=riding", "answers=false", "image_checksum=crc32")
+"""Choices of a device that is not upgraded, or does not show that it was."""
 _LOOKS_LIKE_TWO: Final = (
     plans.Unsolicited, plans.Tool, plans.Noise, plans.OnFrames, plans.Load,
 )  # fmt: skip
@@ -39,6 +47,7 @@ class Violation:
     DISHONEST     a wrong statement about what the device has
     OVERDUE       the run did not end
     LATE          it ended after its deadline
+    FAILED        no success, though nothing was disturbed, or earlier than its attempts may take
     UNDOCUMENTED  an exit code
     FOREIGN       a frame to another device
     WIRE          a message that must not be sent then (`wire_rules`)
@@ -99,6 +108,8 @@ class UnitFacts:
     was_at_update: bool
     was_heard: bool
     """A message of its own reached the tool during the transfer."""
+    runs_nothing: bool = False
+    """Its application is said to run, and its flash holds none."""
 
 
 @dataclass
@@ -145,6 +156,9 @@ def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("FOREIGN", f"frames with the id {ids}")
     for text in facts.rules.broken():
         yield Violation("WIRE", text)
+    if claim.ending == "refused" and facts.rules.ends < 2 and not _has(facts.plan, _BLOCKS):
+        yield Violation("WIRE", "refused, and end of transfer was sent once only (R6)")
+    yield from _judge_failure(facts, claim)
     yield from _judge_report(facts, claim)
     yield from _judge_contents(facts, claim)
 
@@ -165,9 +179,15 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
     if counts_attempts and claim.attempts > plan.job.attempts:
         text = f"{claim.attempts} attempts, and {plan.job.attempts} were allowed"
         yield Violation("STATISTICS", text)
-    if claim.reports_version and not facts.rules.has_version_answer:
-        yield Violation("FALSE", "a version is reported, and the device sent none")
-    is_single = len(plan.devices) == 1 and not _has(plan, _LOOKS_LIKE_TWO)
+    if not facts.rules.has_version_answer:
+        if claim.reports_version:
+            yield Violation("FALSE", "a version is reported, and the device sent none")
+        elif claim.is_ok and plan.job.target == "bms":
+            yield Violation("FALSE", "success, and the new application never sent its version")
+    looks_like_two = [each for each in plan.clauses if isinstance(each, _LOOKS_LIKE_TWO)]
+    # A message that comes again at once is doubled by the line.
+    looks_like_two = [each for each in looks_like_two if not getattr(each, "whole", False)]
+    is_single = len(plan.devices) == 1 and not looks_like_two
     # Answers that come twice again and again are those of two devices.
     answers = [each for each in plan.clauses if isinstance(each, plans.Answer)]
     is_single &= not answers or answers == [plans.Answer(when=answers[0].when, becomes="twice")]
@@ -177,8 +197,27 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("ACCUSED", "two devices are reported, and there is one")
 
 
+def _judge_failure(facts: Facts, claim: Claim) -> Iterator[Violation]:
+    """Check that a run without success had a reason, and enough time."""
+    plan, job = facts.plan, facts.plan.job
+    if claim.is_ok or job.timeout:
+        return
+    packets_s = job.packets * TIMES.ack_timeout_s
+    least_s = (job.attempts or _ATTEMPTS) * (_BEGIN_S + packets_s) + _COMPLETE_S
+    if facts.limit_s <= facts.took_s < least_s:
+        text = f"given up after {facts.took_s:.0f} s, and its attempts may take {least_s:.0f} s"
+        yield Violation("FAILED", text)
+    (device, *twins) = plan.devices
+    is_ready = device.begins == "application" and device.application == "old"
+    is_ready &= not any(each in device.choices for each in _CANNOT_SUCCEED)
+    if is_ready and not twins and not [*plan.events]:
+        yield Violation("FAILED", "no success, and nothing was disturbed")
+
+
 def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     contents = [each.now for each in facts.units]
+    if any(each.runs_nothing for each in facts.units):
+        yield Violation("CORRUPT", "the device runs an application that it does not have")
     if _has(facts.plan, (plans.Tool,)):
         # What another tool did after the end is not the host's.
         contents = ["new" if each.at_end == "new" else each.now for each in facts.units]

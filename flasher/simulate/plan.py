@@ -195,6 +195,8 @@ class Double(OnFrames):
     """It arrives twice."""
 
     NAME = "double"
+    whole: bool = False
+    """The frames of a message arrive again after its last one, as over a second way."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -95,6 +95,10 @@ class UpgradeBug(Bug):
 
     part: str
     """Where it is: "host", "bootloader", "driver", "bus" or "image"."""
+    kind: str
+    """Violation with which its plan ends (`flasher.simulate.oracle.Violation`)."""
+    plan: str
+    """Plan that has no violation without it (`flasher.simulate.plan.Plan`)."""
 
 
 def upgrade_bugs() -> list[UpgradeBug]:
@@ -106,6 +110,8 @@ def upgrade_bugs() -> list[UpgradeBug]:
             table["breaks"],
             [Edit(**edit) for edit in table["edit"]],
             table["part"],
+            table["kind"],
+            " ".join(table["plan"].split()),
         )
         for table in tables
     ]

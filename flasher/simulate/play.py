@@ -21,6 +21,7 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan as ImagePlan
 from flasher.image.plan import plan as image_plan
 from flasher.mock.model import MockDevice
+from flasher.mock.store import with_checksum
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import PACKET_DATA_SIZE, TARGETS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -98,11 +99,16 @@ class Verdict:
     where: str = ""
 
 
-def image_plan_of(packets: int, short: int, seed: int, target: str) -> ImagePlan:
-    """Plan the upgrade to an image that names its version."""
+def image_plan_of(
+    packets: int, short: int, seed: int, target: str, *, has_checksum: bool = False
+) -> ImagePlan:
+    """Plan the upgrade to an image that names its version, and may end with a checksum (R7)."""
     head = _VECTORS + NEW_VERSION.encode() + b"\0"
     body = random.Random(seed).randbytes(packets * PACKET_DATA_SIZE - short - len(head))
-    image = replace(Image.from_bytes(head + body), version=NEW_VERSION)
+    data = head + body
+    if has_checksum:
+        data = with_checksum(b"", len(data), data)
+    image = replace(Image.from_bytes(data), version=NEW_VERSION)
     return image_plan(image, TARGETS[target], WELLING.bitrate_bps)
 
 
@@ -124,7 +130,7 @@ class Player:
         self.target = TARGETS[job.target]
         self.clock = VirtualClock()
         self.bus = PlanBus(self.clock, self._seen)
-        self.image_plan = image_plan_of(job.packets, job.short, job.image, job.target)
+        self.image_plan = self._image_plan()
         self.units: list[Unit] = []
         self._options = _options(job, options or UpgradeOptions())
         self._log = log
@@ -158,6 +164,12 @@ class Player:
             self.units[0].on_operation = lambda number, now: self._begins("flash", number, now)
 
     # -- the world -------------------------------------------------------------------------------
+
+    def _image_plan(self, *, has_checksum: bool = False) -> ImagePlan:
+        job = self.plan.job
+        return image_plan_of(
+            job.packets, job.short, job.image, job.target, has_checksum=has_checksum
+        )
 
     def _engine(self, device: plans.Independent | plans.Mock) -> IndependentDevice | MockDevice:
         if isinstance(device, plans.Independent):
@@ -388,6 +400,7 @@ class Player:
                 took_part=unit in self._at_update or unit.application != unit.before,
                 was_heard=not heard.isdisjoint((unit, unit.engine)),
                 was_at_update=unit in self._at_update,
+                runs_nothing=unit.runs_application and unit.application is None,
             )
             for unit, content in zip(self.units, at_end, strict=True)
         ]
@@ -452,6 +465,9 @@ class Player:
         """
         unit = self.units[0]
         unit.power_on(self.clock.now())
+        if "image_checksum=crc32" in self.plan.devices[0].choices:
+            # It refuses an image without one: another image is advised.
+            self.image_plan = self._image_plan(has_checksum=True)
         self._has_operator = True
         in_session = was_killed or claim.needs_rescue
         options = replace(self._options, attempts=None, timeout_s=None, frame_gap_s=0.0)

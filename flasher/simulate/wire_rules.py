@@ -10,16 +10,21 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from flasher.protocol.frame import Frame
+from flasher.protocol.spec import FRAMES_PER_PACKET, TARGETS
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
     ACK,
     BOOT_VERSION,
     END,
+    FEEDBACK,
+    NAK,
     PACKET,
+    REQUEST,
     RESET,
     UPDATE,
     VERSION,
+    WRITE,
 )
 
 REPEAT_MARGIN_S: Final = 0.05
@@ -32,11 +37,22 @@ _COMMANDS: Final = {
 }
 _CAUSES_REPETITION: Final = (
     plans.OnFrames, plans.Noise, plans.Unsolicited, plans.Answer, plans.Tool, plans.Load,
-    plans.Stall, plans.Kill, plans.Restart, plans.Power, plans.Hang, plans.Unplug, plans.BusOff,
+    plans.Kill, plans.Restart, plans.Power, plans.Hang, plans.Unplug, plans.BusOff,
 )  # fmt: skip
 _DELAYS_FRAMES: Final = (plans.Load, plans.Unplug, plans.BusOff, plans.Tool)
 _MESSAGE_OVERHEAD: Final = 9
 """Bytes of a message beside those that its length counts."""
+_ERASURES_MAX: Final = 20
+"""Erasures after which an upgrade ends (docs/explanation/upgrade.md)."""
+_TOOL_QUIET_S: Final = 2.0
+"""Silence of another tool before an upgrade begins again (docs/explanation/safety.md)."""
+_ECHOED_S: Final = 0.45
+"""Time after which the echo of a frame has come."""
+_BURST_OVER_S: Final = 0.25
+"""Silence after which announcements have ended: longer than the host's."""
+_ANNOUNCING_ON_S: Final = DEFAULT_TIMINGS.announcing_on_s - REPEAT_MARGIN_S
+_BESIDE_S: Final = DEFAULT_TIMINGS.boot_version_spacing_s
+"""An application that confirms so soon after a boot version is that of another device."""
 
 
 class Begun(NamedTuple):
@@ -55,6 +71,9 @@ class WireRules:
         clauses = plan.clauses
         is_alone = len(plan.devices) == 1
         self._checks_acks = is_alone and not _has(clauses, _CAUSES_REPETITION)
+        # A pause may come between a decision and a short queue's room for it.
+        if plan.adapter.queue < FRAMES_PER_PACKET and _has(clauses, (plans.Stall,)):
+            self._checks_acks = False
         has_gaps = not plan.job.others or _has(clauses, _DELAYS_FRAMES)
         self._checks_gaps = not has_gaps
         # Frames that wait in a controller that cannot send come out when it can.
@@ -63,9 +82,20 @@ class WireRules:
         )
         self._checks_messages = not (is_stuck or _has(clauses, (plans.Tool, plans.BusOff)))
         self._checks_times = not _has(clauses, (plans.Load, plans.Unplug, plans.BusOff))
+        # The bus shows when announcements reached the host unless they were disturbed.
+        self._checks_announcements = not _has(clauses, (plans.OnFrames, plans.Noise, plans.Stall))
+        self._checks_beside = self._checks_times and not _has(clauses, _CAUSES_REPETITION)
+        self._checks_naks = is_alone and _names_packets_wanted(plan)
+        adapter = plan.adapter
+        self._has_all_echoes = adapter.echoes and not (adapter.lost or adapter.doubled)
+        self._request_id = TARGETS[plan.job.target].request_id
+        self._packets = plan.job.packets
+        self._acked: set[int] = set()
+        """Low bytes of the numbers of all ACKs, also of those that come late."""
+        self._wanted = 1
+        """Packet that the device waits for."""
         self.has_version_answer = False
-        """The device answered a version request after its last announcement or complete."""
-        self.updates = 0
+        """The device answered a version request after the end of transfer."""
         self._broken: dict[str, int] = {}
         self.begin_run()
 
@@ -74,6 +104,16 @@ class WireRules:
         self._left = self._update_left = 0
         self.has_update = False
         """A whole update command was sent."""
+        self.ends = 0
+        """Whole ends of transfer since the last update command."""
+        self._erasures = 0
+        self._is_erasing = False
+        """No packet was sent since the last update command."""
+        self._heads: dict[bytes, float] = {}
+        """First frames of the host's messages, with their times."""
+        self._tool_at = self._beside_at = self._announced_at = float("-inf")
+        self._announcing_since = 0.0
+        self._has_reset = False
         self._had_gap = False
         self._kind = ""
         self._ended_at = float("-inf")
@@ -116,6 +156,7 @@ class WireRules:
         # The device dropped a message whose rest came after a gap.
         if self._left > 0 and is_short and self._checks_messages and not self._had_gap:
             self._break("a message begins while the device waits for the rest of another one")
+        self._heads[data] = now
         self._kind, self._had_gap = name, False
         self._number = data[7] if name == "packet" and len(data) > 7 else 0
         self._left = data[3] + _MESSAGE_OVERHEAD - len(data)
@@ -124,25 +165,56 @@ class WireRules:
         return Begun(name, self._number)
 
     def _check_begin(self, name: str, number: int, now: float) -> None:
-        if name == "update":
-            self.updates += 1
-            self._acknowledged.clear()
-            self._packet = None
-        elif name == "packet":
-            acknowledged_at = self._acknowledged.get(number)
-            if (
-                self._checks_acks
-                and acknowledged_at is not None
-                and now - acknowledged_at > REPEAT_MARGIN_S
-            ):
-                self._break("a packet is sent again after its ACK")
-            if self._packet is not None and self._packet[0] == number:
-                waited_s = now - self._packet[1]
-                is_early = waited_s < DEFAULT_TIMINGS.ack_timeout_s - _TOLERANCE_S
-                is_answered = self._heard_at > self._packet_begun_at - REPEAT_MARGIN_S
-                if is_early and self._checks_times and not is_answered:
-                    self._break("a packet is sent again before its answer is late")
-            self._packet_begun_at = now
+        if name in ("reset", "update"):
+            is_beside_tool = REPEAT_MARGIN_S < now - self._tool_at < _TOOL_QUIET_S - REPEAT_MARGIN_S
+            if is_beside_tool and self._checks_times:
+                self._break("an attempt begins while another tool writes")
+        if name == "reset":
+            self._has_reset, self._beside_at = True, float("-inf")
+        elif name == "update":
+            self._check_update(now)
+        elif name == "end":
+            self._check_acknowledged(self._packets % 256)
+        else:
+            if self._is_erasing:
+                self._is_erasing = False
+                self._erasures += 1
+                if self._erasures > _ERASURES_MAX:
+                    self._break(f"the device is erased more than {_ERASURES_MAX} times")
+            if number != 1:
+                self._check_acknowledged((number - 1) % 256)
+            self._check_repetition(number, now)
+
+    def _check_update(self, now: float) -> None:
+        announcing_s = self._announced_at - self._announcing_since
+        if self.ends and announcing_s < _ANNOUNCING_ON_S and self._checks_announcements:
+            self._break("an update command to a device that may have the new image (R11)")
+        is_beside = now - self._beside_at < 3 * _BESIDE_S and not self.has_update
+        if is_beside and self._checks_beside:
+            self._break("an update command beside an application that answers (R27)")
+        self._acknowledged.clear()
+        self._packet = None
+        self.ends, self._is_erasing = 0, True
+
+    def _check_acknowledged(self, number: int) -> None:
+        if number not in self._acked:
+            self._break("a message follows a packet that was never acknowledged")
+
+    def _check_repetition(self, number: int, now: float) -> None:
+        acknowledged_at = self._acknowledged.get(number)
+        if (
+            self._checks_acks
+            and acknowledged_at is not None
+            and now - acknowledged_at > REPEAT_MARGIN_S
+        ):
+            self._break("a packet is sent again after its ACK")
+        if self._packet is not None and self._packet[0] == number:
+            waited_s = now - self._packet[1]
+            is_early = waited_s < DEFAULT_TIMINGS.ack_timeout_s - _TOLERANCE_S
+            is_answered = self._heard_at > self._packet_begun_at - REPEAT_MARGIN_S
+            if is_early and self._checks_times and not is_answered:
+                self._break("a packet is sent again before its answer is late")
+        self._packet_begun_at = now
 
     def _end_message(self, now: float) -> None:
         if self._left > 0:
@@ -150,6 +222,11 @@ class WireRules:
         self._left = 0
         if self._kind == "packet":
             self._packet = (self._number, now)
+        elif self._kind == "end":
+            if not self.ends:
+                self._announced_at = float("-inf")
+            self.ends += 1
+            self.has_version_answer = False
 
     def update_handed_over(self, now: float) -> None:
         """Check an update command that the host hands to its adapter."""
@@ -161,16 +238,42 @@ class WireRules:
         """Note a frame of a device, of another tool, or of other traffic."""
         data = frame.data
         if data[:2] == b"\x55\xaa" and len(data) == 8:
-            command = int.from_bytes(data[4:6], "big")
-            if command == ACK and data[3] == 4:
-                number = data[6]
-                self._acknowledged.setdefault(number, now)
-                self._acknowledged.pop((number + 1) % 256, None)  # numbers come round after 255
-            elif command == VERSION:
-                self.has_version_answer = True
-            elif command == BOOT_VERSION:
-                self._left = 0  # a device that restarts waits for nothing
+            if frame.can_id == self._request_id:
+                self._tool_begins(data, now)
+            else:
+                self._device_begins(data, now)
         self._heard_at = now
+
+    def _tool_begins(self, data: bytes, now: float) -> None:
+        """Note when another tool writes, unless its frame may be taken for an echo."""
+        sent_at = self._heads.get(data)
+        is_told_apart = sent_at is None or (self._has_all_echoes and now - sent_at > _ECHOED_S)
+        if data[2] == WRITE and is_told_apart:
+            self._tool_at = now
+
+    def _device_begins(self, data: bytes, now: float) -> None:
+        command, number = int.from_bytes(data[4:6], "big"), int.from_bytes(data[6:8], "little")
+        if command == ACK and data[3] == 4:
+            low = data[6]
+            self._acked.add(low)
+            self._acknowledged.setdefault(low, now)
+            self._acknowledged.pop((low + 1) % 256, None)  # numbers come round after 255
+            self._wanted = max(self._wanted, number + 1)
+        elif command == NAK and self._checks_naks:
+            if number != min(self._wanted, self._packets):
+                self._break("a NAK names another packet than the device waits for")
+        elif command == REQUEST:
+            self._wanted = 1
+        elif command == VERSION:
+            self.has_version_answer = True
+        elif command == FEEDBACK:
+            if self._has_reset and now - self._announced_at <= _BESIDE_S:
+                self._beside_at = now
+        elif command == BOOT_VERSION:
+            self._left = 0  # a device that restarts waits for nothing
+            if now - self._announced_at > _BURST_OVER_S:
+                self._announcing_since = now
+            self._announced_at = now
 
     def _break(self, text: str) -> None:
         self._broken[text] = self._broken.get(text, 0) + 1
@@ -178,3 +281,10 @@ class WireRules:
 
 def _has(clauses: tuple[plans.Clause, ...], kinds: tuple[type[plans.Clause], ...]) -> bool:
     return any(isinstance(each, kinds) for each in clauses)
+
+
+def _names_packets_wanted(plan: plans.Plan) -> bool:
+    """True if each NAK comes from a device model that names the packet that it waits for."""
+    (device, *_) = plan.devices
+    is_model = isinstance(device, plans.Mock) and "bad_packet=nak_received" not in device.choices
+    return is_model and not _has(plan.clauses, (plans.Unsolicited, plans.Answer, plans.Tool))

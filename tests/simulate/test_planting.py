@@ -17,7 +17,9 @@ from flasher.host.query import memory_requests
 from flasher.image.image import Image
 from flasher.protocol.crc import crc32
 from flasher.protocol.spec import WELLING
-from flasher.simulate.planting import ROOT, Bug, Edit, swapped, upgrade_bugs
+from flasher.simulate.plan import Plan
+from flasher.simulate.planting import ROOT, Bug, Edit, UpgradeBug, swapped, upgrade_bugs
+from flasher.simulate.play import play
 from tests.loops import each
 
 BUGS = upgrade_bugs()
@@ -64,6 +66,17 @@ def test_a_mistake_is_in_the_process_until_the_end_of_its_block(bug: Bug) -> Non
 def test_every_edit_of_a_mistake_changes_a_function(bug: Bug) -> None:
     for edit in bug.edits:
         assert replace(bug, edits=[edit]).codes()
+
+
+@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
+def test_a_mistake_spoils_its_plan(bug: UpgradeBug) -> None:
+    plan = Plan.parse(bug.plan)
+    verdict = play(plan)
+    with swapped(bug.codes()):
+        spoiled = play(plan)
+
+    assert verdict.violations == ()
+    assert bug.kind in {each.kind for each in spoiled.violations}, spoiled
 
 
 def test_the_mistakes_are_as_many_as_promised_and_have_names_of_their_own() -> None:
