@@ -31,6 +31,8 @@ _ATTEMPTS: Final = 3
 _BEGIN_S: Final = TIMES.boot_version_timeout_s + TIMES.request_transfer_timeout_s
 """Longest time in which a device begins an attempt (R12)."""
 _COMPLETE_S: Final = TIMES.complete_timeout_s * TIMES.end_tries
+_INTERRUPTED_S: Final = TIMES.command_timeout_s + 0.5
+"""Longest time from Ctrl-C to the end: a message that has begun is finished."""
 _CANNOT_SUCCEED: Final = ("battery_use=riding", "answers=false", "image_checksum=crc32")
 """Choices of a device that is not upgraded, or does not show that it was."""
 _LOOKS_LIKE_TWO: Final = (
@@ -129,6 +131,8 @@ class Facts:
     took_s: float = 0.0
     limit_s: float = 1.0
     """Announced deadline."""
+    interrupted_s: float = 0.0
+    """Duration from the first Ctrl-C to the end; 0 without one."""
 
     def begin_run(self, before: str) -> None:
         """Begin with another process of the host."""
@@ -151,6 +155,10 @@ def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
     if facts.took_s > LATEST * facts.limit_s + blocked_s + paused_s:
         share = facts.took_s / facts.limit_s
         yield Violation("LATE", f"ended at {share:.4f} of the announced deadline")
+    if facts.interrupted_s > _INTERRUPTED_S + blocked_s + paused_s:
+        yield Violation("LATE", f"ended {facts.interrupted_s:.1f} s after Ctrl-C")
+    if claim.ending == "cancelled" and facts.rules.has_half_message:
+        yield Violation("WIRE", "cancelled in the middle of a message")
     if facts.host_ids - {facts.request_id}:
         ids = ", ".join(f"0x{each:03X}" for each in sorted(facts.host_ids - {facts.request_id}))
         yield Violation("FOREIGN", f"frames with the id {ids}")

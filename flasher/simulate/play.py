@@ -140,7 +140,7 @@ class Player:
         self._digest = hashlib.sha256()
         self._waiting: dict[tuple[str, int], list[plans.Clause]] = {}
         self._is_running = True
-        self._is_interrupted = False
+        self._interrupted_at: float | None = None
         self._has_operator = False
         """Somebody follows the prompts of `flasher rescue`."""
         self._is_prompted = False
@@ -297,7 +297,8 @@ class Player:
                 self._again_after_s, self._has_operator = again, rescue
                 link.kill()
             case plans.Interrupt():
-                self._is_interrupted = True
+                if self._interrupted_at is None:
+                    self._interrupted_at = now
 
     def _garble(self, *, is_garbled: bool) -> None:
         self.bus.is_garbled = is_garbled
@@ -386,13 +387,16 @@ class Player:
             if claim is not None:
                 break
             self._wait(self.clock.now() + self._again_after_s)
-        took_s = self.clock.now() - began_at
+        ended_at = self.clock.now()
+        took_s = ended_at - began_at
+        interrupted_s = ended_at - (self._interrupted_at or ended_at)
         heard = frozenset(self.bus.heard)
         at_end = [self._content(unit) for unit in self.units]
         self._end_faults()
         self._wait(self.clock.now() + SETTLE_S)
         left = " / ".join(map(self._content, self.units))
         facts.took_s, facts.limit_s = took_s, limit_s
+        facts.interrupted_s = interrupted_s
         facts.units = [
             UnitFacts(
                 at_end=content,
@@ -434,7 +438,7 @@ class Player:
         self._phase = "idle"
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
         link.on_update = self._facts.rules.update_handed_over
-        self._is_interrupted = False
+        self._interrupted_at = None
         device = api.Connection(link, self.clock, "the bus of the plan").device(self.target)
         try:
             result = device.upgrade(
@@ -442,7 +446,7 @@ class Player:
                 options=options,
                 identity=Identity(),
                 on_event=self._note,
-                cancelled=lambda: self._is_interrupted,
+                cancelled=lambda: self._interrupted_at is not None,
             )
         except KilledError:
             return None

@@ -45,7 +45,7 @@ _MESSAGE_OVERHEAD: Final = 9
 _ERASURES_MAX: Final = 20
 """Erasures after which an upgrade ends (docs/explanation/upgrade.md)."""
 _TOOL_QUIET_S: Final = 2.0
-"""Silence of another tool before an upgrade begins again (docs/explanation/safety.md)."""
+"""Silence of another tool before anything is sent again (docs/explanation/safety.md)."""
 _ECHOED_S: Final = 0.45
 """Time after which the echo of a frame has come."""
 _BURST_OVER_S: Final = 0.25
@@ -82,6 +82,8 @@ class WireRules:
         )
         self._checks_messages = not (is_stuck or _has(clauses, (plans.Tool, plans.BusOff)))
         self._checks_times = not _has(clauses, (plans.Load, plans.Unplug, plans.BusOff))
+        self._checks_ends = self._checks_messages and self._checks_times
+        self._checks_ends &= not _has(clauses, (plans.Stall,))
         # The bus shows when announcements reached the host unless they were disturbed.
         self._checks_announcements = not _has(clauses, (plans.OnFrames, plans.Noise, plans.Stall))
         self._checks_beside = self._checks_times and not _has(clauses, _CAUSES_REPETITION)
@@ -124,6 +126,11 @@ class WireRules:
         self._updated_at = float("-inf")
         self._number = 0
 
+    @property
+    def has_half_message(self) -> bool:
+        """The device waits for the rest of a message that nothing has disturbed."""
+        return self._left > 0 and self._checks_ends
+
     def broken(self) -> Iterator[str]:
         """Yield the rules that were broken, with their numbers."""
         for text, count in self._broken.items():
@@ -165,10 +172,9 @@ class WireRules:
         return Begun(name, self._number)
 
     def _check_begin(self, name: str, number: int, now: float) -> None:
-        if name in ("reset", "update"):
-            is_beside_tool = REPEAT_MARGIN_S < now - self._tool_at < _TOOL_QUIET_S - REPEAT_MARGIN_S
-            if is_beside_tool and self._checks_times:
-                self._break("an attempt begins while another tool writes")
+        is_beside_tool = REPEAT_MARGIN_S < now - self._tool_at < _TOOL_QUIET_S - REPEAT_MARGIN_S
+        if is_beside_tool and self._checks_times:
+            self._break("a message begins while another tool writes")
         if name == "reset":
             self._has_reset, self._beside_at = True, float("-inf")
         elif name == "update":
