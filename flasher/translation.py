@@ -65,6 +65,12 @@ class _Formatted(str):
     __slots__ = ()
 
 
+class _Converted(str):
+    """Text whose numbers are in the language's format."""
+
+    __slots__ = ()
+
+
 class Translator(Formatter):
     """Translates into one language; `code` is for a page's `lang` attribute."""
 
@@ -91,7 +97,7 @@ class Translator(Formatter):
         """Convert the numbers of a text from English, 1,234.5, to the language's format."""
         if self.code not in _COMMA_LANGUAGES:
             return text
-        return _NUMBER.sub(lambda number: number[0].translate(_COMMA), text)
+        return _Converted(_NUMBER.sub(lambda number: number[0].translate(_COMMA), text))
 
     def _translate_plain(self, sentence: str) -> str:
         translated = self._known(sentence)
@@ -159,6 +165,8 @@ class Translator(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, Text):
             return self(value)
+        if isinstance(value, _Converted):
+            return format(str(value), format_spec)
         if isinstance(value, _Formatted):
             text = str(value)
             bare = text.strip()

@@ -6,6 +6,7 @@ import errno
 import itertools
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NoReturn
@@ -36,6 +37,7 @@ from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
 from flasher.web.bench_page import battery_answers
 from flasher.web.bench_state import Activity, BenchState, Done
+from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
@@ -298,6 +300,35 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
 
 
 # -- bad ends --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("language", "text"),
+    [
+        ("en", "the adapter was away for 1.5 s"),
+        ("de", "der Adapter war 1,5 s weg"),
+        ("zh", "适配器断开了 1.5 s"),
+    ],
+)
+def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(
+    place: BenchPlace, language: str, text: str
+) -> None:
+    done = _done(place)
+    assert done.result is not None
+    away = replace(done.result, outcome=replace(done.result.outcome, unobserved_s=1.5))
+    translate = translator(language)
+    for each, is_shown in ((done, False), (replace(done, result=away), True)):
+        sheet = Pages(language).text(
+            "bench_sheet.html",
+            translate,
+            "",
+            done=each,
+            rows=[],
+            device=None,
+            waivers={},
+            is_saved=True,
+        )
+        assert (text in sheet) == is_shown
 
 
 @pytest.mark.parametrize(
