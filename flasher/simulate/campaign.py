@@ -4,6 +4,9 @@ A batch is a range of seeds; `run_batch` plays their plans, wherever it runs. Re
 (`Result.__add__`): counts by +, places by |, violations by the lowest seeds, digests by exclusive
 or; so neither the size of the batches nor the order of their ends changes the sum.
 
+The corpus (`corpus.toml`) keeps plans for places that random plans seldom reach: shrunk plans, not
+seeds, which mean something else after the next change. A campaign plays it first.
+
 A canary is a planted mistake (`planting`) that a campaign has to find, or it is blind.
 """
 
@@ -24,11 +27,12 @@ from math import log2
 from pathlib import Path
 from typing import Final, TypeVar
 
+from flasher.files import parse_toml
 from flasher.simulate import plan as plans
 from flasher.simulate.draw import drawn
 from flasher.simulate.planting import swapped, upgrade_bugs
 from flasher.simulate.play import Verdict, play
-from flasher.simulate.reached import UNREACHABLE, exit_place, places, recorded_cells
+from flasher.simulate.reached import exit_place, reachable, recorded_cells, with_readings
 
 VIOLATIONS_MAX: Final = 20
 """Violations that a result keeps, those of the lowest seeds; all are counted."""
@@ -36,12 +40,15 @@ CANARY_EVERY: Final = 2000
 """Runs of a campaign for each canary."""
 CANARY_RUNS: Final = 1000
 """Runs in which a canary has to be found."""
+CORPUS_SEEDS: Final = 1_000_000
+"""More than the corpus has plans."""
 CANARIES: Final = (
     "last-program-unit-lost",
     "one-packet-more-for-whole-sizes",
 )
 """Planted mistakes that few runs find."""
 NO_FAULT: Final = "none"
+_CORPUS: Final = Path(__file__).with_name("corpus.toml")
 _TIMES_PER_OCTAVE: Final = 4
 """Classes of times: each 2^(1/4) times as long as the one before."""
 
@@ -56,6 +63,12 @@ class Batch:
     count: int
     canary: str = ""
     """Name of a planted mistake."""
+    is_corpus: bool = False
+    """`first` and `count` are those of plans of the corpus."""
+
+    def plan_of(self, number: int) -> plans.Plan:
+        """Return the plan of a seed, or of the corpus."""
+        return [*corpus().values()][number] if self.is_corpus else drawn(number)
 
 
 @dataclass(frozen=True, order=True)
@@ -63,6 +76,7 @@ class Found:
     """Violation, and the plan that shows it."""
 
     seed: int
+    """Or the number of a plan of the corpus less `CORPUS_SEEDS`, so that it is below 0."""
     kind: str
     text: str
     plan: str
@@ -108,6 +122,8 @@ class Result:
 
     campaign: str
     runs: int = 0
+    """Random ones: endings and tallies count only these."""
+    corpus_runs: int = 0
     endings: Mapping[str, int] = field(default_factory=dict)
     tallies: Mapping[str, Tally] = field(default_factory=dict)
     """By the name of a clause that a plan contains; `NO_FAULT` for plans without a fault."""
@@ -135,12 +151,13 @@ class Result:
         return Result(
             campaign=self.campaign,
             runs=self.runs + other.runs,
+            corpus_runs=self.corpus_runs + other.corpus_runs,
             endings=_sum(self.endings, other.endings),
             tallies={
                 name: self.tallies.get(name, Tally()) + other.tallies.get(name, Tally())
                 for name in sorted(names)
             },
-            reached=tuple(sorted({*self.reached, *other.reached})),
+            reached=with_readings({*self.reached, *other.reached}),
             violations=tuple(violations[:VIOLATIONS_MAX]),
             violation_count=self.violation_count + other.violation_count,
             excused=self.excused + other.excused,
@@ -155,7 +172,7 @@ class Result:
     @property
     def never_reached(self) -> list[str]:
         """Places that no run reached, without those that none can reach."""
-        return sorted(places() - {*self.reached} - UNREACHABLE.keys())
+        return sorted(reachable() - {*self.reached})
 
     @property
     def is_blind(self) -> bool:
@@ -179,6 +196,18 @@ def campaign_key() -> str:
         digest.update(f"{file.relative_to(package).as_posix()}\0".encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
+
+
+@cache
+def corpus() -> Mapping[str, plans.Plan]:
+    """Return the plans of the corpus, each by a place that it reaches."""
+    table = parse_toml(_CORPUS.read_bytes())["plans"]
+    return {place: plans.Plan.parse(line) for place, line in table.items()}
+
+
+def corpus_batch() -> Batch:
+    """Return the batch of the whole corpus."""
+    return Batch(campaign_key(), 0, len(corpus()), is_corpus=True)
 
 
 def batches(first: int, runs: int, count: int) -> Iterator[Batch]:
@@ -216,8 +245,8 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
                 for seed in range(batch.first, batch.first + batch.count):
                     if is_stopped():
                         break
-                    plan = drawn(seed)
-                    sums.add(seed, plan, play(plan))
+                    plan = batch.plan_of(seed)
+                    sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, play(plan))
             sums.reached |= cells
     return sums.result(batch.campaign, time.process_time() - began_s)
 
@@ -238,7 +267,7 @@ class _Sums:
 
     def __init__(self) -> None:
         self.reached: set[str] = set()
-        self._runs = self._excused = self._canary_runs = self._digest = 0
+        self._runs = self._corpus_runs = self._excused = self._canary_runs = self._digest = 0
         self._endings: Counter[str] = Counter()
         self._tallies: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._times: defaultdict[str, Counter[int]] = defaultdict(Counter)
@@ -247,13 +276,21 @@ class _Sums:
         self._latest = 0.0
 
     def add(self, seed: int, plan: plans.Plan, verdict: Verdict) -> None:
-        self._runs += 1
-        self._endings[verdict.ending] += 1
         self.reached |= verdict.reached
         self.reached.add(exit_place(verdict.exit_code))
         self._latest = max(self._latest, verdict.lateness)
         text = f"{seed} {verdict.wire} {verdict.ending} {verdict.left} {verdict.recovered}"
         self._digest ^= int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+        for each in verdict.violations:
+            if each.is_excused:
+                self._excused += 1
+            else:
+                self._found.append(Found(seed, each.kind, each.text, str(plan)))
+        if seed < 0:
+            self._corpus_runs += 1
+            return
+        self._runs += 1
+        self._endings[verdict.ending] += 1
         how = "good" if verdict.is_good else f"by_{verdict.recovered}" if verdict.recovered else ""
         for name in {each.NAME for each in plan.events} or {NO_FAULT}:
             tally = self._tallies[name]
@@ -263,11 +300,6 @@ class _Sums:
             if verdict.is_good and verdict.share_of_bus_time:
                 time_class = round(_TIMES_PER_OCTAVE * log2(verdict.share_of_bus_time))
                 self._times[name][time_class] += 1
-        for each in verdict.violations:
-            if each.is_excused:
-                self._excused += 1
-            else:
-                self._found.append(Found(seed, each.kind, each.text, str(plan)))
 
     def hunt(self, batch: Batch, is_stopped: Callable[[], bool]) -> None:
         """Play plans with a planted mistake until one shows it."""
@@ -287,12 +319,13 @@ class _Sums:
         return Result(
             campaign=campaign,
             runs=self._runs,
+            corpus_runs=self._corpus_runs,
             endings=_sorted(self._endings),
             tallies={
                 name: Tally(**counts, times=_sorted(self._times[name]))
                 for name, counts in sorted(self._tallies.items())
             },
-            reached=tuple(sorted(self.reached - {""})),
+            reached=with_readings(self.reached - {""}),
             violations=tuple(sorted(set(self._found))[:VIOLATIONS_MAX]),
             violation_count=len(self._found),
             excused=self._excused,

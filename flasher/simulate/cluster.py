@@ -201,7 +201,14 @@ class _Todo:
         return bool(self._running)
 
     def _submit(self, play: Callable[[RunBatch, Batch], Result], batch: Batch) -> None:
-        key = (play.__name__, batch.campaign, batch.canary, batch.first, batch.count)
+        key = (
+            play.__name__,
+            batch.campaign,
+            batch.canary,
+            int(batch.is_corpus),
+            batch.first,
+            batch.count,
+        )
         future = self._client.submit(play, self._run_one, batch, key=key)
         self._running[future.key] = future, batch
         self._completed.add(future)

@@ -198,7 +198,10 @@ class Ledger:
         done = _joined(self.found.ranges)
         canaries = set(self.found.canaries)
         for batch in batches:
-            if not batch.canary:
+            if batch.is_corpus:
+                if not self.found.result.corpus_runs:
+                    yield batch
+            elif not batch.canary:
                 for first, end in _gaps((batch.first, batch.first + batch.count), done):
                     yield replace(batch, first=first, count=end - first)
             elif (batch.first, batch.canary) not in canaries:
@@ -209,7 +212,10 @@ class Ledger:
         the file cannot be written.
         """
         waiting = self._waiting
-        if batch.canary:
+        if batch.is_corpus:
+            if result.corpus_runs < batch.count:
+                return  # stopped
+        elif batch.canary:
             if not (result.canaries_found or result.canaries_missed):
                 return  # stopped
             waiting.canaries.append((batch.first, batch.canary))
@@ -223,7 +229,7 @@ class Ledger:
         """Write what was added. Raises UsageError if the file cannot be written."""
         done, self._waiting = self._waiting, _Read(Result(campaign_key()))
         self._written_at_s = time.perf_counter()
-        if not (done.ranges or done.canaries):
+        if not (done.ranges or done.canaries or done.result.corpus_runs):
             return
         seeds = tuple((first, end - first) for first, end in _joined(done.ranges))
         whole = (self._first, self._runs)

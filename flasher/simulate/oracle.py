@@ -15,9 +15,9 @@ from flasher.simulate import plan as plans
 from flasher.simulate.wire_rules import WireRules
 
 DOCUMENTED: Final = frozenset(ExitCode) - {
-    ExitCode.INTERNAL, ExitCode.USAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
+    ExitCode.INTERNAL, ExitCode.USAGE, ExitCode.IMAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
 }  # fmt: skip
-"""Exit codes that a plan can cause."""
+"""Exit codes that a plan can cause; the image of a plan is always one for its device."""
 LATEST: Final = 1.001
 """Latest end as a share of the announced deadline: a message that has begun is finished."""
 _BLOCKS: Final = (plans.Load, plans.Unplug, plans.BusOff)

@@ -252,7 +252,8 @@ class Unsolicited(Clause):
     """A message of the device that nobody asked for, valid, from another sender."""
 
     NAME = "unsolicited"
-    what: Literal["ack", "nak", "boot", "request", "complete", "feedback"] = "nak"
+    what: Literal["ack", "nak", "boot", "request", "complete", "feedback", "unknown"] = "nak"
+    """`unknown` is a message of no document."""
     number: int = 1
     count: int = 1
 
@@ -338,10 +339,21 @@ class Tool(Clause):
 
     NAME = "tool"
     does: Literal[
-        "asks", "writes", "resets", "updates", "packets", "refused", "ends", "unknown", "damaged"
+        "asks",
+        "writes",
+        "resets",
+        "updates",
+        "packets",
+        "refused",
+        "ends",
+        "unknown",
+        "damaged",
+        "shortens",
+        "answers",
     ] = "asks"
     """`refused` is an update command of size 0, `unknown` a command of no document, `damaged` a
-    packet with a wrong checksum.
+    packet with a wrong checksum, `shortens` an update command for an image that is one byte
+    shorter, `answers` an ACK, which only a device sends.
     """
     count: int = 1
     every: float = 0.2

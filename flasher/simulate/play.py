@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import random
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
@@ -13,15 +13,17 @@ from typing import Final
 from flasher import api
 from flasher.bus.link import VirtualClock
 from flasher.errors import FlasherError
-from flasher.events import BootVersionSeen, PowerCycleAwaited
+from flasher.events import AttemptStarted, BootVersionSeen, PowerCycleAwaited, QueryAnswered
 from flasher.host.identity import Identity
 from flasher.host.options import UpgradeOptions, overall_timeout_s
 from flasher.host.session import Result
+from flasher.host.table import Reason
 from flasher.image.image import Image
 from flasher.image.plan import Plan as ImagePlan
 from flasher.image.plan import plan as image_plan
 from flasher.mock.model import MockDevice
 from flasher.mock.store import with_checksum
+from flasher.protocol.contents import RunningInformation
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import PACKET_DATA_SIZE, TARGETS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -53,7 +55,7 @@ from flasher.simulate.independent import (
     frames_of,
 )
 from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
-from flasher.simulate.reached import fault_place
+from flasher.simulate.reached import fault_place, reading_place
 from flasher.simulate.wire_rules import WireRules
 
 NEW_VERSION: Final = "V1r2r0_20240601"
@@ -145,6 +147,7 @@ class Player:
         """Somebody follows the prompts of `flasher rescue`."""
         self._is_prompted = False
         """A prompt is on the screen."""
+        self._has_running_information = self._is_silence_answered = False
         self._again_after_s = 0.0
         """Time from the kill of the host's process until the same command runs again."""
         self._phase = "idle"
@@ -344,6 +347,7 @@ class Player:
             "request": (REQUEST, b"\0\0"),
             "complete": (COMPLETE, b"\0\0"),
             "feedback": (FEEDBACK, b"ACK"),
+            "unknown": (0x7701, b"?"),
         }[clause.what]
         return frames_of(self.target.answer_id, REPORT, command, data)
 
@@ -352,19 +356,19 @@ class Player:
         packet = (
             b"\1" + (turn + 1).to_bytes(2, "little") + packets.to_bytes(2, "little") + b"\xa5" * 128
         )
-        update = self.target.update_text.encode()
+        update, size_bytes = self.target.update_text.encode(), len(self.image_plan.image.data)
         mode, command, data = {
             "asks": (READ, READ_VERSION, b""),
             "writes": (WRITE, 0x3A10, b"second tool.    "),
             "resets": (WRITE, RESET, b"RESET"),
-            "updates": (
-                WRITE, UPDATE, update + len(self.image_plan.image.data).to_bytes(4, "little")
-            ),
+            "updates": (WRITE, UPDATE, update + size_bytes.to_bytes(4, "little")),
+            "shortens": (WRITE, UPDATE, update + (size_bytes - 1).to_bytes(4, "little")),
             "packets": (WRITE, PACKET, packet),
             "refused": (WRITE, UPDATE, update + bytes(4)),
             "ends": (WRITE, END, b"\4"),
             "unknown": (WRITE, 0x7777, b"?"),
             "damaged": (WRITE, PACKET, packet),
+            "answers": (REPORT, ACK, b"\1\0"),
         }[does]  # fmt: skip
         frames = frames_of(self.target.request_id, mode, command, data)
         if does == "damaged":
@@ -408,6 +412,9 @@ class Player:
             )
             for unit, content in zip(self.units, at_end, strict=True)
         ]
+        is_good = claim.is_ok and self.units[0].application == self.image_plan.image.data
+        if is_good:
+            self._reached |= set(map(reading_place, self._readings()))
         violations = [*judge(facts, claim)]
         recovered = ""
         if not (claim.is_ok or violations) and len(self.units) == 1:
@@ -419,7 +426,7 @@ class Player:
             plan=str(self.plan),
             ending=claim.ending,
             exit_code=claim.exit_code,
-            is_good=claim.is_ok and self.units[0].application == self.image_plan.image.data,
+            is_good=is_good,
             left=left,
             attempts=claim.attempts,
             took_s=took_s,
@@ -432,6 +439,20 @@ class Player:
             wire=self._digest.hexdigest()[:16],
             where=claim.where,
         )
+
+    def _readings(self) -> Iterator[str]:
+        """Yield the readings of the documents that a good run shows by itself."""
+        job, device = self.plan.job, self.plan.devices[0]
+        if self._has_running_information:
+            yield "R1"
+        if device.application == "none":
+            yield "R14"
+        elif job.target != "bms" and not [*self.plan.events]:
+            yield "R3"  # only a reset leads into its bootloader
+        if job.short:
+            yield "R9"
+        if self._is_silence_answered:
+            yield "R26"
 
     def _run(self, options: UpgradeOptions, overdue_at: float) -> Claim | None:
         """Run the command once; None if its process was killed."""
@@ -493,6 +514,10 @@ class Player:
             self.bus.agenda.at(self.clock.now() + _OPERATOR_S, self._follow_prompt)
         elif isinstance(event, BootVersionSeen):
             self._is_prompted = False
+        elif isinstance(event, QueryAnswered):
+            self._has_running_information |= isinstance(event.content, RunningInformation)
+        elif isinstance(event, AttemptStarted):
+            self._is_silence_answered |= event.reason == Reason.BOOT_SILENT.value
 
     def _follow_prompt(self, now: float) -> None:
         """Switch the unit off, unless the upgrade goes on already."""

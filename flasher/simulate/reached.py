@@ -1,26 +1,123 @@
-"""Records what a campaign has reached: rows of the tables, faults in each phase, endings.
+"""Records what a campaign has reached: rows of the tables, faults in each phase, exit codes, and
+readings of the documents (R1 to R28).
 
 What no run of a large campaign reaches is not tested by it. So the places that there are (`places`)
-are compared with those that were reached; `UNREACHABLE` names the ones that nothing can reach.
+are compared with those that were reached; `UNREACHABLE` names the ones that nothing can reach. What
+random plans seldom reach has a plan of its own in the corpus (`corpus.toml`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, Final
 
 from flasher.host import upgrade
 from flasher.host.table import TABLE as HOST_TABLE
 from flasher.mock import model
 from flasher.mock.table import TABLE as DEVICE_TABLE
+from flasher.mock.table import BootloaderEvent, BootloaderState
 from flasher.simulate import plan as plans
 from flasher.simulate.oracle import DOCUMENTED
 
 PHASES: Final = ("idle", "reset", "update", "packet", "end")
 """Last message that the host has begun when a fault happens."""
 _LASTING: Final = (plans.Job, plans.Adapter, plans.Independent, plans.Mock)
-UNREACHABLE: Final[Mapping[str, str]] = {}
+_S, _E = BootloaderState, BootloaderEvent
+_IN_BOOTLOADER: Final = frozenset(_S) - {_S.OFF, _S.RESTARTING, _S.APPLICATION}
+_HAPPENS_IN: Final[Mapping[BootloaderEvent, frozenset[BootloaderState]]] = {
+    _E.UPGRADE_IN_APPLICATION: frozenset({_S.APPLICATION}),
+    _E.RESET_IGNORED: _IN_BOOTLOADER,
+    _E.UPDATE: _IN_BOOTLOADER - {_S.CHECKING, _S.STARTING},
+    _E.UPDATE_AGAIN: frozenset({_S.ERASING, _S.TRANSFER}),
+    _E.UPDATE_REFUSED: _IN_BOOTLOADER,
+    **dict.fromkeys(
+        (
+            _E.PACKET_NEXT, _E.PACKET_REPEATED, _E.PACKET_OLDER, _E.PACKET_BAD,
+            _E.END_WHOLE, _E.END_WRONG, _E.END_EARLY,
+        ),
+        frozenset({_S.TRANSFER}),
+    ),
+    _E.END_AGAIN: frozenset({_S.CHECKING, _S.STARTING, _S.REFUSED}),
+    _E.OUT_OF_TURN: _IN_BOOTLOADER - {_S.TRANSFER},
+    _E.POWER_ON: frozenset({_S.OFF}),
+}  # fmt: skip
+"""States in which an event of the device model can happen, where they are not all of its rows."""
+_READINGS: Final[Mapping[str, tuple[str, ...]]] = {
+    "R2": ("host: awaiting request transfer, boot version",),
+    "R4": ("host: transferring, ACK", "host: transferring, NAK"),
+    "R6": ("host: ending, NAK", "exit code: 8"),
+    "R7": (
+        "device: transfer, end of transfer, packets missing",
+        "device: transfer, end of transfer, image checksum wrong",
+    ),
+    "R10": (
+        "device: transfer, packet stored last",
+        "device: transfer, packet stored before",
+        "host: settling, ACK",
+        "host: settling, no answer to a copy came any more",
+    ),
+    "R11": (
+        "host: transferring, boot version",
+        "host: ending, boot version",
+        "host: confirming, boot version",
+    ),
+    "R12": (
+        "host: awaiting boot version, no boot version in time",
+        "host: awaiting request transfer, no request transfer in time",
+        "host: transferring, packet not answered",
+        "host: ending, end of transfer not answered, or its announcements stopped",
+        "device: transfer, pause too long",
+    ),
+    "R15": (
+        "host: awaiting request transfer, general feedback",
+        "host: transferring, general feedback",
+        "host: ending, general feedback",
+    ),
+    "R16": ("host: transferring, request transfer", "host: settling, request transfer"),
+    "R17": ("device: application, upgrade message for the running application",),
+    "R18": ("device: announcing, reset that the bootloader ignores",),
+    "R19": (
+        "device: off, power on",
+        "device: announcing, window over, application whole",
+        "device: starting, start delay over",
+    ),
+    "R25": (
+        "device: erasing, update command repeated",
+        "device: transfer, update command repeated",
+    ),
+    "R27": (
+        "host: watching the announcements, what one device does not send",
+        "host: transferring, what one device does not send",
+    ),
+    "R28": ("host: transferring, boot version",),
+}
+"""Places that show together how flasher reads the documents; the player observes the others."""
+_NOT_ASKED: Final = "an upgrade asks the device neither for this nor shows it"
+UNREACHABLE: Final[Mapping[str, str]] = {
+    **{
+        f"device: {state.value}, {event.value}": (
+            "a supply that is on is not switched on again"
+            if event is _E.POWER_ON
+            else "in this state the model takes the message for another event"
+        )
+        for state, row in DEVICE_TABLE.items()
+        for event in row
+        if state not in _HAPPENS_IN.get(event, DEVICE_TABLE)
+    },
+    "host: yielding to another tool, what one device does not send": (
+        "the host does not judge answers that are for another tool"
+    ),
+    "reading: R5": _NOT_ASKED,
+    "reading: R8": "the image of a plan is not read from a file, so it has no addresses",
+    "reading: R13": _NOT_ASKED,
+    "reading: R20": "the devices of a plan end their texts as the document asks",
+    "reading: R21": _NOT_ASKED,
+    "reading: R22": _NOT_ASKED,
+    "reading: R23": "a battery switches off after 30 minutes without traffic, which no plan has",
+    "reading: R24": _NOT_ASKED,
+}
 """Places that no plan reaches, with the reason."""
 
 
@@ -71,7 +168,25 @@ def places() -> set[str]:
     for clause in plans.CLAUSES.values():
         if not issubclass(clause, _LASTING):
             found |= {fault_place(clause.NAME, phase) for phase in PHASES}
+    found |= {reading_place(f"R{number}") for number in range(1, 29)}
     return found | {exit_place(code) for code in DOCUMENTED}
+
+
+@cache
+def reachable() -> frozenset[str]:
+    """Return the places that a campaign has to reach."""
+    return frozenset(places() - UNREACHABLE.keys())
+
+
+def with_readings(reached: Iterable[str]) -> tuple[str, ...]:
+    """Sort places, and add the readings that they show together."""
+    found = {*reached}
+    found |= {reading_place(name) for name, each in _READINGS.items() if found.issuperset(each)}
+    return tuple(sorted(found))
+
+
+def reading_place(name: str) -> str:
+    return f"reading: {name}"
 
 
 def fault_place(fault: str, phase: str) -> str:

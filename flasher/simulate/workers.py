@@ -16,8 +16,7 @@ from threading import Event, Lock
 from typing import Final, Self
 
 from flasher.processes import end_with_parent, signals_blocked
-from flasher.simulate.campaign import NO_FAULT, Batch, Found, Result, Tally, run_batch
-from flasher.simulate.draw import drawn
+from flasher.simulate.campaign import CORPUS_SEEDS, NO_FAULT, Batch, Found, Result, Tally, run_batch
 
 KILLED: Final = "KILLED"
 """Kind of the violation of a run that ended its process."""
@@ -49,11 +48,14 @@ class Pace:
             self._cpu_s += result.cpu_s
 
     def cut(self, batches: Iterable[Batch]) -> Iterator[Batch]:
-        """Yield the batches in parts, each as large as the pace then is; canaries whole."""
+        """Yield the batches in parts, each as large as the pace then is; canaries and the corpus
+        whole.
+        """
         for batch in batches:
             first, end = batch.first, batch.first + batch.count
             while first < end:
-                count = batch.count if batch.canary else min(self._size(), end - first)
+                is_whole = batch.canary or batch.is_corpus
+                count = batch.count if is_whole else min(self._size(), end - first)
                 yield replace(batch, first=first, count=count)
                 first += count
 
@@ -259,13 +261,17 @@ def _killed(batch: Batch, seed: int, exit_code: int | None) -> Result:
         how = f"ended its process: {signal.Signals(-exit_code).name}"
         if how.endswith("SIGPROF"):
             how = f"took more than {_RUN_S:g} s of CPU time"
-    plan = drawn(seed)
+    plan = batch.plan_of(seed)
+    text = f"the run {how}"
+    if batch.is_corpus:
+        found = Found(seed - CORPUS_SEEDS, KILLED, text, str(plan))
+        return Result(batch.campaign, corpus_runs=1, violations=(found,), violation_count=1)
     return Result(
         batch.campaign,
         runs=1,
         endings={"killed": 1},
         tallies={name: Tally(runs=1) for name in {each.NAME for each in plan.events} or {NO_FAULT}},
-        violations=(Found(seed, KILLED, f"the run {how}", str(plan)),),
+        violations=(Found(seed, KILLED, text, str(plan)),),
         violation_count=1,
         digest=hashlib.sha256(f"{seed} {KILLED}".encode()).hexdigest()[:16],
     )

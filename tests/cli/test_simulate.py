@@ -14,8 +14,9 @@ from flasher.cli.bench import simulate as command
 from flasher.cli.main import main
 from flasher.errors import ExitCode
 from flasher.simulate import campaign, planting
-from flasher.simulate.campaign import Batch, Result, campaign_key
+from flasher.simulate.campaign import Batch, Result, campaign_key, corpus, corpus_batch
 from flasher.simulate.planting import swapped, upgrade_bugs
+from flasher.simulate.reached import reachable
 from tests.loops import each
 
 LOST = "job packets=3 ; independent erase=0.05 ; @packet2 power"
@@ -25,9 +26,14 @@ def planted(name: str) -> planting.Codes:
     return next(bug for bug in upgrade_bugs() if bug.name == name).codes()
 
 
+def part_of_corpus(count: int) -> Batch:
+    return Batch(campaign_key(), 0, count, is_corpus=True)
+
+
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A canary is found in the first runs of a campaign."""
+    """A canary is found in the first runs of a campaign, which has no corpus."""
+    monkeypatch.setattr(command, "corpus_batch", lambda: part_of_corpus(0))
     monkeypatch.setattr(campaign, "CANARIES", ("last-program-unit-lost",))
     monkeypatch.setattr(command, "_BATCH", 3)
 
@@ -40,7 +46,7 @@ def test_a_campaign_prints_what_happened_and_what_was_reached(
     assert main(["simulate", "--runs", "6"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert out.startswith("6 runs, ")
-    assert "places reached" in out
+    assert " places reached\n" in out
     assert out.endswith("canaries found: 1\nno violation in 6 runs\n")
 
 
@@ -65,6 +71,28 @@ def test_a_violation_ends_the_campaign_with_the_shortest_plan_and_its_replay(
         assert re.search(r'<td class="keep">[\w-]+</td><td class="number">\d+</td>', text)
         assert main(["simulate", "replay", plan]) == ExitCode.PARTIAL
     assert main(["simulate", "replay", plan]) == ExitCode.OK
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_strict_needs_every_place_and_lists_what_no_run_reached(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "corpus_batch", corpus_batch)
+    assert main(["simulate", "--runs", "1", "--strict"]) == ExitCode.OK
+    out = capsys.readouterr().out
+    assert f"\n{len(corpus())} plans of the corpus played\n" in out
+    assert f"\n{len(reachable())} of {len(reachable())} places reached\n" in out
+    assert "never" not in out
+    monkeypatch.setattr(command, "corpus_batch", lambda: part_of_corpus(2))
+    assert main(["simulate", "--runs", "1"]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["simulate", "--runs", "1", "--strict"]) == ExitCode.PARTIAL
+    out = capsys.readouterr().out
+    lines = [line for line in out.splitlines() if line.startswith("  never: ")]
+    assert "  never: reading: R10; R11; R12; " in out
+    assert sum(line.startswith("  never: host: settling: ") for line in lines) == 1
+    assert max(map(len, out.splitlines())) < 80
 
 
 def test_a_replay_is_the_same_each_time_and_leaves_a_trace(

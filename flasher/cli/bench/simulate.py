@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -31,6 +33,7 @@ from flasher.simulate.campaign import (
     Tally,
     batches,
     campaign_key,
+    corpus_batch,
     run_batch,
     share,
 )
@@ -38,6 +41,7 @@ from flasher.simulate.ledger import Ledger
 from flasher.simulate.ledger import merge as merge_ledgers
 from flasher.simulate.plan import Plan
 from flasher.simulate.play import Player, Verdict
+from flasher.simulate.reached import reachable
 from flasher.simulate.shrink import shrink
 from flasher.simulate.sweep import PartResult, parts
 from flasher.simulate.sweep import run as run_part
@@ -64,6 +68,9 @@ In the table, `again` is how many failed runs the same command brought back with
 `rescued` how many `flasher rescue` did, and `median time` that of the successful ones, as a
 multiple of the time on the bus.
 
+Before the random runs, each campaign plays a corpus: plans for what random ones seldom reach. What
+no run reached is listed, without what none can reach.
+
 The first violation is printed as the shortest plan that shows it, with a command that replays it on
 any computer; exit code 12. Every campaign also plants a mistake into its own process (a canary),
 which it has to find; a campaign that misses it is blind, exit code 12 as well.
@@ -71,6 +78,7 @@ which it has to find; a campaign that misses it is blind, exit code 12 as well.
 _BATCH: Final = 50
 """Runs of a batch."""
 _RUNS: Final = 1000
+_COLUMNS: Final = 79
 _ENDLESS: Final = 10**12
 """Runs that no campaign reaches."""
 TRACE_FILE: Final = "--trace-file"
@@ -129,7 +137,8 @@ class Campaign:
     )]  # fmt: skip
     strict: Annotated[bool, _what(
         "--strict", is_flag=True,
-        help="fail as well if no run reached some row of the tables, or some fault in some phase",
+        help="fail as well if no run reached some row of the tables, fault in a phase, exit code,"
+        " or reading of the documents",
     )]  # fmt: skip
     html: Annotated[Path | None, _html]
 
@@ -149,6 +158,8 @@ def simulate(output: Output, chosen: Campaign) -> int:
     todo: Iterable[Batch] = batches(chosen.seed, most, _BATCH)
     if chosen.shard is not None:
         todo = share(todo, *chosen.shard)
+    if chosen.shard is None or chosen.shard[0] == 1:
+        todo = chain([corpus_batch()], todo)
     began_s = time.perf_counter()
     total = Result(campaign_key())
     with (
@@ -229,18 +240,30 @@ def _tell(total: Result, output: Output, *, is_shard: bool = False) -> None:
     """Print the sum of a campaign."""
     if total.tallies:
         output.table(_rows(total.tallies), indent=2)
-    never = total.never_reached
-    output.result(f"{len(total.reached)} places reached, {len(never)} never (-v lists them)")
-    if output.verbosity > 0:
-        output.results(f"  never: {each}" for each in never)
+    count, never = len(reachable()), total.never_reached
+    if total.corpus_runs:
+        output.result(f"{counted(total.corpus_runs, 'plan')} of the corpus played")
+    output.result(f"{count - len(never)} of {count} places reached")
+    output.results(_never_lines(never))
     output.results(_canary_lines(total, is_shard=is_shard))
     for each in total.violations:
         output.result(f"VIOLATION {each.kind}: {printable(each.text)}")
-        output.result(f"  seed {each.seed}; replay: {replay_line(each.plan)}")
+        where = "corpus" if each.seed < 0 else f"seed {each.seed}"
+        output.result(f"  {where}; replay: {replay_line(each.plan)}")
     if total.violation_count > len(total.violations):
         output.result(f"{total.violation_count:,} violations in all")
     if not total.violation_count:
         output.result(f"no violation in {counted(total.runs, 'run')}")
+
+
+def _never_lines(never: Iterable[str]) -> Iterator[str]:
+    """Yield what no run reached, by state, in lines for a narrow terminal."""
+    split = (each.rpartition(": ") if ", " not in each else each.partition(", ") for each in never)
+    for head, same in groupby(split, key=lambda each: each[0]):
+        text = "; ".join(name for _, _, name in same)
+        yield from textwrap.wrap(
+            f"never: {head}: {text}", _COLUMNS, initial_indent="  ", subsequent_indent=" " * 9
+        )
 
 
 def _canary_lines(total: Result, *, is_shard: bool) -> Iterator[str]:
@@ -279,6 +302,7 @@ def _write_page(
         tallies=[*_in_order(total.tallies)],
         classes=range(min(times, default=0), max(times, default=-1) + 1),
         replay=replay_line,
+        places=len(reachable()),
     )
     write_whole(path, page.encode("utf-8"), "--html")
     output.progress(f"html: {printable(str(path))}")
