@@ -59,6 +59,11 @@ class FlashMemory:
         """Pages that are not erased, by offset: few of the megabytes are ever used."""
         self._used_units: set[int] = set()
 
+    def assign(self, other: FlashMemory) -> None:
+        """Take over the content of a memory of the same layout."""
+        self._pages = {offset: bytearray(page) for offset, page in other._pages.items()}
+        self._used_units = set(other._used_units)
+
     def read(self, address: int, size_bytes: int) -> bytes:
         """Read bytes. Raises FlashRangeError."""
         offset = self._offset(address, size_bytes)

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import count
 from math import inf
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from flasher.bus.echoes import Echoes
 from flasher.bus.link import VirtualClock
@@ -29,6 +29,9 @@ from flasher.simulate.independent import (
     frames_of,
 )
 
+if TYPE_CHECKING:
+    from flasher.simulate.subject import SubjectDevice
+
 INBOX_FRAMES: Final = 4096
 """Frames that an adapter's driver keeps for a computer that pauses."""
 ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=True)
@@ -42,6 +45,12 @@ _NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
 
 class KilledError(BaseException):
     """The host's process is gone; no code of the host may catch it."""
+
+
+class SubjectFailedError(BaseException):
+    """The bootloader under test crashed, hung or used its flash wrongly; no code of the host may
+    catch it.
+    """
 
 
 class OverdueError(Exception):
@@ -100,7 +109,9 @@ class Unit:
 
     done = False
 
-    def __init__(self, engine: IndependentDevice | MockDevice, *, drift: float = 0.0) -> None:
+    def __init__(
+        self, engine: IndependentDevice | MockDevice | SubjectDevice, *, drift: float = 0.0
+    ) -> None:
         self.engine = engine
         self.before = self.application
         """Application that it had at the beginning."""
@@ -138,6 +149,8 @@ class Unit:
         engine = self.engine
         if isinstance(engine, IndependentDevice):
             return engine.flash.operations
+        if not isinstance(engine, MockDevice):
+            return engine.flash_faults.operations
         return engine.operations_done + (engine.operation_reaches(0.0) is not None)
 
     @property
@@ -171,8 +184,15 @@ class Unit:
         """Run on without a fault; a power supply that is off stays off."""
         self._end_hang(now)
         self._answers.clear()
-        if isinstance(self.engine, IndependentDevice):
-            self.engine.flash.failures_left = 0
+        self.fail_flash(0)
+
+    def fail_flash(self, count: int) -> None:
+        """Make so many more flash operations fail; 0: none any more."""
+        engine = self.engine
+        if isinstance(engine, MockDevice):
+            return
+        flash = engine.flash if isinstance(engine, IndependentDevice) else engine.flash_faults
+        flash.failures_left = count and flash.failures_left + count
 
     def change(self, answer: plans.Answer) -> None:
         """Change the next answers."""

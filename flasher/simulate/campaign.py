@@ -25,14 +25,24 @@ from functools import cache
 from itertools import islice
 from math import log2
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from flasher.files import parse_toml
 from flasher.simulate import plan as plans
 from flasher.simulate.draw import drawn
 from flasher.simulate.planting import swapped, upgrade_bugs
 from flasher.simulate.play import Verdict, play
-from flasher.simulate.reached import exit_place, reachable, recorded_cells, with_readings
+from flasher.simulate.reached import (
+    DEVICE_PLACES,
+    READINGS,
+    exit_place,
+    reachable,
+    recorded_cells,
+    with_readings,
+)
+
+if TYPE_CHECKING:
+    from flasher.simulate.subject import SubjectBench
 
 VIOLATIONS_MAX: Final = 20
 """Violations that a result keeps, those of the lowest seeds; all are counted."""
@@ -47,6 +57,10 @@ CANARIES: Final = (
     "one-packet-more-for-whole-sizes",
 )
 """Planted mistakes that few runs find."""
+SUBJECT_CANARY: Final = CANARIES[1]
+"""The one that is not in the device model."""
+_SUBJECT: Final = "-"
+"""Between the hash of the code and that of the bootloader under test, in `Result.campaign`."""
 NO_FAULT: Final = "none"
 _CORPUS: Final = Path(__file__).with_name("corpus.toml")
 _TIMES_PER_OCTAVE: Final = 4
@@ -65,9 +79,24 @@ class Batch:
     """Name of a planted mistake."""
     is_corpus: bool = False
     """`first` and `count` are those of plans of the corpus."""
+    subject: str = ""
+    """Bootloader under test (see `BootloaderProcess`), which is the device of each plan."""
+    target: str = ""
+    """Of the subject."""
+
+    @property
+    def bench(self) -> SubjectBench | None:
+        """Raises UsageError for a subject that is unusable."""
+        if not self.subject:
+            return None
+        from flasher.simulate.subject import bench  # noqa: PLC0415  loads much of the suite
+
+        return bench(self.subject, self.target)
 
     def plan_of(self, number: int) -> plans.Plan:
         """Return the plan of a seed, or of the corpus."""
+        if self.bench is not None:
+            return self.bench.drawn(number)
         return [*corpus().values()][number] if self.is_corpus else drawn(number)
 
 
@@ -172,7 +201,17 @@ class Result:
     @property
     def never_reached(self) -> list[str]:
         """Places that no run reached, without those that none can reach."""
-        return sorted(reachable() - {*self.reached})
+        return sorted(self.reachable - {*self.reached})
+
+    @property
+    def reachable(self) -> set[str]:
+        """Places that a run can reach; a bootloader under test reaches none in the device model."""
+        is_subject = _SUBJECT in self.campaign
+        return {
+            each
+            for each in reachable()
+            if not (is_subject and each.startswith((DEVICE_PLACES, READINGS)))
+        }
 
     @property
     def is_blind(self) -> bool:
@@ -188,8 +227,15 @@ def _sum(one: Mapping[Key, int], other: Mapping[Key, int]) -> dict[Key, int]:
 
 
 @cache
-def campaign_key() -> str:
-    """Return a hash of all that decides the result of a seed: the code, and Python's version."""
+def campaign_key(subject: str = "", target: str = "") -> str:
+    """Return a hash of all that decides the result of a seed: the code, and Python's version; with
+    a bootloader under test also a hash of that.
+    """
+    if subject:
+        from flasher.simulate.subject import source_of  # noqa: PLC0415  loads much of the suite
+
+        key = hashlib.sha256(f"{subject} {target}\0".encode() + source_of(subject))
+        return campaign_key() + _SUBJECT + key.hexdigest()[:16]
     digest = hashlib.sha256(platform.python_version().encode())
     package = Path(__file__).parents[1]
     for file in sorted([*package.rglob("*.py"), *package.rglob("*.toml")]):
@@ -210,17 +256,19 @@ def corpus_batch() -> Batch:
     return Batch(campaign_key(), 0, len(corpus()), is_corpus=True)
 
 
-def batches(first: int, runs: int, count: int) -> Iterator[Batch]:
+def batches(
+    first: int, runs: int, count: int, subject: str = "", target: str = ""
+) -> Iterator[Batch]:
     """Yield the batches of a campaign of `runs` seeds from `first` on, each of `count` runs, with a
     canary before each `CANARY_EVERY` runs.
     """
-    key, end = campaign_key(), first + runs
+    key, end = campaign_key(subject, target), first + runs
     for start in range(first, end, CANARY_EVERY):
-        canary = random.Random(start).choice(CANARIES)
-        yield Batch(key, start, CANARY_RUNS, canary)
+        canary = random.Random(start).choice(CANARIES) if not subject else SUBJECT_CANARY
+        yield Batch(key, start, CANARY_RUNS, canary, subject=subject, target=target)
         part_end = min(start + CANARY_EVERY, end)
         for begin in range(start, part_end, count):
-            yield Batch(key, begin, min(count, part_end - begin))
+            yield Batch(key, begin, min(count, part_end - begin), subject=subject, target=target)
 
 
 def share(batches: Iterable[Batch], number: int, count: int) -> Iterator[Batch]:
@@ -233,8 +281,8 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
 
     Raises ValueError for a batch of other code.
     """
-    if batch.campaign != campaign_key():
-        raise ValueError(f"a batch of {batch.campaign}; this is the code {campaign_key()}")
+    if batch.campaign != (key := campaign_key(batch.subject, batch.target)):
+        raise ValueError(f"a batch of {batch.campaign}; this is the code {key}")
     began_s = time.process_time()
     sums = _Sums()
     with _without_log():
@@ -246,7 +294,8 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
                     if is_stopped():
                         break
                     plan = batch.plan_of(seed)
-                    sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, play(plan))
+                    verdict = play(plan, bench=batch.bench)
+                    sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, verdict)
             sums.reached |= cells
     return sums.result(batch.campaign, time.process_time() - began_s)
 
@@ -309,7 +358,7 @@ class _Sums:
                 if is_stopped():
                     return
                 self._canary_runs += 1
-                violations = play(drawn(seed)).violations
+                violations = play(batch.plan_of(seed), bench=batch.bench).violations
                 if any(not each.is_excused for each in violations):
                     self._canaries[True][bug.name] += 1
                     return

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Final
 
 from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
@@ -13,6 +14,8 @@ from flasher.simulate.plan import Plan, When
 
 TWIN_SHARE: Final = 0.1
 """Share of the plans with two devices; their images are long, and take half of the time."""
+_LONG_PACKETS: Final = 1000
+"""Largest image for a bootloader under test."""
 _TOOL_DOES: Final = (
     "asks", "asks", "writes", "resets", "updates", "packets", "refused", "ends", "unknown",
     "damaged",
@@ -23,6 +26,27 @@ _HOW_MANY: Final = (0, 1, 1, 1, 2, 2, 2, 3, 3, 4, 6)
 def drawn(seed: int, twin_share: float = TWIN_SHARE) -> Plan:
     """The plan of a seed, which has two devices in it in a share of the seeds."""
     return _Draw(seed, twin_share).plan()
+
+
+def drawn_for_subject(
+    seed: int, target: str, packets_max: int, erases: int, writes_per_packet: float
+) -> Plan:
+    """The plan of a seed for a bootloader under test: job, adapter and faults of the other plans,
+    and in every second one also a fault in a flash operation.
+    """
+    draw = _Draw(seed, twin_share=0.0)
+    plan = draw.plan()
+    packets, short = min(plan.job.packets, packets_max), plan.job.short
+    if draw.is_whole_area():
+        packets, short = min(packets_max, _LONG_PACKETS), 0
+    job = replace(plan.job, target=target, packets=packets, short=short)  # type: ignore[arg-type]
+    device = plan.devices[0]
+    subject = plans.Subject(
+        application=device.application, begins=device.begins, drift=device.drift
+    )
+    faults = (*plan.events, *draw.flash_faults(erases, round(packets * writes_per_packet)))
+    lasting = [each for each in plan.clauses if isinstance(each, plans.Adapter)]
+    return Plan((job, *lasting, subject, *faults))
 
 
 class _Draw:
@@ -203,7 +227,7 @@ class _Draw:
             (12, self._noise),
             (8, self._unsolicited),
             (12, self._power),
-            (8, lambda when: plans.Restart(when=when, device=self._which())),
+            (8, self._restart),
             (8, self._hang),
             (8, self._answer),
             (3 if self._is_independent else 0, self._flash_fails),
@@ -286,6 +310,28 @@ class _Draw:
 
     def _flash_fails(self, when: When) -> plans.Clause:
         return plans.FlashFails(when=when, count=self._random.choice((1, 1, 2, 5, 20)))
+
+    def is_whole_area(self) -> bool:
+        """True in a small share of the plans: a long image takes as long as fifty short ones."""
+        return self._is(0.015)
+
+    def flash_faults(self, erases: int, writes: int) -> Iterator[plans.Clause]:
+        """In half of the plans, a fault in an erase, in a write, or in one of the last writes."""
+        draw = self._random
+        if self._is(0.5):
+            first, last = draw.choice(
+                (
+                    (1, erases),
+                    (erases + 1, erases + writes),
+                    (erases + writes - 1, erases + writes + 2),
+                )
+            )
+            number = draw.randint(first, max(first, last))
+            when = When("flash", max(1, number), self._between(1e-5, 0.03))
+            yield draw.choice((self._power, self._restart, self._flash_fails))(when)
+
+    def _restart(self, when: When) -> plans.Clause:
+        return plans.Restart(when=when, device=self._which())
 
     def _unplug(self, when: When) -> plans.Clause:
         return plans.Unplug(

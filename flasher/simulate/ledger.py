@@ -82,11 +82,11 @@ class _Read:
     """A last line that was written in part."""
 
 
-def _read(path: Path) -> _Read:
-    """Read a ledger. Raises UsageError for a file that cannot be read, is damaged before its last
-    line, or was written by other code.
+def _read(path: Path, campaign: str) -> _Read:
+    """Read a ledger; an empty `campaign` is that of its first line. Raises UsageError for a file
+    that cannot be read, is damaged before its last line, or was written by other code.
     """
-    found = _Read(Result(campaign_key()))
+    found = _Read(Result(campaign))
     with opened(path, None, what="ledger", may_grow=True) as (file, size):
         number = 0
         while found.size < size:
@@ -100,7 +100,9 @@ def _read(path: Path) -> _Read:
                     " seeds run again."
                 )
                 break
-            entry = _entry(path, number, line)
+            entry = _entry(path, number, line, found.result.campaign)
+            if not found.result.campaign:
+                found.result = Result(entry.campaign)
             found.size += len(line)
             found.result += entry.result
             found.ranges += [(first, first + count) for first, count in entry.seeds]
@@ -109,7 +111,7 @@ def _read(path: Path) -> _Read:
     return found
 
 
-def _entry(path: Path, number: int, line: bytes) -> Entry:
+def _entry(path: Path, number: int, line: bytes, expected: str) -> Entry:
     from pydantic import ValidationError  # noqa: PLC0415  slow
 
     try:
@@ -117,12 +119,15 @@ def _entry(path: Path, number: int, line: bytes) -> Entry:
     except ValueError as error:
         raise _damaged(path, number, f"it is not valid JSON ({printable(str(error))})") from error
     campaign = document.get("campaign") if isinstance(document, dict) else None
-    if isinstance(campaign, str) and campaign != campaign_key():
+    code = campaign_key()  # the key begins with it
+    is_same = campaign == expected if expected else str(campaign).startswith(code)
+    if isinstance(campaign, str) and not is_same:
         raise UsageError(
             f"The ledger {printable(str(path))} was written by other code, so its results cannot be"
             " added to those of this one.",
-            where=f"line {number}: campaign {printable(campaign)[:40]}; this is {campaign_key()}",
-            cause="flasher or Python was changed since: the same seeds now mean other plans",
+            where=f"line {number}: campaign {printable(campaign)[:40]}; this is {expected or code}",
+            cause="flasher, Python or the bootloader under test was changed since: the same seeds "
+            "now mean other plans",
             remedy="Run the flasher and Python that wrote it, or begin with a new file.",
         )
     try:
@@ -151,13 +156,17 @@ class Ledger:
     """Ledger that is written, locked against other programs until it is closed.
 
     `first` and `runs` are the seeds of the whole campaign; None for one that ends some time.
+    `campaign` is a `campaign_key`, by default that of the code.
     Raises UsageError for a file that cannot be read or written, is damaged, was written by other
     code, or is in use.
     """
 
-    def __init__(self, path: Path, first: int, runs: int | None) -> None:
+    def __init__(
+        self, path: Path, first: int, runs: int | None, campaign: str | None = None
+    ) -> None:
         self._path, self._first, self._runs = path, first, runs
-        self._waiting = _Read(Result(campaign_key()))
+        self._campaign = campaign or campaign_key()
+        self._waiting = _Read(Result(self._campaign))
         """Finished batches that are not written."""
         self._lock = FileLock(f"{path}.lock", timeout=0)
         try:
@@ -175,7 +184,7 @@ class Ledger:
                 code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
         try:
-            self.found = _read(path)
+            self.found = _read(path, self._campaign)
             _check_once([(*each, path) for each in self.found.ranges])
         except BaseException:
             self.close()
@@ -227,13 +236,13 @@ class Ledger:
 
     def write(self) -> None:
         """Write what was added. Raises UsageError if the file cannot be written."""
-        done, self._waiting = self._waiting, _Read(Result(campaign_key()))
+        done, self._waiting = self._waiting, _Read(Result(self._campaign))
         self._written_at_s = time.perf_counter()
         if not (done.ranges or done.canaries or done.result.corpus_runs):
             return
         seeds = tuple((first, end - first) for first, end in _joined(done.ranges))
         whole = (self._first, self._runs)
-        entry = Entry(campaign_key(), *whole, seeds, tuple(done.canaries), done.result)
+        entry = Entry(self._campaign, *whole, seeds, tuple(done.canaries), done.result)
         self.found.result += done.result
         try:
             self._file.write(_adapter().dump_json(entry) + b"\n")
@@ -281,13 +290,15 @@ def merge(paths: Iterable[Path]) -> Merged:
     """Add ledgers up. Raises UsageError as `Ledger` does, for seeds that are in two files, and for
     files without a result.
     """
-    result = Result(campaign_key())
+    result = Result("")
     ranges: list[tuple[int, int, Path]] = []
     canaries: dict[tuple[int, str], Path] = {}
     wholes: set[Range] = set()
     notices = []
     for path in paths:
-        found = _read(path)
+        found = _read(path, result.campaign)
+        if not result.campaign:
+            result = Result(found.result.campaign)
         result += found.result
         ranges += [(*each, path) for each in found.ranges]
         for canary in found.canaries:

@@ -58,6 +58,7 @@ class Violation:
     CORRUPT       a device that would start what is no image
     LOST          a device that the tool cannot bring back
     CRASH         an exception of the code under test
+    SUBJECT       a bootloader under test that crashed, hung, or used its flash wrongly
     KILLED        the process of the simulation died
     UNSEEN        excused, see `is_excused`
     """
@@ -128,6 +129,8 @@ class Facts:
     may_have_erased: bool = False
     """The run sent an update command."""
     units: Sequence[UnitFacts] = ()
+    started: Sequence[str] = ()
+    """What a bootloader under test would have started after each power-up and reset."""
     took_s: float = 0.0
     limit_s: float = 1.0
     """Announced deadline."""
@@ -243,7 +246,11 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     for twin, unit in zip(twins, facts.units[1:], strict=True):
         if claim.is_ok and twin != "new" and unit.took_part:
             yield Violation(false, f"success, and its twin has {twin}")
-    if content == "other" and len(contents) == 1 and not _has(facts.plan, (plans.Tool,)):
+    if (
+        "other" in (content, *facts.started)
+        and len(contents) == 1
+        and not _has(facts.plan, (plans.Tool,))
+    ):
         yield Violation("CORRUPT", "the device would start what is neither old nor new")
     if not facts.may_have_erased:
         return  # whoever erased it, it was not the host

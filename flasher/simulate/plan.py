@@ -134,15 +134,15 @@ class Device(Clause):
     """`boot`: it is switched on at the beginning."""
     drift: float = 0.0
     """Its clock is faster by this share."""
+    choices: str = ""
+    """What else a kind of device can choose."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Independent(Device):
-    """A device that was written from the document alone."""
+    """A device that was written from the document alone; its choices are fields of `Choices`."""
 
     NAME = "independent"
-    choices: str = ""
-    """Fields of `Choices`."""
 
     def chosen(self) -> Choices:
         return Choices(**_values(Choices, self.choices.split()))
@@ -150,16 +150,21 @@ class Independent(Device):
 
 @dataclass(frozen=True, kw_only=True)
 class Mock(Device):
-    """flasher's own device model."""
+    """flasher's own device model; its choices are fields of `DeviceProfile`."""
 
     NAME = "mock"
-    choices: str = ""
-    """Fields of `DeviceProfile`."""
 
     def chosen(self) -> DeviceProfile:
         profile = {"application_area_bytes": "131072"}
         words = (f"{name}={value}" for name, value in profile.items())
         return DeviceProfile(**_values(DeviceProfile, [*words, *self.choices.split()]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject(Device):
+    """The bootloader under test; a plan chooses nothing for it."""
+
+    NAME = "subject"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,9 +310,7 @@ class Hang(OnDevice):
 
 @dataclass(frozen=True, kw_only=True)
 class FlashFails(OnDevice):
-    """Its next `count` flash operations change nothing, and it detects that; only `independent`
-    devices.
-    """
+    """Its next `count` flash operations change nothing, and it can detect that; not `mock`."""
 
     NAME = "flash-fails"
     count: int = 1
@@ -389,9 +392,9 @@ class Interrupt(Clause):
 CLAUSES: Final[dict[str, type[Clause]]] = {
     kind.NAME: kind
     for kind in (
-        Job, Adapter, Independent, Mock, Load, Drop, Double, Swap, Delay, Flip, Truncate, Noise,
-        Unsolicited, Answer, Power, Restart, Hang, FlashFails, Unplug, BusOff, Tool, Stall, Kill,
-        Interrupt,
+        Job, Adapter, Independent, Mock, Subject, Load, Drop, Double, Swap, Delay, Flip, Truncate,
+        Noise, Unsolicited, Answer, Power, Restart, Hang, FlashFails, Unplug, BusOff, Tool, Stall,
+        Kill, Interrupt,
     )
 }  # fmt: skip
 
@@ -414,8 +417,8 @@ class Plan:
         return next((each for each in self.clauses if isinstance(each, Adapter)), Adapter())
 
     @property
-    def devices(self) -> Sequence[Independent | Mock]:
-        found = [each for each in self.clauses if isinstance(each, Independent | Mock)]
+    def devices(self) -> Sequence[Device]:
+        found = [each for each in self.clauses if isinstance(each, Device)]
         return found or [Independent()]
 
     @property

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from flasher import api
 from flasher.bus.link import VirtualClock
@@ -34,6 +34,7 @@ from flasher.simulate.bus import (
     OverdueError,
     PlanBus,
     PlanLink,
+    SubjectFailedError,
     Unit,
 )
 from flasher.simulate.independent import (
@@ -58,6 +59,9 @@ from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
 from flasher.simulate.reached import fault_place, reading_place
 from flasher.simulate.wire_rules import WireRules
 
+if TYPE_CHECKING:
+    from flasher.simulate.subject import SubjectBench, SubjectDevice
+
 NEW_VERSION: Final = "V1r2r0_20240601"
 """Version that the new image reports."""
 SETTLE_S: Final = 3.0
@@ -67,6 +71,7 @@ OVERDUE_S: Final = 60.0
 """A run that is so much later than its announced deadline has not ended."""
 _VECTORS: Final = struct.pack("<4I", 0x2000_5000, 0x0800_4101, 0, 0)
 """Vector table of a Cortex-M: stack pointer, reset vector, no NMI and no hard fault handler."""
+_STEP_S: Final = 0.05
 _OPERATOR_S: Final = 8.0
 """Time in which the operator of the recovery follows a prompt; the supply is then off so long."""
 
@@ -116,7 +121,8 @@ def image_plan_of(
 
 class Player:
     """One plan being played. `log` gets each frame, fault and event as a line of text, `tap` each
-    frame with its sender (`None` for other traffic) and time.
+    frame with its sender (`None` for other traffic) and time. `bench` makes the device of a plan
+    that has a bootloader under test.
     """
 
     def __init__(
@@ -124,6 +130,7 @@ class Player:
         plan: plans.Plan,
         options: UpgradeOptions | None = None,
         *,
+        bench: SubjectBench | None = None,
         log: Callable[[str], object] | None = None,
         tap: Callable[[Frame, plans.Sender | None, float], None] | None = None,
     ) -> None:
@@ -132,6 +139,8 @@ class Player:
         self.target = TARGETS[job.target]
         self.clock = VirtualClock()
         self.bus = PlanBus(self.clock, self._seen)
+        self._bench = bench
+        self._identity = Identity() if bench is None else bench.identity
         self.image_plan = self._image_plan()
         self.units: list[Unit] = []
         self._options = _options(job, options or UpgradeOptions())
@@ -156,29 +165,70 @@ class Player:
         self._facts = Facts(plan, self.target.request_id, WireRules(plan))
         self._at_update: list[Unit] = []
         """Units on the bus when the last update command began."""
-        for number, device in enumerate(plan.devices):
+        if bench is None:
+            self._begin()
+
+    # -- the world -------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Put the devices on the bus."""
+        for number, device in enumerate(self.plan.devices):
             unit = Unit(self._engine(device), drift=device.drift)
             self.units.append(unit)
             if device.when is None:
                 self._join(number, device, 0.0)
-        for clause in plan.events:
+        if self._bench is not None:
+            self._start_subject()
+        for clause in self.plan.events:
             self._expect(clause)
-        if any(what == "flash" for what, _ in self._waiting):
+        if self._bench is None and any(what == "flash" for what, _ in self._waiting):
             self.units[0].on_operation = lambda number, now: self._begins("flash", number, now)
 
-    # -- the world -------------------------------------------------------------------------------
+    def _start_subject(self) -> None:
+        """Wait until the bootloader under test has started its application, if it has one."""
+        engine, device = self.units[0].engine, self.plan.devices[0]
+        assert not isinstance(engine, IndependentDevice | MockDevice)  # noqa: S101  it has a bench
+        engine.flash_faults.on_operation = self._interrupt
+        if device.begins == "application" and device.application == "old" and device.when is None:
+            limit = self.clock.now() + engine.START_LIMIT_S
+            while not self.units[0].runs_application and self.clock.now() < limit:
+                self.bus.advance(self.clock.now() + _STEP_S)
+            if not self.units[0].runs_application:
+                raise SubjectFailedError("it does not start an application that it has taken")
+        self._frames = 0
 
     def _image_plan(self, *, has_checksum: bool = False) -> ImagePlan:
         job = self.plan.job
+        if self._bench is not None:
+            size_bytes = job.packets * PACKET_DATA_SIZE - job.short
+            return self._bench.image_plan(NEW_VERSION, size_bytes, job.image)
         return image_plan_of(
             job.packets, job.short, job.image, job.target, has_checksum=has_checksum
         )
 
-    def _engine(self, device: plans.Independent | plans.Mock) -> IndependentDevice | MockDevice:
+    def _interrupt(self, number: int, takes_s: float) -> float | None:
+        """Begin what waits for a flash operation of the bootloader under test; return the share of
+        it that is done when its supply fails, None if it does not. It calls while its time runs
+        ahead of the bus.
+        """
+        now, share = self.clock.now(), None
+        for clause in [*self._waiting.get(("flash", number), ())]:
+            plus_s = clause.when.plus_s if clause.when else 0.0
+            if isinstance(clause, plans.Power | plans.Restart) and plus_s < takes_s:
+                self._waiting["flash", number].remove(clause)
+                self._happen(clause, now)
+                share = plus_s / takes_s
+        self._begins("flash", number, now)
+        return share
+
+    def _engine(self, device: plans.Device) -> IndependentDevice | MockDevice | SubjectDevice:
+        if self._bench is not None:
+            return self._bench.device(device.version if device.application == "old" else None)
         if isinstance(device, plans.Independent):
             old = _VECTORS + device.version.encode() + b"\0" + bytes(range(256)) * 4
             content = old if device.application == "old" else None
             return IndependentDevice(self.target.name, device.chosen(), content)
+        assert isinstance(device, plans.Mock)  # noqa: S101  a subject has a bench
         return MockDevice(
             self.target,
             bitrate_bps=WELLING.bitrate_bps,
@@ -186,7 +236,7 @@ class Player:
             has_application=device.application == "old",
         )
 
-    def _join(self, number: int, device: plans.Independent | plans.Mock, now: float) -> None:
+    def _join(self, number: int, device: plans.Device, now: float) -> None:
         unit = self.units[number]
         engine = unit.engine
         self.bus.attach(unit if self._is_disturbed(number, device) else engine)
@@ -202,7 +252,7 @@ class Player:
 
     def _is_disturbed(self, number: int, device: plans.Device) -> bool:
         """True if more than the supply of a device fails, or its flash operations are traced."""
-        return bool(device.drift or self._tap) or any(
+        return bool(device.drift or self._tap or self._bench) or any(
             (isinstance(each, plans.Answer | plans.Hang) and each.device == number)
             or (each.when is not None and each.when.what == "flash")
             for each in self.plan.clauses
@@ -218,7 +268,7 @@ class Player:
         when = clause.when
         if when is None or not when.what:
             moment = 0.0 if when is None else when.plus_s
-            self.bus.agenda.at(moment, lambda now: self._happen(clause, now))
+            self.bus.agenda.at(self.clock.now() + moment, lambda now: self._happen(clause, now))
         else:
             self._waiting.setdefault((when.what, when.number), []).append(clause)
 
@@ -269,7 +319,7 @@ class Player:
                 self.bus.frame_faults.append(FrameFault(clause, now))
             case plans.OnDevice():
                 self._happen_to(clause, now)
-            case plans.Independent() | plans.Mock():
+            case plans.Device():
                 self._join(list(self.plan.devices).index(clause), clause, now)
             case plans.Load():
                 self._load(clause, now, now + clause.seconds)
@@ -321,8 +371,8 @@ class Player:
                 unit.power_on(now)
             case plans.Hang(seconds=seconds):
                 unit.hang(now + seconds, now)
-            case plans.FlashFails(count=count) if isinstance(unit.engine, IndependentDevice):
-                unit.engine.flash.failures_left += count
+            case plans.FlashFails(count=count):
+                unit.fail_flash(count)
 
     def _cut(self, unit: Unit, seconds: float, now: float) -> None:
         unit.power_cut(now)
@@ -379,6 +429,19 @@ class Player:
 
     def play(self) -> Verdict:
         """Run the host, as often as it is killed; examine the devices; bring the unit back."""
+        if self._bench is None:
+            return self._play()
+        try:
+            self._begin()
+            return self._play()
+        except SubjectFailedError as error:
+            failed = _failed(self.plan, "subject failed", Violation("SUBJECT", str(error)))
+            wire = self._digest.hexdigest()[:16]
+            return replace(failed, took_s=self.clock.now(), wire=wire)
+        finally:
+            self._bench.end_device()
+
+    def _play(self) -> Verdict:
         runs, facts = 0, self._facts
         while True:
             runs += 1
@@ -415,6 +478,9 @@ class Player:
         is_good = claim.is_ok and self.units[0].application == self.image_plan.image.data
         if is_good:
             self._reached |= set(map(reading_place, self._readings()))
+        if self._bench is not None:
+            unit = self.units[0]
+            facts.started = [self._name(each, unit) for each in unit.engine.started]  # type: ignore[union-attr]
         violations = [*judge(facts, claim)]
         recovered = ""
         if not (claim.is_ok or violations) and len(self.units) == 1:
@@ -465,7 +531,7 @@ class Player:
             result = device.upgrade(
                 self.image_plan,
                 options=options,
-                identity=Identity(),
+                identity=self._identity,
                 on_event=self._note,
                 cancelled=lambda: self._interrupted_at is not None,
             )
@@ -543,7 +609,9 @@ class Player:
             link.drain()
 
     def _content(self, unit: Unit) -> str:
-        application = unit.application
+        return self._name(unit.application, unit)
+
+    def _name(self, application: bytes | None, unit: Unit) -> str:
         if application is None:
             return "none"
         if application == self.image_plan.image.data:
@@ -586,13 +654,18 @@ def _claim_of(result: Result) -> Claim:
     )
 
 
-def play(plan: plans.Plan, options: UpgradeOptions | None = None) -> Verdict:
+def play(
+    plan: plans.Plan, options: UpgradeOptions | None = None, bench: SubjectBench | None = None
+) -> Verdict:
     """Play a plan. An exception of the code under test is a violation."""
     try:
-        return Player(plan, options).play()
+        return Player(plan, options, bench=bench).play()
     except Exception as error:  # noqa: BLE001  a finding
-        crash = Violation("CRASH", f"{type(error).__name__}: {error}")
-        return Verdict(
-            str(plan), "crash", 1, is_good=False, left="", attempts=0, took_s=0.0, lateness=0.0,
-            violations=(crash,),
-        )  # fmt: skip
+        return _failed(plan, "crash", Violation("CRASH", f"{type(error).__name__}: {error}"))
+
+
+def _failed(plan: plans.Plan, ending: str, why: Violation) -> Verdict:
+    return Verdict(
+        str(plan), ending, 1, is_good=False, left="", attempts=0, took_s=0.0, lateness=0.0,
+        violations=(why,),
+    )  # fmt: skip

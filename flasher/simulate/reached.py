@@ -23,7 +23,7 @@ from flasher.simulate.oracle import DOCUMENTED
 
 PHASES: Final = ("idle", "reset", "update", "packet", "end")
 """Last message that the host has begun when a fault happens."""
-_LASTING: Final = (plans.Job, plans.Adapter, plans.Independent, plans.Mock)
+_LASTING: Final = (plans.Job, plans.Adapter, plans.Independent, plans.Mock, plans.Subject)
 _S, _E = BootloaderState, BootloaderEvent
 _IN_BOOTLOADER: Final = frozenset(_S) - {_S.OFF, _S.RESTARTING, _S.APPLICATION}
 _HAPPENS_IN: Final[Mapping[BootloaderEvent, frozenset[BootloaderState]]] = {
@@ -95,6 +95,9 @@ _READINGS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Places that show together how flasher reads the documents; the player observes the others."""
 _NOT_ASKED: Final = "an upgrade asks the device neither for this nor shows it"
+DEVICE_PLACES: Final = "device: "
+"""Places in the device model begin with this."""
+READINGS: Final = "reading: "
 UNREACHABLE: Final[Mapping[str, str]] = {
     **{
         f"device: {state.value}, {event.value}": (

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from flasher.conformance.shrink import shrink as shrink_items
 from flasher.simulate import plan as plans
 from flasher.simulate.play import play
 
+if TYPE_CHECKING:
+    from flasher.simulate.subject import SubjectBench
+
 TRIES: Final = 300
 """Maximum number of plans that are played."""
 
 
-def shows(plan: plans.Plan, kind: str) -> bool:
+def shows(plan: plans.Plan, kind: str, bench: SubjectBench | None = None) -> bool:
     """Return True if a plan ends in a violation of this kind."""
-    return any(each.kind == kind for each in play(plan).violations)
+    if bench is not None and plan.job.target != bench.target.name:
+        return False
+    return any(each.kind == kind for each in play(plan, bench=bench).violations)
 
 
 def shrink(

@@ -113,6 +113,8 @@ class WireRules:
         """No packet was sent since the last update command."""
         self._heads: dict[bytes, float] = {}
         """First frames of the host's messages, with their times."""
+        self._sent_twice: set[bytes] = set()
+        """Those that were sent again before the echo of the first had come for sure."""
         self._tool_at = self._beside_at = self._announced_at = float("-inf")
         self._announcing_since = 0.0
         self._has_reset = False
@@ -163,6 +165,8 @@ class WireRules:
         # The device dropped a message whose rest came after a gap.
         if self._left > 0 and is_short and self._checks_messages and not self._had_gap:
             self._break("a message begins while the device waits for the rest of another one")
+        if now - self._heads.get(data, float("-inf")) <= _ECHOED_S:
+            self._sent_twice.add(data)
         self._heads[data] = now
         self._kind, self._had_gap = name, False
         self._number = data[7] if name == "packet" and len(data) > 7 else 0
@@ -254,6 +258,8 @@ class WireRules:
         """Note when another tool writes, unless its frame may be taken for an echo."""
         sent_at = self._heads.get(data)
         is_told_apart = sent_at is None or (self._has_all_echoes and now - sent_at > _ECHOED_S)
+        # Its second echo may have been taken for a copy of the first: another one is expected.
+        is_told_apart &= data not in self._sent_twice
         if data[2] == WRITE and is_told_apart:
             self._tool_at = now
 

@@ -21,14 +21,18 @@ from flasher.cli.bar import Bar
 from flasher.cli.extras import need
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, typed_values
+from flasher.cli.options import target_option
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
+from flasher.conformance.results import LINE_JOINT
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.frame import Frame
+from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.simulate.campaign import (
     NO_FAULT,
     Batch,
+    Found,
     Result,
     Tally,
     batches,
@@ -39,10 +43,10 @@ from flasher.simulate.campaign import (
 )
 from flasher.simulate.ledger import Ledger
 from flasher.simulate.ledger import merge as merge_ledgers
-from flasher.simulate.plan import Plan
+from flasher.simulate.oracle import Violation
+from flasher.simulate.plan import Plan, Subject
 from flasher.simulate.play import Player, Verdict
-from flasher.simulate.reached import reachable
-from flasher.simulate.shrink import shrink
+from flasher.simulate.shrink import shows, shrink
 from flasher.simulate.sweep import PartResult, parts
 from flasher.simulate.sweep import run as run_part
 from flasher.simulate.workers import KILLED, OnResult
@@ -55,6 +59,7 @@ examples:
   flasher simulate --for 600 --jobs 4
   flasher simulate --seed 1000000 --runs 20000 --keep-going --json
   flasher simulate --runs 1000000 --jobs 8 --ledger campaign.jsonl
+  flasher simulate --subject ./boot -t bms --for 60
   flasher simulate sweep limits
   flasher simulate replay 'job packets=3 ; independent erase=0.05 ; @packet2 power'
 
@@ -68,6 +73,10 @@ In the table, `again` is how many failed runs the same command brought back with
 `rescued` how many `flasher rescue` did, and `median time` that of the successful ones, as a
 multiple of the time on the bus.
 
+With --subject, all devices are your bootloader, with simulated flash memory and application. It
+gets the same faults, and more of them in its flash operations. A crash, a sanitizer report, a call
+that does not return, and a forbidden flash access are violations of kind SUBJECT.
+
 Before the random runs, each campaign plays a corpus: plans for what random ones seldom reach. What
 no run reached is listed, without what none can reach.
 
@@ -77,6 +86,8 @@ which it has to find; a campaign that misses it is blind, exit code 12 as well.
 """
 _BATCH: Final = 50
 """Runs of a batch."""
+_SUBJECT_BATCH: Final = 10
+"""The same with a bootloader under test, whose runs take longer."""
 _RUNS: Final = 1000
 _COLUMNS: Final = 79
 _ENDLESS: Final = 10**12
@@ -94,6 +105,11 @@ def _shard(text: str) -> tuple[int, int]:
     return int(number), int(count)
 
 
+_subject: Final = option(
+    "--subject", metavar="BOOTLOADER", panel="device", brief=True,
+    help="upgrade a bootloader that is compiled for the computer (-t): a program, a shared library,"
+    " or MODULE:FACTORY; see `flasher conformance header`",
+)  # fmt: skip
 _html: Final = option(
     "--html", type=values.FilePath("html", gives=Path), metavar="FILE", panel="reports",
     help="the campaign as one self-contained page",
@@ -128,6 +144,8 @@ class Campaign:
         "--ledger", type=values.FilePath("jsonl", gives=Path), metavar="FILE",
         help="save what is done in this file, and go on with what it lacks",
     )]  # fmt: skip
+    subject: Annotated[str | None, _subject]
+    target: Annotated[Target | None, target_option(required=False)]
     dask: Annotated[str | None, _what(
         "--dask", metavar="ADDRESS",
         help="run on the workers of this Dask scheduler (extra `cluster`), as tcp://host:8786",
@@ -154,14 +172,18 @@ def simulate(output: Output, chosen: Campaign) -> int:
     in their flash.
     """
     check_writable(chosen.html, "--html", typed_values(but="html"))
+    subject, target = _subject_of(chosen)
+    key = campaign_key(subject, target)
     most = chosen.runs or (_RUNS if chosen.for_s is None else _ENDLESS)
-    todo: Iterable[Batch] = batches(chosen.seed, most, _BATCH)
+    todo: Iterable[Batch] = batches(
+        chosen.seed, most, _SUBJECT_BATCH if subject else _BATCH, subject, target
+    )
     if chosen.shard is not None:
         todo = share(todo, *chosen.shard)
-    if chosen.shard is None or chosen.shard[0] == 1:
+    if not subject and (chosen.shard is None or chosen.shard[0] == 1):
         todo = chain([corpus_batch()], todo)
     began_s = time.perf_counter()
-    total = Result(campaign_key())
+    total = Result(key)
     with (
         stop_on_signal(lambda: output.progress("Ending.")) as stopped,
         Bar(output, leave=False, unit=" runs" if most < _ENDLESS else " s") as bar,
@@ -170,7 +192,7 @@ def simulate(output: Output, chosen: Campaign) -> int:
         ledger: Ledger | None = None
         if chosen.ledger is not None:
             whole = None if most == _ENDLESS else most
-            ledger = files.enter_context(Ledger(chosen.ledger, chosen.seed, whole))
+            ledger = files.enter_context(Ledger(chosen.ledger, chosen.seed, whole, key))
             total, todo = ledger.result, ledger.left(todo)
             output.progress(ledger.notice or f"{counted(total.runs, 'run')} found in the ledger")
         before = total.runs
@@ -196,7 +218,8 @@ def simulate(output: Output, chosen: Campaign) -> int:
         first = next(iter(total.violations), None)
         if first is not None and first.kind != KILLED and not stopped():
             output.progress("Shrinking the first violation; Ctrl-C ends that.")
-            plan = shrink(Plan.parse(first.plan), first.kind, is_over=stopped)
+            shown = partial(shows, bench=Batch(key, 0, 0, subject=subject, target=target).bench)
+            plan = shrink(Plan.parse(first.plan), first.kind, is_bad=shown, is_over=stopped)
             total = replace(
                 total, violations=(replace(first, plan=str(plan)), *total.violations[1:])
             )
@@ -204,12 +227,34 @@ def simulate(output: Output, chosen: Campaign) -> int:
     rate = 60 * (total.runs - before) / took_s if took_s else 0.0
     output.result(f"{counted(total.runs, 'run')}, {rate:,.0f} a minute")
     is_shard = chosen.shard is not None
-    _tell(total, output, is_shard=is_shard)
+    _tell(total, output, is_shard=is_shard, subject=subject)
     code = _exit_code(total, is_strict=chosen.strict, is_shard=is_shard)
-    _write_page(chosen.html, total, code, output, is_shard=is_shard)
+    _write_page(chosen.html, total, code, output, is_shard=is_shard, subject=subject)
     if was_stopped and code is ExitCode.OK:
         code = ExitCode.INTERRUPTED
     return output.document(total, exit_code=code)
+
+
+def _subject_of(chosen: Campaign) -> tuple[str, str]:
+    """Return the bootloader under test and its target; both are empty without one. Raises
+    UsageError for one that is unusable, and for options that do not fit.
+    """
+    if chosen.subject is None or chosen.dask is not None:
+        if chosen.subject or chosen.target:
+            raise UsageError(
+                "--subject does not work with --dask."
+                if chosen.subject
+                else "-t/--target works with --subject only.",
+                remedy="Use --jobs or --shard."
+                if chosen.subject
+                else "Leave it out: the plans have devices of each kind.",
+            )
+        return "", ""
+    target = "bms" if chosen.target is None else chosen.target.name
+    from flasher.simulate.subject import bench  # noqa: PLC0415  loads much of the suite
+
+    bench(chosen.subject, target)
+    return chosen.subject, target
 
 
 def _run(
@@ -236,20 +281,20 @@ def _exit_code(total: Result, *, is_strict: bool, is_shard: bool = False) -> Exi
     return ExitCode.PARTIAL if failed else ExitCode.OK
 
 
-def _tell(total: Result, output: Output, *, is_shard: bool = False) -> None:
+def _tell(total: Result, output: Output, *, is_shard: bool = False, subject: str = "") -> None:
     """Print the sum of a campaign."""
     if total.tallies:
         output.table(_rows(total.tallies), indent=2)
-    count, never = len(reachable()), total.never_reached
+    count, never = len(total.reachable), total.never_reached
     if total.corpus_runs:
         output.result(f"{counted(total.corpus_runs, 'plan')} of the corpus played")
     output.result(f"{count - len(never)} of {count} places reached")
     output.results(_never_lines(never))
     output.results(_canary_lines(total, is_shard=is_shard))
     for each in total.violations:
-        output.result(f"VIOLATION {each.kind}: {printable(each.text)}")
+        output.results(_violation_lines("VIOLATION", each))
         where = "corpus" if each.seed < 0 else f"seed {each.seed}"
-        output.result(f"  {where}; replay: {replay_line(each.plan)}")
+        output.result(f"  {where}; replay: {replay_line(each.plan, subject)}")
     if total.violation_count > len(total.violations):
         output.result(f"{total.violation_count:,} violations in all")
     if not total.violation_count:
@@ -264,6 +309,12 @@ def _never_lines(never: Iterable[str]) -> Iterator[str]:
         yield from textwrap.wrap(
             f"never: {head}: {text}", _COLUMNS, initial_indent="  ", subsequent_indent=" " * 9
         )
+
+
+def _violation_lines(word: str, violation: Violation | Found) -> Iterator[str]:
+    text, *printed = violation.text.split(LINE_JOINT)
+    yield f"{word} {violation.kind}: {printable(text)}"
+    yield from (f"    {printable(line)}" for line in printed)
 
 
 def _canary_lines(total: Result, *, is_shard: bool) -> Iterator[str]:
@@ -285,6 +336,7 @@ def _write_page(
     output: Output,
     *,
     is_shard: bool = False,
+    subject: str = "",
     missing: Iterable[str] = (),
 ) -> None:
     """Write the page of a campaign; `missing`: lines about what a merged one lacks."""
@@ -301,8 +353,8 @@ def _write_page(
         missing=[*missing],
         tallies=[*_in_order(total.tallies)],
         classes=range(min(times, default=0), max(times, default=-1) + 1),
-        replay=replay_line,
-        places=len(reachable()),
+        replay=partial(replay_line, subject=subject),
+        places=len(total.reachable),
     )
     write_whole(path, page.encode("utf-8"), "--html")
     output.progress(f"html: {printable(str(path))}")
@@ -327,18 +379,20 @@ def _in_order(tallies: Mapping[str, Tally]) -> Sequence[tuple[str, Tally]]:
     return sorted(tallies.items(), key=lambda each: each[0] != NO_FAULT)
 
 
-def replay_line(plan: str) -> str:
+def replay_line(plan: str, subject: str = "") -> str:
     """Return the command that plays a plan again."""
-    return shlex.join(["flasher", "simulate", "replay", plan])
+    device = ["--subject", subject] if subject else []
+    return shlex.join(["flasher", "simulate", "replay", *device, plan])
 
 
 @simulate.action("replay", exit_codes=(ExitCode.IMAGE, ExitCode.PARTIAL))
 @argument("text", metavar="PLAN")
+@_subject
 @option(
     TRACE_FILE, type=values.FilePath("log", "asc", "csv", gives=Path), metavar="FILE",
     panel="reports", help="the frames of the run, as for `flasher explain`",
 )  # fmt: skip
-def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
+def replay(output: Output, *, text: str, subject: str | None, trace_file: Path | None) -> int:
     """Play a plan, as printed with a violation, exactly as it was: - reads it from standard input.
     With -v, every frame, fault and event is printed.
     """
@@ -350,7 +404,9 @@ def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
             f"The plan cannot be read: {printable(str(error))}.",
             remedy="Give the plan as one argument, in quotes, as it was printed.",
         ) from error
+    _check_device(plan, subject)
     check_writable(trace_file, TRACE_FILE, typed_values(but="trace_file"))
+    bench = Batch("", 0, 0, subject=subject or "", target=plan.job.target).bench
     with ExitStack() as files:
         recorder = None if trace_file is None else files.enter_context(Recorder(trace_file))
 
@@ -359,19 +415,34 @@ def replay(output: Output, *, text: str, trace_file: Path | None) -> int:
                 recorder(frame, sent=sender == "host", now=now)
 
         log: Callable[[str], object] | None = output.result if output.verbosity > 0 else None
-        verdict = Player(plan, log=log, tap=record).play()
+        verdict = Player(plan, bench=bench, log=log, tap=record).play()
     output.result(f"{verdict.ending}, exit code {verdict.exit_code}, {verdict.took_s:.2f} s")
     if verdict.where:
         output.result(f"  {printable(verdict.where)}")
-    output.result(f"in the device's flash: {verdict.left}")
+    if verdict.left:
+        output.result(f"in the device's flash: {verdict.left}")
     if verdict.recovered:
         output.result(f"brought back by: flasher {verdict.recovered}")
     output.result(f"digest of all frames: {verdict.wire}")
     for each in verdict.violations:
         word = "not counted" if each.is_excused else "VIOLATION"
-        output.result(f"{word} {each.kind}: {printable(each.text)}")
+        output.results(_violation_lines(word, each))
     failed = any(not each.is_excused for each in verdict.violations)
     return output.document(verdict, exit_code=ExitCode.PARTIAL if failed else ExitCode.OK)
+
+
+def _check_device(plan: Plan, subject: str | None) -> None:
+    is_subject = [isinstance(each, Subject) for each in plan.devices]
+    if subject is None and any(is_subject):
+        raise UsageError(
+            "The device of the plan is a bootloader under test.",
+            remedy="Name it: --subject ./boot.",
+        )
+    if subject is not None and is_subject != [True]:
+        raise UsageError(
+            "The device of the plan is not the bootloader under test.",
+            remedy="Write `subject` for its device, or leave --subject out.",
+        )
 
 
 @dataclass(frozen=True)

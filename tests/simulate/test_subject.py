@@ -1,0 +1,276 @@
+"""Campaigns against a bootloader under test: the right one passes, each wrong one is found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flasher.cli.main import main
+from flasher.conformance.dut import process
+from flasher.errors import ExitCode, UsageError
+from flasher.simulate import campaign
+from flasher.simulate.campaign import Batch, Result, campaign_key, run_batch
+from flasher.simulate.ledger import Ledger, merge
+from flasher.simulate.plan import Plan
+from flasher.simulate.play import Player, Verdict, play
+from flasher.simulate.subject import SubjectBench
+from tests.loops import each
+from tests.peers.python_bootloader import PythonBootloader
+
+RIGHT = "tests.peers.python_bootloader:PythonBootloader"
+JOB = "job packets=3 ; subject"
+ERASES = 3
+"""Flash operations before the first packet of `JOB`: the record, and a sector."""
+
+
+class ReportsErrors(PythonBootloader):
+    """Its flash reports errors, which it handles by a restart."""
+
+    facts = replace(PythonBootloader.facts, abi=2)
+
+    def start(self, host: object, cause: int) -> None:
+        super().start(_Restarting(host), cause)  # type: ignore[arg-type]
+
+
+class _Restarting:
+    def __init__(self, host: object) -> None:
+        self._host = host
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._host, name)
+
+    def flash_erase(self, offset: int) -> None:
+        self._host.flash_erase(offset) or self._host.reset()  # type: ignore[attr-defined]
+
+    def flash_write(self, offset: int, data: bytes) -> None:
+        self._host.flash_write(offset, data) or self._host.reset()  # type: ignore[attr-defined]
+
+
+class IgnoresErrors(PythonBootloader):
+    facts = ReportsErrors.facts
+
+
+class ForgetsTheRecord(PythonBootloader):
+    """It starts what it received, until the power fails."""
+
+    def _end(self) -> None:
+        write = self.host.flash_write
+        self.host.flash_write = lambda _offset, _data: True  # type: ignore[method-assign,assignment]
+        super()._end()
+        self.host.flash_write = write  # type: ignore[method-assign]
+
+
+class TrustsTheRecord(PythonBootloader):
+    """It erases the record last, and does not check what it stands for."""
+
+    def _begin(self, size: int) -> None:
+        erase = self.host.flash_erase
+        offsets: list[int] = []
+
+        def note(offset: int) -> bool:
+            offsets.append(offset)
+            return True
+
+        self.host.flash_erase = note  # type: ignore[method-assign]
+        super()._begin(size)
+        self.host.flash_erase = erase  # type: ignore[method-assign]
+        for offset in reversed(offsets):
+            erase(offset)
+
+    def _is_whole(self) -> bool:
+        return self.host.flash_read(0, 4) != b"\xff" * 4
+
+
+class Crashes(PythonBootloader):
+    def _store(self, data: bytes) -> None:
+        super()._store(data)
+        self._size // (self._stored - 2)
+
+
+class Hangs(PythonBootloader):
+    def _store(self, data: bytes) -> None:
+        while True:
+            pass
+
+
+class Deaf(PythonBootloader):
+    def _take_messages(self) -> None:
+        pass
+
+
+@contextmanager
+def bench_of(what: type | str) -> Iterator[SubjectBench]:
+    bench = SubjectBench(what if isinstance(what, str) else f"{__name__}:{what.__name__}", "bms")
+    try:
+        yield bench
+    finally:
+        bench.close()
+
+
+def played(what: type | str, line: str) -> Verdict:
+    with bench_of(what) as bench:
+        return play(Plan.parse(line), bench=bench)
+
+
+def found(what: type, line: str) -> str:
+    (violation,) = played(what, line).violations
+    return str(violation)
+
+
+def test_a_right_bootloader_is_upgraded_and_a_line_replays_the_run() -> None:
+    verdict = played(RIGHT, f"{JOB} ; @packet2 drop count=3")
+    assert (verdict.ending, verdict.left, verdict.violations) == ("completed", "new", ())
+    assert verdict.is_good
+    assert played(RIGHT, verdict.plan) == verdict
+
+
+@each("device", ["application=none", "begins=boot", "drift=0.01", "version=V0r9r9_20200101"])
+def test_a_bootloader_begins_as_the_plan_says(device: str) -> None:
+    assert played(RIGHT, f"{JOB} {device}").is_good
+
+
+def test_a_power_cut_in_any_flash_operation_leaves_no_more_than_an_empty_device() -> None:
+    lines: list[str] = []
+    with bench_of(RIGHT) as bench:
+        for operation in range(1, ERASES + 4):
+            for after in ("", "+0.00003", "+0.005"):
+                plan = Plan.parse(f"{JOB} ; @flash{operation}{after} power")
+                verdict = Player(plan, bench=bench, log=lines.append).play()
+                assert verdict.violations == (), plan
+                assert verdict.left == "new", plan
+    assert sum(line.endswith("power") for line in lines) == 3 * (ERASES + 3)
+
+
+def test_flash_that_reports_errors_is_no_success() -> None:
+    fault = "@end flash-fails count=9"
+    assert played(ReportsErrors, f"{JOB} ; {fault}").is_good
+    wrong = played(IgnoresErrors, f"{JOB} ; {fault}")
+    assert "FALSE: success, and the device has none" in map(str, wrong.violations)
+
+
+def test_what_the_flash_holds_is_what_is_started_after_a_power_up() -> None:
+    with bench_of(ForgetsTheRecord) as bench:
+        verdict = play(Plan.parse("job packets=3 ; subject application=none"), bench=bench)
+    assert {*map(str, verdict.violations)} == {
+        "FALSE: success, and the device has none",
+        "CORRUPT: the device runs an application that it does not have",
+    }
+
+
+def test_a_start_of_half_an_image_is_found() -> None:
+    plan = Plan.parse(f"{JOB} ; @flash2 restart")
+    with bench_of(TrustsTheRecord) as bench:
+        first, second = play(plan, bench=bench), play(plan, bench=bench)
+    assert [*map(str, first.violations)] == [
+        "SUBJECT: the bootloader started an incomplete application"
+    ]
+    assert second == first
+
+
+def test_a_crash_names_the_call_and_what_the_bootloader_printed() -> None:
+    text = found(Crashes, "job packets=3 ; subject application=none")
+    assert text.startswith("SUBJECT: the bootloader ended with status 1 in flasher_dut_receive")
+    assert "ZeroDivisionError" in text
+
+
+def test_a_call_that_does_not_return_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "WATCHDOG_S", 0.3)
+    text = found(Hangs, "job packets=3 ; subject application=none")
+    assert "did not return from flasher_dut_receive" in text
+
+
+def test_a_bootloader_that_takes_no_application_is_a_finding_in_each_plan() -> None:
+    text = found(Deaf, JOB)
+    assert text.startswith("SUBJECT: its first upgrade, without faults, with -t bms, ends in ")
+
+
+def test_drawn_plans_have_the_bootloader_as_their_only_device() -> None:
+    with bench_of(RIGHT) as bench:
+        faults = 0
+        for seed in range(40):
+            plan = bench.drawn(seed)
+            assert Plan.parse(str(plan)) == plan
+            assert [device.NAME for device in plan.devices] == ["subject"]
+            faults += any(each.when and each.when.what == "flash" for each in plan.clauses)
+        assert faults > 10
+
+
+@pytest.mark.slow
+def test_random_plans_end_in_no_violation_with_a_right_bootloader() -> None:
+    with bench_of(RIGHT) as bench:
+        for seed in range(500, 560):
+            verdict = play(bench.drawn(seed), bench=bench)
+            assert verdict.violations == (), verdict
+
+
+def test_the_key_of_a_campaign_depends_on_the_bootloader(tmp_path: Path) -> None:
+    program = tmp_path / "boot"
+    keys = {campaign_key(), campaign_key(RIGHT, "bms"), campaign_key(RIGHT, "wmc")}
+    for content in (b"one", b"two"):
+        program.write_bytes(content)
+        campaign_key.cache_clear()
+        keys.add(campaign_key(str(program), "bms"))
+    assert len(keys) == 5
+    with pytest.raises(ValueError, match="a batch of"):
+        run_batch(Batch(campaign_key(), 0, 1, subject=RIGHT, target="bms"))
+
+
+def test_ledgers_of_different_bootloaders_are_not_added_up(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.jsonl" for name in ("bms", "wmc", "again")]
+    for first, (path, target) in enumerate(zip(paths, ("bms", "wmc", "bms"), strict=True)):
+        batch = Batch(campaign_key(RIGHT, target), first, 1, subject=RIGHT, target=target)
+        with Ledger(path, 0, 3, batch.campaign) as ledger:
+            ledger.add(batch, Result(batch.campaign, runs=1))
+    merged = merge([paths[0], paths[2]])
+    assert (merged.result.runs, merged.missing) == (2, [(1, 2)])
+    assert not any(place.startswith("device: ") for place in merged.result.never_reached)
+    readers: list[Callable[[], object]] = [
+        lambda: merge(paths),
+        lambda: Ledger(paths[0], 0, 3),
+        lambda: Ledger(paths[0], 0, 3, campaign_key(RIGHT, "wmc")),
+    ]
+    for read in readers:
+        with pytest.raises(UsageError, match="written by other code"):
+            read()
+
+
+@pytest.mark.slow
+def test_a_violation_is_shrunk_and_replayed_by_its_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(campaign, "CANARY_RUNS", 60)
+    subject = f"{__name__}:TrustsTheRecord"
+    assert main(["simulate", "--subject", subject, "--runs", "100"]) == ExitCode.PARTIAL
+    line = next(each for each in capsys.readouterr().out.splitlines() if "replay: " in each)
+    head, _, plan = line.partition(f"flasher simulate replay --subject {subject} ")
+    assert head.endswith("replay: ")
+    assert len(plan.split(" ; ")) <= 3, plan
+    trace = tmp_path / "run.log"
+    replay = ["simulate", "replay", "--subject", subject, plan.strip("'")]
+    assert main([*replay, "--trace-file", str(trace), "--json"]) == ExitCode.PARTIAL
+    assert json.loads(capsys.readouterr().out)["violations"][0]["kind"] == "SUBJECT"
+    assert main(["explain", str(trace)]) in set(ExitCode)
+    assert "BMS" in capsys.readouterr().out
+
+
+@each(
+    "arguments, why",
+    [
+        (["--subject", RIGHT, "--dask", "tcp://localhost:1"], "does not work with --dask"),
+        (["-t", "bms"], "works with --subject only"),
+        (["--subject", "no/file"], "There is no bootloader"),
+        (["replay", JOB], "is a bootloader under test"),
+        (["replay", "--subject", RIGHT, "job ; mock"], "is not the bootloader under test"),
+        (["replay", "--subject", RIGHT, f"{JOB} ; subject"], "is not the bootloader under test"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], why: str
+) -> None:
+    assert main(["simulate", *arguments]) == ExitCode.USAGE
+    assert why in capsys.readouterr().err
