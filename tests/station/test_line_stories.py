@@ -164,6 +164,18 @@ STORIES = {
         " @3.1 put unit=3 socket=A ; @7.0 card by=jo unit=3 ; @7.4 label by=jo unit=3 ;"
         " @7.5 pull unit=3"
     ),
+    "a unit that gets its power after its label and reports another number": (
+        "line sockets=1 recipe=held ; unit label=2 number=other ; person name=jo ; person name=al ;"
+        " @3.0 card by=al unit=2 socket=A ; @3.2 label by=al unit=2 ; @21.3 put unit=2 socket=A ;"
+        " @24.0 pull unit=2 ; @88.0 put unit=2 socket=A ; @88.1 card by=jo unit=2 socket=A ;"
+        " @88.5 dip socket=A seconds=2.0 ; @89.0 label by=jo unit=2"
+    ),
+    "a unit that is pulled in the run of one which runs in another socket by then": (
+        "line sockets=3 ; unit label=1 number=own ; unit label=6 pace=slow ;"
+        " person name=jo source=jo ; @44.5 put unit=1 socket=C ; @45.0 label by=jo unit=1 ;"
+        " @45.9 pull unit=1 ; @46.2 put unit=6 socket=C ; @46.5 put unit=1 socket=B ;"
+        " @48.0 pull unit=6"
+    ),
     "a unit that is pulled while the adapter is away": (
         "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
         " @7.0 label by=jo unit=1 ; @12.0 unplug socket=A seconds=0.5 ; @12.2 pull unit=1 ;"

@@ -152,8 +152,10 @@ class Promises:
                 label,
                 unit,
                 self._number_of(unit),
-                # One that nobody can ask is not identified with an application either.
-                engine.stored_image is not None or not engine.target.has_version_query,
+                # One that nobody can ask is not identified with an application either; one without
+                # power announces its bootloader before anybody can ask its application.
+                (engine.stored_image is not None and engine.has_power)
+                or not engine.target.has_version_query,
                 [(unit, unit.operations)],
             )
 
@@ -167,11 +169,11 @@ class Promises:
         if socket in self._runs:
             self._runs[socket].has_commanded = True
 
-    def pulled(self, socket: str, *, was_calm: bool) -> None:
+    def pulled(self, socket: str, unit: PaperUnit, *, was_calm: bool) -> None:
         """`was_calm`: it was in the socket and heard for some time before the run."""
         self.touched(socket)
         run = self._runs.get(socket)
-        if run is None or run.number is None:
+        if run is None or run.number is None or run.unit is not unit:
             return
         if (run.is_identified or was_calm) and not run.is_flashed:
             run.was_running = (

@@ -492,7 +492,7 @@ class World:
         if self._holds(bay):
             return False
         if self.setup.line.tells:
-            self.promises.pulled(bay.name, was_calm=_is_calm(bay))
+            self.promises.pulled(bay.name, bay.unit, was_calm=_is_calm(bay))
         else:
             self.promises.touched(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
