@@ -402,7 +402,7 @@ class DuplicateDetector:
                     self._transfer_lost_by = text("request transfer came again")
             case messages.Ack(number):
                 self._acknowledged(number, now)
-            case messages.Nak():
+            case messages.Nak() if not self._has_ended:
                 self._packet.has_nak = True
                 self._check_two_answers(self._packet)
             case messages.Complete():

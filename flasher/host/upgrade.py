@@ -854,6 +854,7 @@ class UpgradeStage:
         if at.end_copies_left <= at.end_naks:
             return  # answers a packet
         at.end_naks += 1
+        at.announced_at = None  # it still waits in its transfer
         if at.end_naks > 1:
             self._end(Ending.REFUSED, nak)
             return

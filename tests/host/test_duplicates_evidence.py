@@ -587,6 +587,13 @@ def test_what_was_odd_is_forgotten_slowly(good: int, evidence: str) -> None:
     assert odd(watch, 3 + good).evidence == evidence
 
 
+def test_a_refusal_of_the_image_is_no_answer_to_a_packet() -> None:
+    watch = Watch()
+    for _ in range(3):
+        watch.transfers(2).sends(Command.END_OF_TRANSFER).hears(Nak(2))
+    assert watch.evidence == ""
+
+
 def test_a_packet_is_odd_once_and_only_when_each_copy_has_its_ack() -> None:
     watch = odd(Watch().transfers(0), 1).hears(*[Nak(1)] * 9)
     assert watch.evidence == ""

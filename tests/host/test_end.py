@@ -10,7 +10,7 @@ from flasher import events
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
-from flasher.host.table import Ending
+from flasher.host.table import Ending, UpgradeState
 from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
@@ -204,6 +204,18 @@ def test_a_refusal_while_the_version_is_asked_is_a_refusal() -> None:
     bench.wait(0.02)
     bench.say(Nak(2))
     assert bench.outcome.ending is Ending.REFUSED
+
+
+def test_a_nak_after_announcements_has_the_end_repeated_and_waited_for() -> None:
+    bench = versioned()
+    bench.to_end()
+    bench.say(BOOT)
+    bench.wait(0.5)
+    assert bench.engine.state is UpgradeState.CONFIRMING
+    bench.say(Nak(2))
+    bench.expect(EndOfTransfer)
+    bench.wait(40.0)
+    assert bench.outcome.ending is Ending.UNCONFIRMED
 
 
 def test_a_version_on_the_bus_before_the_end_decides_nothing() -> None:
