@@ -294,6 +294,22 @@ class Unit:
         self._late.append((now + change.late, frames * copies))
 
 
+class HostClock:
+    """Clock of a host on a simulated bus, which goes on while the host waits: for an adapter that
+    is away, for example.
+    """
+
+    speed: Final = 1.0
+
+    def __init__(self, bus: SimulatedBus) -> None:
+        self._bus = bus
+        self.now = bus.clock.now
+
+    def wait_until(self, moment: float) -> None:
+        while self.now() < moment:
+            self._bus.advance(moment)
+
+
 class Watcher(Protocol):
     """Observer of each frame before it is delivered."""
 

@@ -30,6 +30,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.bus import (
     FrameFault,
+    HostClock,
     KilledError,
     OverdueError,
     PlanBus,
@@ -526,7 +527,9 @@ class Player:
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
         link.on_update = self._facts.rules.update_handed_over
         self._interrupted_at = None
-        device = api.Connection(link, self.clock, "the bus of the plan").device(self.target)
+        device = api.Connection(link, HostClock(self.bus), "the bus of the plan").device(
+            self.target
+        )
         try:
             result = device.upgrade(
                 self.image_plan,

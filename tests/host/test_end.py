@@ -213,7 +213,7 @@ def test_a_nak_after_announcements_has_the_end_repeated_and_waited_for() -> None
     bench.wait(0.5)
     assert bench.engine.state is UpgradeState.CONFIRMING
     bench.say(Nak(2))
-    bench.expect(EndOfTransfer)
+    assert isinstance(bench.sent[-1][1], EndOfTransfer)
     bench.wait(40.0)
     assert bench.outcome.ending is Ending.UNCONFIRMED
 
