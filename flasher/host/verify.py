@@ -77,7 +77,8 @@ class Verification:
         """Create the error for the verdict; None for a good one."""
         if self.ok:
             return None
-        what = f"{target.node.name}: completed, but {wording(self.verdict)}"
+        ending = f"completed, but {wording(self.verdict)}"
+        what = f"{target.node.name}: {ending}"
         what += f" ({self.detail})." if self.detail else "."
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(

@@ -47,12 +47,6 @@ class KilledError(BaseException):
     """The host's process is gone; no code of the host may catch it."""
 
 
-class SubjectFailedError(BaseException):
-    """The bootloader under test crashed, hung or used its flash wrongly; no code of the host may
-    catch it.
-    """
-
-
 class OverdueError(Exception):
     """The host did not end."""
 

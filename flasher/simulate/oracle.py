@@ -41,6 +41,12 @@ _LOOKS_LIKE_TWO: Final = (
 """Faults after which one device may look like two: other traffic may have its CAN ids."""
 
 
+class SubjectFailedError(BaseException):
+    """The bootloader under test crashed, hung or used its flash wrongly; no code of the host may
+    catch it.
+    """
+
+
 @dataclass(frozen=True)
 class Violation:
     """Broken promise, of one of these kinds.

@@ -35,7 +35,6 @@ from flasher.simulate.bus import (
     OverdueError,
     PlanBus,
     PlanLink,
-    SubjectFailedError,
     Unit,
 )
 from flasher.simulate.independent import (
@@ -56,7 +55,7 @@ from flasher.simulate.independent import (
     IndependentDevice,
     frames_of,
 )
-from flasher.simulate.oracle import Claim, Facts, UnitFacts, Violation, judge
+from flasher.simulate.oracle import Claim, Facts, SubjectFailedError, UnitFacts, Violation, judge
 from flasher.simulate.reached import fault_place, reading_place
 from flasher.simulate.wire_rules import WireRules
 

@@ -37,8 +37,8 @@ from flasher.mock.memory import FlashMemory, Operation
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import PACKET_DATA_SIZE, TARGETS, WELLING
 from flasher.simulate import plan as plans
-from flasher.simulate.bus import SubjectFailedError
 from flasher.simulate.draw import drawn_for_subject
+from flasher.simulate.oracle import SubjectFailedError
 
 _FIRST_PACKETS: Final = 12
 """Size of the first application."""

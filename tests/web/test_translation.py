@@ -7,7 +7,9 @@ import re
 
 import pytest
 
+from flasher.host.verify import Level, Verdict, Verification
 from flasher.i18n import Text, text, with_value
+from flasher.protocol.spec import TARGETS
 from flasher.station.scans import Word
 from flasher.translation import chosen, translator
 from tests import catalogue
@@ -120,3 +122,21 @@ def test_brackets_with_two_clauses_stay_one_part() -> None:
         "BMS: das Fahrzeug wird benutzt (die Batterie gibt 3336 mA ab, mehr als 1000 mA;"
         " --allow-in-use erlässt dies)."
     )
+
+
+@pytest.mark.parametrize(
+    ("language", "translated"),
+    [
+        ("de", "abgeschlossen, aber der Speicher weicht vom Image ab"),
+        ("zh", "存储区与固件不一致"),
+    ],
+)
+def test_a_verification_that_fails_is_translated_whole(language: str, translated: str) -> None:
+    error = Verification(
+        Level.MEMORY, Verdict.MEMORY_OTHER, None, "first at 0x08009000: FF instead of 00"
+    ).error(TARGETS["bms"])
+    assert error is not None
+    text = translator(language)(error.what)
+    assert "completed" not in text
+    assert "instead" not in text
+    assert translated in text
