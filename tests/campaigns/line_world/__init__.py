@@ -50,6 +50,7 @@ Kinds of violations, by what is true when there is none:
     ACCUSED         a unit that nothing has disturbed is not taken for another one
     BLAMED          one that was pulled before its flash is not recorded as FAIL
     CANCELLED       a label that was cancelled begins no run
+    ABORTED         a run ends as aborted only where somebody aborted it
     UNIDENTIFIED    a unit without application is flashed only with the card of its socket
     TRUSTED         after UNIT_CHANGED, a label passes only with a new flash
     FORGOTTEN       a run that a dead station left is shown when it runs again

@@ -21,6 +21,8 @@ Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
 _RECIPES: Final = {"writes": 10, "plain": 5, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
 _NUMBERS: Final = {"none": 5, "empty": 2.5, "maker": 4, "own": 2, "other": 1.5}
+_NUMBERLESS: Final = ("empty", "new")
+"""Number and application of a unit that runs the line's firmware, and reports no number."""
 _GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -33,10 +35,14 @@ def setup_of(chance: random.Random) -> Story:
     bare = chance.choice((0.1, 0.1, 0.5))
     units, count = [], sockets + chance.choice((1, 2, 3))
     numbers = chance.choices(list(_NUMBERS), list(_NUMBERS.values()), k=count)
-    if chance.random() < 0.4:  # one of each
+    way = chance.random()
+    if way < 0.4:  # one of each
         numbers[: len(_NUMBERS)] = chance.sample(list(_NUMBERS), min(count, len(_NUMBERS)))
+    elif way < 0.7:
+        numbers[:2] = "maker", "empty"
     for label, number in enumerate(numbers, 1):
-        firmware = "new" if chance.random() < (0.2 if number == "other" else 0.5) else "old"
+        is_new = chance.random() < {"other": 0.2, "empty": 0.8}.get(number, 0.5)
+        firmware = "new" if is_new else "old"
         units.append(
             stories.UnitSetup(
                 label=label,
@@ -91,10 +97,14 @@ class Teller:
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
         if people and self.chance.random() < 0.9:
             scenes = [self._scan_at_once, self._lose_station, self._cancel_label]
+            scenes += 2 * [self._abort_own]
             scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash, self._take_out_again]
             scenes += 3 * [self._be_interrupted]
-            if any(each.number == "other" for each in self.world.setup.units):
+            numbers = {each.number for each in self.world.setup.units}
+            if "other" in numbers:
                 scenes += 3 * [self._scan_another_number]
+            if {"maker", "empty"} <= numbers and self.world.setup.line.recipe == "writes":
+                scenes += 6 * [self._exchange_for_numberless]
             for scene in self.chance.sample(scenes, 3):
                 yield from scene(self.chance.choice(people))
                 yield 3.0, None
@@ -261,6 +271,28 @@ class Teller:
             if flashed is bay and bay.unit is not None:
                 yield from self._put_another(bay)
 
+    def _exchange_for_numberless(self, name: str) -> Iterator[Step]:
+        """A unit whose image is complete, for one that runs that firmware and reports no number
+        where the first one reported its maker's.
+        """
+        table, empty = [self._setup(each) for each in self._on_table()], self._bays(full=False)
+        answering = [each for each in table if each.answers and each.application != "none"]
+        units = [each.label for each in answering if each.number == "maker"]
+        others = [each for each in answering if (each.number, each.application) == _NUMBERLESS]
+        if not (units and others and empty):
+            return
+        bay, unit = self.chance.choice(empty), self.chance.choice(units)
+        yield self._pause(), stories.Put(unit=unit, socket=bay.name)
+        yield 2.0, None
+        yield self._pause(), stories.Card(by=name, unit=unit)
+        yield self._pause(), stories.Label(by=name, unit=unit)
+        if (yield from self._await(StepName.FLASH, is_complete=True)) is bay:
+            # A slow unit confirms its image later.
+            confirmed_s = 0.2 if self._setup(unit).pace == "slow" else 0.0
+            yield confirmed_s + 0.1 * self.chance.random(), stories.Pull(unit=unit)
+            other = self.chance.choice(others).label
+            yield self.chance.choice(_GAPS_S), stories.Put(unit=other, socket=bay.name)
+
     def _keep_busy(self, name: str) -> Iterator[Step]:
         """Begin a run where none goes on."""
         if not self._bays(full=True, working=True):
@@ -275,7 +307,7 @@ class Teller:
             for bay in self.world.bays.values():
                 if bay.is_working and bay.step is step and bay.is_complete >= is_complete:
                     return bay
-            yield 0.1, None
+            yield 0.03, None
         return None
 
     def _exchange_complete(self, name: str) -> Iterator[Step]:
@@ -454,6 +486,14 @@ class Teller:
         empty = self._bays(full=False)
         if empty:
             yield self._pause(), stories.Free(by=name, socket=self.chance.choice(empty).name)
+
+    def _abort_own(self, name: str) -> Iterator[Step]:
+        """Begin a run, and abort it."""
+        for bay in (yield from self._bring(1)):
+            unit = self._number(bay)
+            yield self._pause(), stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
+            yield self._pause(), stories.Abort(by=name, socket=bay.name)
 
     def _abort(self, name: str) -> Iterator[Step]:
         working = self._bays(full=True, working=True)

@@ -88,6 +88,8 @@ class Promises:
         """Labels that were not flashed since a run in which the unit may have become another one.
         """
         self._runs: dict[str, _Run] = {}
+        self._aborted: set[str] = set()
+        """Sockets whose run somebody aborts."""
         self._interrupted: dict[str, tuple[str, float | None]] = {}
         """Labels of runs that a dead station left, by socket, and when that has to be shown."""
 
@@ -123,6 +125,8 @@ class Promises:
                 self._labels.pop(source, None)
             case "FREE":
                 self.touched(argument)
+            case "ABORT":
+                self._aborted.add(argument)
             case _ if not argument:
                 is_mounted = source.startswith(SCANNER)
                 self._interrupted.clear()
@@ -143,6 +147,7 @@ class Promises:
 
     def _begun(self, socket: str, label: str, unit: PaperUnit | None) -> None:
         self.touched(socket)
+        self._aborted.discard(socket)
         if label in self._cancelled:
             raise Violation("CANCELLED", f"{label} was cancelled, and its run begins in {socket}")
         self._runs.pop(socket, None)
@@ -193,6 +198,10 @@ class Promises:
 
     def _ended(self, event: RunEnded) -> None:
         run = self._runs.pop(event.socket, None)
+        if event.outcome is RunState.ABORTED and event.socket not in self._aborted:
+            raise Violation(
+                "ABORTED", f"the run of {event.serial} ended as if somebody had aborted it"
+            )
         was_changed = event.serial in self._changed
         if event.code in _OF_ANOTHER:
             self._changed.add(event.serial)
