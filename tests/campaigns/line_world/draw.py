@@ -98,14 +98,18 @@ class Teller:
         if people and self.chance.random() < 0.9:
             scenes = [self._scan_at_once, self._lose_station, self._cancel_label]
             scenes += 2 * [self._abort_own]
-            scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash, self._take_out_again]
-            scenes += 3 * [self._be_interrupted]
+            scenes += 2 * [self._go_on_in_an_outage, self._exchange_in_flash]
+            scenes += 3 * [self._be_interrupted, self._take_out_again]
+            # More often where they can do harm.
             numbers = {each.number for each in self.world.setup.units}
+            recipe = self.world.setup.line.recipe
             if "other" in numbers:
                 scenes += 3 * [self._scan_another_number]
-            if {"maker", "empty"} <= numbers and self.world.setup.line.recipe == "writes":
+            if recipe == "writes" and {"maker", "empty"} <= numbers:
                 scenes += 6 * [self._exchange_for_numberless]
-            for scene in self.chance.sample(scenes, 3):
+            if recipe == "plain":
+                scenes += 4 * [self._go_on_in_an_outage]
+            for scene in self.chance.sample(scenes, 4):
                 yield from scene(self.chance.choice(people))
                 yield 3.0, None
 
@@ -343,8 +347,9 @@ class Teller:
             yield self.chance.choice((0.0, 3.0)), None
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
-            yield self.chance.uniform(0.0, 0.6), stories.Pull(unit=unit)
-            yield 4.0, stories.Put(unit=unit, socket=bay.name)
+            yield self.chance.uniform(0.0, 0.4), stories.Pull(unit=unit)
+            # Before or after the station gives up.
+            yield self.chance.choice((4.0, 12.0, 12.0)), stories.Put(unit=unit, socket=bay.name)
 
     def _scan_at_once(self, name: str) -> Iterator[Step]:
         """Two people at one page scan at once, each a unit of their own."""
