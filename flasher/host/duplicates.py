@@ -117,8 +117,8 @@ class _Announcements:
     times: deque[float] = field(default_factory=lambda: deque(maxlen=4))
     """Times of the last boot versions since a reset or an update command."""
     rhythm: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=4))
-    """Times of the last boot versions since a reset, and whether an update command was sent before
-    it, since the previous one.
+    """Times of the last boot versions since a reset, and whether each came early although no update
+    command was sent since the previous one.
     """
     is_documented: bool = False
     """Two consecutive boot versions came at the documented interval."""
@@ -237,14 +237,20 @@ class DuplicateDetector:
         self._feedbacks.left()
 
     def _packet_of(self, number: int) -> _Packet:
-        """Return the record of a packet, and drop one that was answered long ago."""
+        """Return the record of a packet, the last one from now on; drop one of a packet that was
+        sent long ago, if possible an answered one.
+        """
         if number in self._packets:
-            return self._packets[number]
-        self._odd_answers = max(0.0, self._odd_answers - _DECAY)
-        if len(self._packets) >= _STORED_MAX:
-            answered = (key for key, each in self._packets.items() if each.unacknowledged <= 0)
-            del self._packets[next(answered, min(self._packets))]
-        return self._packets.setdefault(number, _Packet())
+            packet = self._packets.pop(number)
+        else:
+            packet = _Packet()
+            self._odd_answers = max(0.0, self._odd_answers - _DECAY)
+            if len(self._packets) >= _STORED_MAX:
+                oldest = [*self._packets][: _STORED_MAX // 2]
+                answered = (each for each in oldest if self._packets[each].unacknowledged <= 0)
+                del self._packets[next(answered, oldest[0])]
+        self._packets[number] = packet
+        return packet
 
     def _forget_announcements(self, *, is_reset: bool) -> None:
         """Drop boot versions from before a reset or update command."""
@@ -436,7 +442,7 @@ class DuplicateDetector:
         is_documented = self._shortest_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
         announced.last_at = now
-        announced.rhythm.append((now, not times))
+        announced.rhythm.append((now, bool(times) and gap_s < self._shortest_s))
         times.append(now)
         if self._alternate(announced.rhythm, is_documented=announced.is_documented):
             self._set_evidence(text("two bootloaders announced themselves alternately"))
@@ -452,12 +458,7 @@ class DuplicateDetector:
         ):
             return False
         gaps = [later - earlier for earlier, later in pairwise(times)]
-        after_update = [is_after for _, is_after in rhythm][1:]
-        if all(
-            gap >= self._shortest_s
-            for gap, is_after in zip(gaps, after_update, strict=True)
-            if not is_after
-        ):
+        if not any(is_early for _, is_early in [*rhythm][1:]):
             return False
         is_uneven = max(gaps) - min(gaps) > _TOLERANCE * self._timings.boot_version_spacing_s
         return is_documented or is_uneven

@@ -608,6 +608,17 @@ def test_a_packet_is_odd_once_and_only_when_each_copy_has_its_ack() -> None:
     assert watch.evidence == TOO_OFTEN
 
 
+def test_unanswered_packets_of_an_earlier_attempt_do_not_hide_a_second_ack() -> None:
+    watch = Watch().transfers(0)
+    for packet in range(1, 9):
+        watch.sends(Command.PACKET, packet)
+    watch.transfers(0)
+    for packet in (21, 22):
+        watch.sends(Command.PACKET, packet).hears(Ack(packet))
+    watch.sends(Command.PACKET, 23).wait(4).hears(Ack(22))
+    assert watch.evidence == "packet 22 was acknowledged more often than it was sent"
+
+
 def test_a_new_attempt_forgets_the_naks_but_not_what_was_odd() -> None:
     watch = odd(Watch().transfers(0), 1).sends(Command.UPDATE).hears(RequestTransfer())
     for packet in range(1, 6):
