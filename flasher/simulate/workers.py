@@ -144,13 +144,13 @@ class _Worker:
         """
         if self._pipe is None:
             self._pipe = self._started()
-        is_told = False
+        is_stop_sent = False
         try:
             self._pipe.send(batch)
             while not self._pipe.poll(_POLL_S):
-                if is_stopped() and not is_told:
+                if is_stopped() and not is_stop_sent:
                     self._pipe.send(None)
-                    is_told = True
+                    is_stop_sent = True
             result: Result | Exception = self._pipe.recv()
         except (EOFError, OSError) as error:  # OSError: while it sent
             if self._process is not None:
@@ -206,22 +206,28 @@ def _run_each(run_one: RunBatch, pipe: Connection, run_s: float) -> None:
             continue
         result: Result | Exception
         try:
-            with _time_limit(run_s * batch.count):
-                result = run_one(batch, pipe.poll)
+            with _time_limit(run_s) as begin_run:
+                result = run_one(batch, lambda: begin_run() or pipe.poll())
         except Exception as error:  # noqa: BLE001  for the parent
             result = error
         pipe.send(result)
 
 
 @contextmanager
-def _time_limit(limit_s: float) -> Iterator[None]:
-    """End this process by SIGPROF if the block takes more CPU time. Does nothing on Windows."""
+def _time_limit(limit_s: float) -> Iterator[Callable[[], None]]:
+    """End this process by SIGPROF if it takes more CPU time in the block without a call of the
+    function that it gets. Does nothing on Windows.
+    """
     if not hasattr(signal, "setitimer"):
-        yield
+        yield lambda: None
         return
-    signal.setitimer(signal.ITIMER_PROF, limit_s)
+
+    def begin() -> None:
+        signal.setitimer(signal.ITIMER_PROF, limit_s)
+
+    begin()
     try:
-        yield
+        yield begin
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
 

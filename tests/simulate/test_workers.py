@@ -125,6 +125,16 @@ def test_a_run_without_an_end_is_a_violation(monkeypatch: pytest.MonkeyPatch) ->
     assert found.runs == 2
 
 
+def test_each_run_of_a_batch_has_the_time_limit_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(workers, "_RUN_S", 0.2)
+    batch = Batch(campaign_key(), KILLER, 1000)
+    with workers._Worker(run_endlessly) as worker, pytest.raises(EOFError):
+        worker.run(batch, never)
+    assert worker.exit_code == -signal.SIGPROF
+
+
 def test_an_error_of_a_process_ends_the_campaign() -> None:
     with pytest.raises(FileNotFoundError):
         run(
