@@ -27,7 +27,9 @@ from math import log2
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from flasher.errors import UsageError
 from flasher.files import parse_toml
+from flasher.protocol.text import printable
 from flasher.simulate import plan as plans
 from flasher.simulate.draw import drawn
 from flasher.simulate.planting import swapped, upgrade_bugs
@@ -226,16 +228,20 @@ def _sum(one: Mapping[Key, int], other: Mapping[Key, int]) -> dict[Key, int]:
     return {key: one.get(key, 0) + other.get(key, 0) for key in sorted(one.keys() | other.keys())}
 
 
-@cache
 def campaign_key(subject: str = "", target: str = "") -> str:
     """Return a hash of all that decides the result of a seed: the code, and Python's version; with
-    a bootloader under test also a hash of that.
+    a bootloader under test also a hash of that, as it is now.
     """
-    if subject:
-        from flasher.simulate.subject import source_of  # noqa: PLC0415  loads much of the suite
+    if not subject:
+        return _code_key()
+    from flasher.simulate.subject import source_of  # noqa: PLC0415  loads much of the suite
 
-        key = hashlib.sha256(f"{subject} {target}\0".encode() + source_of(subject))
-        return campaign_key() + _SUBJECT + key.hexdigest()[:16]
+    key = hashlib.sha256(f"{subject} {target}\0".encode() + source_of(subject))
+    return _code_key() + _SUBJECT + key.hexdigest()[:16]
+
+
+@cache
+def _code_key() -> str:
     digest = hashlib.sha256(platform.python_version().encode())
     package = Path(__file__).parents[1]
     for file in sorted([*package.rglob("*.py"), *package.rglob("*.toml")]):
@@ -279,10 +285,10 @@ def share(batches: Iterable[Batch], number: int, count: int) -> Iterator[Batch]:
 def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
     """Play the plans of a batch; once stopped, the sum of those that were played.
 
-    Raises ValueError for a batch of other code.
+    Raises ValueError for a batch of other code, UsageError for one of another bootloader under
+    test, or one that is changed meanwhile.
     """
-    if batch.campaign != (key := campaign_key(batch.subject, batch.target)):
-        raise ValueError(f"a batch of {batch.campaign}; this is the code {key}")
+    _check_code(batch)
     began_s = time.process_time()
     sums = _Sums()
     with _without_log():
@@ -297,7 +303,21 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
                     verdict = play(plan, bench=batch.bench)
                     sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, verdict)
             sums.reached |= cells
+    _check_code(batch)
     return sums.result(batch.campaign, time.process_time() - began_s)
+
+
+def _check_code(batch: Batch) -> None:
+    key = campaign_key(batch.subject, batch.target)
+    if batch.campaign == key:
+        return
+    if not batch.campaign.startswith(_code_key() + _SUBJECT):
+        raise ValueError(f"a batch of {batch.campaign}; this is the code {key}")
+    raise UsageError(
+        f"The bootloader {printable(batch.subject)} was changed during the campaign.",
+        cause="it was built again",
+        remedy="Begin again, with a new ledger; test a copy of it while you build.",
+    )
 
 
 @contextmanager

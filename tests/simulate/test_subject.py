@@ -18,7 +18,7 @@ from flasher.simulate.campaign import Batch, Result, campaign_key, run_batch
 from flasher.simulate.ledger import Ledger, merge
 from flasher.simulate.plan import Plan
 from flasher.simulate.play import Player, Verdict, play
-from flasher.simulate.subject import SubjectBench
+from flasher.simulate.subject import SubjectBench, source_of
 from tests.loops import each
 from tests.peers.python_bootloader import PythonBootloader
 
@@ -213,11 +213,21 @@ def test_the_key_of_a_campaign_depends_on_the_bootloader(tmp_path: Path) -> None
     keys = {campaign_key(), campaign_key(RIGHT, "bms"), campaign_key(RIGHT, "wmc")}
     for content in (b"one", b"two"):
         program.write_bytes(content)
-        campaign_key.cache_clear()
         keys.add(campaign_key(str(program), "bms"))
     assert len(keys) == 5
     with pytest.raises(ValueError, match="a batch of"):
         run_batch(Batch(campaign_key(), 0, 1, subject=RIGHT, target="bms"))
+
+
+def test_a_bootloader_that_is_built_again_during_a_batch_ends_the_campaign(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    batch = Batch(campaign_key(RIGHT, "bms"), 0, 1, subject=RIGHT, target="bms")
+    assert run_batch(batch).runs == 1
+    builds = iter([source_of(RIGHT), b"another one"])
+    monkeypatch.setattr("flasher.simulate.subject.source_of", lambda _subject: next(builds))
+    with pytest.raises(UsageError, match="was changed during the campaign"):
+        run_batch(batch)
 
 
 def test_ledgers_of_different_bootloaders_are_not_added_up(tmp_path: Path) -> None:

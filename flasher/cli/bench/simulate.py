@@ -107,8 +107,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 _subject: Final = option(
     "--subject", metavar="BOOTLOADER", panel="device", brief=True,
-    help="upgrade a bootloader that is compiled for the computer (-t): a program, a shared library,"
-    " or MODULE:FACTORY; see `flasher conformance header`",
+    help="upgrade the bootloader of a target (-t, default bms) that is compiled for this computer:"
+    " a program, a shared library, or MODULE:FACTORY; see `flasher conformance header`",
 )  # fmt: skip
 _html: Final = option(
     "--html", type=values.FilePath("html", gives=Path), metavar="FILE", panel="reports",
@@ -227,7 +227,7 @@ def simulate(output: Output, chosen: Campaign) -> int:
     rate = 60 * (total.runs - before) / took_s if took_s else 0.0
     output.result(f"{counted(total.runs, 'run')}, {rate:,.0f} a minute")
     is_shard = chosen.shard is not None
-    _tell(total, output, is_shard=is_shard, subject=subject)
+    _print_sum(total, output, is_shard=is_shard, subject=subject)
     code = _exit_code(total, is_strict=chosen.strict, is_shard=is_shard)
     _write_page(chosen.html, total, code, output, is_shard=is_shard, subject=subject)
     if was_stopped and code is ExitCode.OK:
@@ -239,17 +239,15 @@ def _subject_of(chosen: Campaign) -> tuple[str, str]:
     """Return the bootloader under test and its target; both are empty without one. Raises
     UsageError for one that is unusable, and for options that do not fit.
     """
-    if chosen.subject is None or chosen.dask is not None:
-        if chosen.subject or chosen.target:
+    if chosen.subject is None:
+        if chosen.target is not None:
             raise UsageError(
-                "--subject does not work with --dask."
-                if chosen.subject
-                else "-t/--target works with --subject only.",
-                remedy="Use --jobs or --shard."
-                if chosen.subject
-                else "Leave it out: the plans have devices of each kind.",
+                "-t/--target works with --subject only.",
+                remedy="Leave it out: the plans have devices of each kind.",
             )
         return "", ""
+    if chosen.dask is not None:
+        raise UsageError("--subject does not work with --dask.", remedy="Use --jobs or --shard.")
     target = "bms" if chosen.target is None else chosen.target.name
     from flasher.simulate.subject import bench  # noqa: PLC0415  loads much of the suite
 
@@ -277,19 +275,24 @@ def _run(
 
 def _exit_code(total: Result, *, is_strict: bool, is_shard: bool = False) -> ExitCode:
     is_blind = bool(total.canaries_missed) if is_shard else total.is_blind
-    failed = total.violation_count or is_blind or (is_strict and total.never_reached)
+    is_empty = not (total.runs or is_shard)
+    failed = total.violation_count or is_blind or is_empty or (is_strict and total.never_reached)
     return ExitCode.PARTIAL if failed else ExitCode.OK
 
 
-def _tell(total: Result, output: Output, *, is_shard: bool = False, subject: str = "") -> None:
+def _print_sum(total: Result, output: Output, *, is_shard: bool = False, subject: str = "") -> None:
     """Print the sum of a campaign."""
     if total.tallies:
         output.table(_rows(total.tallies), indent=2)
     count, never = len(total.reachable), total.never_reached
     if total.corpus_runs:
         output.result(f"{counted(total.corpus_runs, 'plan')} of the corpus played")
-    output.result(f"{count - len(never)} of {count} places reached")
-    output.results(_never_lines(never))
+    # Most are of the host's tables, which are not the business of who tests a bootloader.
+    is_listed = not subject or output.verbosity > 0
+    hint = "" if is_listed or not never else " (-v lists the others)"
+    output.result(f"{count - len(never)} of {count} places reached{hint}")
+    if is_listed:
+        output.results(_never_lines(never))
     output.results(_canary_lines(total, is_shard=is_shard))
     for each in total.violations:
         output.results(_violation_lines("VIOLATION", each))
@@ -297,7 +300,9 @@ def _tell(total: Result, output: Output, *, is_shard: bool = False, subject: str
         output.result(f"  {where}; replay: {replay_line(each.plan, subject)}")
     if total.violation_count > len(total.violations):
         output.result(f"{total.violation_count:,} violations in all")
-    if not total.violation_count:
+    if not total.runs:
+        output.result("NOTHING TRIED: no random plan was played; allow more time")
+    elif not total.violation_count:
         output.result(f"no violation in {counted(total.runs, 'run')}")
 
 
@@ -467,7 +472,7 @@ def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
     for notice in merged.notices:
         output.progress(notice)
     output.result(counted(merged.result.runs, "run"))
-    _tell(merged.result, output)
+    _print_sum(merged.result, output)
     missing = [f"MISSING: seeds {first} to {end - 1}" for first, end in merged.missing]
     missing += [f"MISSING: the canary at seed {seed}" for seed in merged.missing_canaries]
     output.results(missing)
