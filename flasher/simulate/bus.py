@@ -16,7 +16,7 @@ from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import WELLING
+from flasher.protocol.spec import OVERHEAD_SIZE, WELLING
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
     ACK,
@@ -232,7 +232,7 @@ class Unit:
             if self._answers and not (is_feedback and self._answers[0].becomes == "twice"):
                 self._change_answer(now)
                 return self.next_frame(now)
-            self._bytes_left = frame.data[3] + 9
+            self._bytes_left = frame.data[3] + OVERHEAD_SIZE
         self._bytes_left = max(0, self._bytes_left - len(frame.data))
         return frame
 
@@ -275,7 +275,7 @@ class Unit:
                 break
             frames.append(frame)
             engine.frame_sent(own)
-            size = frames[0].data[3] + 9
+            size = frames[0].data[3] + OVERHEAD_SIZE
         wire = b"".join(frame.data for frame in frames)
         command, data = int.from_bytes(wire[4:6], "big"), wire[6:-5]
         if change.becomes == "silence":
@@ -451,7 +451,7 @@ class FrameFault:
             return [frame, *rest]
         held.append(frame)
         self._sender = sender
-        if sum(len(each.data) for each in held) < held[0].data[3] + 9:
+        if sum(len(each.data) for each in held) < held[0].data[3] + OVERHEAD_SIZE:
             return [frame, *rest]
         frames = [frame, *held, *rest]
         held.clear()

@@ -25,7 +25,13 @@ from flasher.host.options import (
 )
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import BOOT_VERSION_BURST, FRAME_DATA_SIZE, MESSAGE_MAX_SIZE, WELLING
+from flasher.protocol.spec import (
+    BOOT_VERSION_BURST,
+    FRAME_DATA_SIZE,
+    MESSAGE_MAX_SIZE,
+    OVERHEAD_SIZE,
+    WELLING,
+)
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.campaign import VIOLATIONS_MAX, Found
@@ -269,7 +275,7 @@ def _messages(frames: Sequence[tuple[float, plans.Sender | None, Frame]]) -> Ite
     """Per sender and CAN id, number of the first frame, and of the last."""
     for number, (now, sender, frame) in enumerate(frames, 1):
         if frame.data.startswith(b"\x55\xaa"):
-            size = frame.data[3] + 9
+            size = frame.data[3] + OVERHEAD_SIZE
             open_messages[sender, frame.can_id] = number, size
         first, size = open_messages.get((sender, frame.can_id), (0, 0))
         if first:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import FRAMES_PER_PACKET, TARGETS
+from flasher.protocol.spec import FRAMES_PER_PACKET, OVERHEAD_SIZE, TARGETS
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
@@ -40,8 +40,6 @@ _CAUSES_REPETITION: Final = (
     plans.Kill, plans.Restart, plans.Power, plans.Hang, plans.Unplug, plans.BusOff,
 )  # fmt: skip
 _DELAYS_FRAMES: Final = (plans.Load, plans.Unplug, plans.BusOff, plans.Tool)
-_MESSAGE_OVERHEAD: Final = 9
-"""Bytes of a message beside those that its length counts."""
 _ERASURES_MAX: Final = 20
 """Erasures after which an upgrade ends (docs/explanation/upgrade.md)."""
 _TOOL_QUIET_S: Final = 2.0
@@ -143,8 +141,9 @@ class WireRules:
         data = frame.data
         gap_s, self._ended_at = now - self._ended_at, now
         name = _COMMANDS.get(data[4:6]) if data[:3] == b"\x55\xaa\x16" else None
+        # Unlike `_left` also beside a device that restarts: another one may take the command.
         if name is not None:
-            self._update_left = data[3] + _MESSAGE_OVERHEAD if name == "update" else 0
+            self._update_left = data[3] + OVERHEAD_SIZE if name == "update" else 0
         if self._update_left:
             self._update_left = max(0, self._update_left - len(data))
             self.has_update |= not self._update_left
@@ -158,7 +157,7 @@ class WireRules:
                 self._left -= len(data)
                 self._end_message(now)
             elif data[:2] == b"\x55\xaa" and len(data) == 8:
-                self._left = data[3] + _MESSAGE_OVERHEAD - len(data)
+                self._left = data[3] + OVERHEAD_SIZE - len(data)
                 self._kind = ""
             return None
         is_short = gap_s < DEFAULT_TIMINGS.inter_frame_timeout_s - _TOLERANCE_S
@@ -170,7 +169,7 @@ class WireRules:
         self._heads[data] = now
         self._kind, self._had_gap = name, False
         self._number = data[7] if name == "packet" and len(data) > 7 else 0
-        self._left = data[3] + _MESSAGE_OVERHEAD - len(data)
+        self._left = data[3] + OVERHEAD_SIZE - len(data)
         self._check_begin(name, self._number, now)
         self._end_message(now)
         return Begun(name, self._number)

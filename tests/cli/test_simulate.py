@@ -167,6 +167,18 @@ def test_a_blind_campaign_fails(
     assert "BLIND: the planted mistake " in capsys.readouterr().out
 
 
+def test_a_campaign_that_tried_nothing_fails(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_batch(batch: Batch, *_: object) -> Result:
+        found = {batch.canary: 1} if batch.canary else {}
+        return Result(campaign_key(), canaries_found=found)
+
+    monkeypatch.setattr(command, "run_batch", run_batch)
+    assert main(["simulate", "--runs", "5"]) == ExitCode.PARTIAL
+    assert "NOTHING TRIED: " in capsys.readouterr().out
+
+
 def test_parts_of_the_sweep_are_listed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "sweep", "--list"]) == ExitCode.OK
     assert capsys.readouterr().out.startswith("frames ")

@@ -170,8 +170,14 @@ class Bench:
 
     def to_end(self) -> None:
         """Up to end of transfer, which has left and is not answered yet."""
+        self.to_request()
+        self.say(RequestTransfer())
+        self.on_to_end(first=1)
+
+    def on_to_end(self, *, first: int) -> None:
+        """From packet `first`, which is expected next, up to end of transfer."""
         total = -(-self.image.size_bytes // 128)
-        self.to_packet(total)
+        self.on_to_packet(total, first=first)
         self.say(Ack(total))
         self.expect(EndOfTransfer)
 

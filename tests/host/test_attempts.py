@@ -131,10 +131,7 @@ def test_a_transfer_reports_for_how_long_the_adapter_was_away_since_its_update_c
         bench.engine.link_back(bench.now)
         bench.expect(Packet)
     bench.say(Ack(2))
-    last = -(-bench.image.size_bytes // 128)
-    bench.on_to_packet(last, first=3)
-    bench.say(Ack(last))
-    bench.expect(EndOfTransfer)
+    bench.on_to_end(first=3)
     bench.say(Complete())
     assert bench.outcome.ok
     assert bench.outcome.unobserved_s == pytest.approx(1.75, abs=0.01)
@@ -149,10 +146,7 @@ def test_a_transfer_that_began_after_the_adapter_was_away_is_observed() -> None:
     bench.say(BOOT)
     bench.expect(UpdateCommand)
     bench.say(RequestTransfer())
-    last = -(-bench.image.size_bytes // 128)
-    bench.on_to_packet(last, first=1)
-    bench.say(Ack(last))
-    bench.expect(EndOfTransfer)
+    bench.on_to_end(first=1)
     bench.say(Complete())
     assert bench.outcome.ok
     assert not bench.outcome.unobserved_s
