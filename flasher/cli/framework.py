@@ -343,6 +343,7 @@ def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., A
         @click.pass_context
         def run(ctx: click.Context, /, **options: Any) -> Any:
             if ctx.invoked_subcommand is not None:
+                _refuse_own_options(ctx, ctx.invoked_subcommand)
                 return None
             session = _session(ctx)
             session.begin()
@@ -357,6 +358,19 @@ def group(*, runs_alone: bool = False, **more: Any) -> Callable[[Callable[..., A
         )(run)
 
     return make
+
+
+def _refuse_own_options(ctx: click.Context, action: str) -> None:
+    """Raise UsageError for an option of a command that is typed before its action: it would have no
+    effect. Those of the output apply to the action.
+    """
+    for param in ctx.command.params:
+        if param.name in _typed(ctx) and param.callback is not _take:
+            raise UsageError(
+                f"{param.opts[0]} before the action {action} has no effect.",
+                remedy=f"Leave it out, or write it after {action} if that has it:"
+                f" `{ctx.command_path} {action} --help`.",
+            )
 
 
 @dataclass(frozen=True)

@@ -291,7 +291,7 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
     _check_code(batch)
     began_s = time.process_time()
     sums = _Sums()
-    with _without_log():
+    with without_log():
         if batch.canary:
             sums.hunt(batch, is_stopped)
         else:
@@ -321,7 +321,7 @@ def _check_code(batch: Batch) -> None:
 
 
 @contextmanager
-def _without_log() -> Iterator[None]:
+def without_log() -> Iterator[None]:
     """Log nothing: thousands of upgrades fail as they should."""
     before = logging.root.manager.disable
     logging.disable()

@@ -186,3 +186,31 @@ def test_parts_of_the_sweep_are_listed_and_run(capsys: pytest.CaptureFixture[str
     assert "limits: 5 of 5 cases" in capsys.readouterr().out
     assert main(["simulate", "sweep", "nonsense"]) == ExitCode.USAGE
     assert "The sweep has no part nonsense." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        ("simulate --runs 5 sweep limits", "--runs"),
+        ("--json simulate --runs 5 sweep --list", "--runs"),
+        ("conformance --quick init", "--quick"),
+    ],
+)
+def test_an_option_before_an_action_is_refused(
+    capsys: pytest.CaptureFixture[str], line: str, option: str
+) -> None:
+    assert main(line.split()) == ExitCode.USAGE
+    captured = capsys.readouterr()
+    assert f"{option} before the action " in captured.out + captured.err
+
+
+def test_an_option_of_the_output_stands_before_an_action(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["simulate", "--json", "sweep", "--list"]) == ExitCode.OK
+    assert capsys.readouterr().out.startswith("{")
+
+
+def test_a_sweep_logs_no_upgrade(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "sweep", "limits", "--every", "100", "-vv"]) == ExitCode.OK
+    assert "host:" not in capsys.readouterr().err

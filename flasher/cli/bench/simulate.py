@@ -40,6 +40,7 @@ from flasher.simulate.campaign import (
     corpus_batch,
     run_batch,
     share,
+    without_log,
 )
 from flasher.simulate.ledger import Ledger
 from flasher.simulate.ledger import merge as merge_ledgers
@@ -498,6 +499,7 @@ class Sweep:
     "--every", type=values.count, default="1", metavar="N", brief=True,
     help="run every Nth case only",
 )  # fmt: skip
+@without_log()
 def sweep(output: Output, *, names: tuple[str, ...], is_list: bool, every: int) -> int:
     """Try every single fault, pair of faults, power cut and time limit in an upgrade of 4 packets,
     and all small errors against the CRC: all parts, or those that are named.
