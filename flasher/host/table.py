@@ -207,8 +207,8 @@ TABLE: Final[Mapping[UpgradeState, _Row]] = {
         ),
         _E.REQUEST: _do("send_first_packet", _S.TRANSFERRING),
         _E.REQUEST_MISSING: _do(
-            "miss_request", _S.RESETTING, _S.AWAITING_BOOT,
-            _X.NO_REQUEST, _X.NO_BOOT_VERSION, _X.PACKET_FAILED,
+            "miss_request", _S.AWAITING_REQUEST, _S.RESETTING, _S.AWAITING_BOOT,
+            _X.NO_REQUEST, _X.NO_BOOT_VERSION, _X.PACKET_FAILED, _X.UNHEARING,
         ),
         _E.LINK_BACK: _do("await_request_or_begin_again", _S.AWAITING_REQUEST, _S.RESETTING),
     },

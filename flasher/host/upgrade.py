@@ -111,6 +111,8 @@ class _Attempt:
     watched_since: float = 0.0
     watched_until: float = 0.0
     first_update_left_at: float | None = None
+    announced_meanwhile: BootVersion | None = None
+    """Boot version that came while the update command was leaving."""
     request_at: float = 0.0
 
     packet: int = 0
@@ -418,6 +420,7 @@ class UpgradeStage:
     def _send_update(self) -> None:
         size_bytes = self._plan.image.size_bytes
         self.in_session, self._asks_for_power = False, self._options.at_power_up
+        self._at.announced_meanwhile = None
         self._send(UpdateCommand(self._plan.target.update_text, size_bytes))
 
     def _send_packet(self) -> None:
@@ -467,6 +470,8 @@ class UpgradeStage:
             case Command.PACKET, UpgradeState.SETTLING:
                 return timings.quiet_after_repeat_s
             case Command.UPDATE, UpgradeState.AWAITING_REQUEST:
+                if self._at.announced_meanwhile is not None:
+                    return timings.update_spacing_s
                 return timings.request_transfer_timeout_s
             case Command.END_OF_TRANSFER, UpgradeState.ENDING if self._at.announced_at is None:
                 return timings.complete_timeout_s
@@ -688,15 +693,21 @@ class UpgradeStage:
 
     def _answer_boot_again(self, boot: BootVersion) -> None:
         """Handle a boot version between update command and request transfer (R2)."""
-        now, timings, at = self._run.now, self._timings, self._at
-        first_at = at.first_update_left_at
+        now, timings = self._run.now, self._timings
         if self._is_foreign(boot):
             self._end(Ending.WRONG_DEVICE, boot)
         elif self.unchecked is not None:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
-        elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
+        elif not self._tx.idle:
+            self._at.announced_meanwhile = boot
+        elif now - self._update_left_at < timings.update_spacing_s:
             pass  # too early for an answer to the update command
-        elif first_at is not None and now - first_at > timings.request_transfer_timeout_s:
+        else:
+            self._send_update_again(boot)
+
+    def _send_update_again(self, boot: BootVersion) -> None:
+        first_at, limit_s = self._at.first_update_left_at, self._timings.request_transfer_timeout_s
+        if first_at is not None and self._run.now - first_at > limit_s:
             self._miss_hearing(boot)
         else:
             self._note_boot(boot)
@@ -710,7 +721,11 @@ class UpgradeStage:
             self._end(Ending.UNHEARING, boot)
 
     def _miss_request(self, row: ReceivedContent) -> None:
-        if not self._has_begun and self._asks_for_power:
+        announced = self._at.announced_meanwhile
+        if announced is not None:
+            # It may be the last one of a device that listens after its announcement only.
+            self._send_update_again(announced)
+        elif not self._has_begun and self._asks_for_power:
             self._attempts += 1
             self._next_attempt(Reason.REQUEST_GIVEN_UP)
             self._await_boot(row)

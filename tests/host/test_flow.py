@@ -186,6 +186,43 @@ def test_a_boot_version_within_30_ms_of_the_update_command_is_not_answered(
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == commands
 
 
+def _announced_while_the_command_leaves() -> Bench:
+    bench = Bench(options=UpgradeOptions(frame_gap_s=0.08, attempts=1))
+    bench.to_boot()
+    bench.say(BOOT)
+    bench.wait(0.1)
+    assert not bench.unread
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    return bench
+
+
+def test_a_boot_version_that_comes_while_the_update_command_leaves_is_answered() -> None:
+    """It may be the last one of a device that listens after its announcement only (R2)."""
+    bench = _announced_while_the_command_leaves()
+    left_at = bench.sent[-1][0]
+    bench.expect(UpdateCommand)
+    assert left_at + 0.03 <= bench.sent[-1][0] <= left_at + 0.03 + 2 * 0.08 + 0.01
+    bench.wait(5.0)
+    assert not bench.unread
+
+
+def test_no_further_update_command_follows_a_request_that_came_in_time() -> None:
+    bench = _announced_while_the_command_leaves()
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
+def test_a_device_that_announces_into_each_update_command_does_not_hear() -> None:
+    bench = _announced_while_the_command_leaves()
+    first_at = bench.now
+    while not bench.engine.done:
+        bench.wait(0.11)
+        bench.say(BOOT)
+    assert bench.outcome.ending is Ending.UNHEARING
+    assert bench.now - first_at < 11.0
+
+
 def test_the_update_command_is_never_repeated_into_silence() -> None:
     """The device may be erasing: UP-07."""
     bench = Bench(options=UpgradeOptions(attempts=1))
