@@ -18,6 +18,10 @@ from flasher.conformance.restore import BY_NOTHING, restore
 from flasher.conformance.results import ExploreResult
 from flasher.conformance.wire import Encoder, joined
 from flasher.errors import UsageError
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.spec import TARGETS, WELLING
+from tests.campaigns.right_devices import answers_late
 from tests.cli.conftest import Flasher
 
 
@@ -247,3 +251,13 @@ def test_a_repeated_packet_is_judged_by_the_profile_as_in_the_case(
         assert (found is None) is (choice in (answers, "either"))
         silent = MockSubject(profile=device, make_device=variant_maker("repeat-unanswered"))
         assert Explorer(silent, stated).replay(steps).finding is not None
+
+
+def test_feedback_to_an_update_command_may_come_after_the_reset_that_follows() -> None:
+    late = answers_late(GeneralFeedbackMessage=0.9)
+
+    def make(target: str, profile: DeviceProfile) -> MockDevice:
+        return late(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+
+    explorer = Explorer(MockSubject(make_device=make), profile_of_mock())
+    assert explorer.replay(["update=good", "burst"]).finding is None
