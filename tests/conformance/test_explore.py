@@ -21,7 +21,7 @@ from flasher.errors import UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import TARGETS, WELLING
-from tests.campaigns.right_devices import answers_late
+from tests.campaigns.right_devices import CountsFromPackets, answers_late
 from tests.cli.conftest import Flasher
 
 
@@ -253,11 +253,24 @@ def test_a_repeated_packet_is_judged_by_the_profile_as_in_the_case(
         assert Explorer(silent, stated).replay(steps).finding is not None
 
 
-def test_feedback_to_an_update_command_may_come_after_the_reset_that_follows() -> None:
-    late = answers_late(GeneralFeedbackMessage=0.9)
+def _walked(kind: type[MockDevice], steps: list[str], **choices: Any) -> ExploreResult:
+    device = replace(MOCK_PROFILE, **choices)
 
     def make(target: str, profile: DeviceProfile) -> MockDevice:
-        return late(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+        return kind(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
-    explorer = Explorer(MockSubject(make_device=make), profile_of_mock())
-    assert explorer.replay(["update=good", "burst"]).finding is None
+    stated = profile_of_mock(device)
+    stated = replace(stated, given={**stated.given, "limits.pause_s": device.transfer_timeout_s})
+    return Explorer(MockSubject(profile=device, make_device=make), stated).replay(steps)
+
+
+def test_feedback_to_an_update_command_may_come_after_the_reset_that_follows() -> None:
+    late = answers_late(GeneralFeedbackMessage=0.9)
+    assert _walked(late, ["update=good", "burst"]).finding is None
+
+
+def test_a_pause_may_count_from_the_last_packet_that_was_stored_and_end_within_a_step() -> None:
+    kind = type("Hasty", (CountsFromPackets, answers_late(Ack=0.488)), {})
+    steps = ["reset", "update=128", "packets=4", "packet-again=other", "packet-mode", "flood"]
+    choices = {"repeated_packet": "nak_next", "bad_packet": "silence", "transfer_timeout_s": 2.5}
+    assert _walked(kind, steps, **choices).finding is None

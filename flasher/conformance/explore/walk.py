@@ -44,6 +44,8 @@ from flasher.conformance.wire import (
 _GAP_S: Final = 0.02
 _BUS_OFF_S: Final = 0.02
 _UPDATES_MAX: Final = 8
+_MAYBE_PAUSE: Final = 0.8
+"""A device may end a transfer after this share of limits.pause_s."""
 
 
 class DevicePhase(Enum):
@@ -120,8 +122,8 @@ class Walk:
         self._version_at = -inf
         self._announced = 0
         """Boot versions of the burst so far."""
-        self._answered_at = bench.now
-        """Time of the last message that required an answer; a pause counts from there."""
+        self._stored_at = bench.now
+        """Time of the last request transfer or stored packet, from which a pause may count."""
 
     def take(self, name: str, argument: str = "") -> None:
         """Take a step of `STEPS`, or send an invalid message. Raises Violation and errors of the
@@ -168,8 +170,9 @@ class Walk:
                 self._await_start()
             elif self.has_application is None:
                 self.phase, self._may_restart = DevicePhase.UNCLEAR, True
-        pause_s = bench.now - self._answered_at
-        left_s = min(0.8 * bench.limit("pause_s"), bench.limit("pause_s") - bench.waits.settle_s)
+        pause_s = bench.now - self._stored_at
+        limit_s = bench.limit("pause_s")
+        left_s = min(_MAYBE_PAUSE * limit_s, limit_s - bench.waits.settle_s)
         may_end = bench.choice("tx_12") != "waits" and pause_s > left_s
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
@@ -205,7 +208,6 @@ class Walk:
         if reply is None:
             named = kind.value if number is None else f"{kind.value} {number}"
             raise Violation(f"no {kind.value}", f"no {named} within {within_s:g} s after {after}")
-        self._answered_at = self.bench.now
 
     def _listen_for_answers(self) -> None:
         """Listen for as long as an answer or the rest of a partial message may take."""
@@ -261,7 +263,13 @@ class Walk:
         is_leftover = reply.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
+        # The pause of a device may have ended within this step.
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
+        is_expected = is_expected or (
+            self.phase in _IN_TRANSFER
+            and self.bench.choice("tx_12") != "waits"
+            and reply.at - self._stored_at > _MAYBE_PAUSE * self.bench.limit("pause_s")
+        )
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
             raise Violation("restart", f"{reply} without reset, pause or power cycle, phase: "
                             f"{self.phase.value}")  # fmt: skip
@@ -281,12 +289,13 @@ class Walk:
         self.has_application = {"erased": False, "kept": True}.get(self.bench.choice("rs_03_old"))
         self.update_accepted = True
         self._stored = 0
-        self._requested_at = self._answered_at = at
+        self._requested_at = self._stored_at = at
         self._acks_due.clear()
         self._may_restart = self._may_complete = False
 
     def _store(self) -> None:
         self._stored += 1
+        self._stored_at = self.bench.now
         if self.phase is not DevicePhase.UNCLEAR:
             is_last = self._stored == packet_count(len(self._image))
             self.phase = DevicePhase.STORED if is_last else DevicePhase.TRANSFER
