@@ -35,6 +35,11 @@ LEFTOVER_S: Final = 0.06
 _PACKET_ANSWERS: Final = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION, Reply.COMPLETE)
 
 
+def is_leftover(one: Received, requested_at: float) -> bool:
+    """True for a boot version that was sent before request transfer (R11)."""
+    return one.kind is Reply.BOOT_VERSION and one.at < requested_at + LEFTOVER_S
+
+
 class UpgradeResult(NamedTuple):
     """Result of an upgrade; `reason` is "" on success."""
 
@@ -224,9 +229,8 @@ class PatientHost:
         """
 
         def is_stale(one: Received) -> bool:
-            if one.kind is Reply.BOOT_VERSION:
-                return one.at < began_at + LEFTOVER_S
-            return one.kind is Reply.ACK and one.number != number
+            is_other = one.kind is Reply.ACK and one.number != number
+            return is_other or is_leftover(one, began_at)
 
         last, tries, requests = "no answer", 0, 0
         unanswered = 0

@@ -125,6 +125,12 @@ def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() ->
 
 
 @pytest.mark.slow
+@each("case_id", ("BU-01", "BU-02"))
+def test_request_transfer_may_come_while_a_reset_that_restarts_is_being_sent(case_id: str) -> None:
+    assert faults_of(2017, Selection(cases=(case_id,)), at_limits=True) == []
+
+
+@pytest.mark.slow
 @each("case_id", ("CR-01", "CR-03"))
 def test_waits_for_late_answers_to_damage_add_up_to_no_pause(case_id: str) -> None:
     """Two of them take longer than the pause, one does not."""

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
+from flasher.conformance.patient_host import is_leftover
 from flasher.conformance.tester import FaultKind, LineFault, Sent
 from flasher.conformance.wire import (
     ACK,
@@ -229,6 +230,12 @@ def _enter(bench: Bench, image: bytes, left: _PendingFaults) -> None:
             within_s = limit("feedback_s") if disturbance.name else limit("first_version_s")
             with disturbance.send(bench, bench.encoder.reset()):
                 reply = bench.wait_for(Reply.BOOT_VERSION, Reply.REQUEST, within_s=within_s)
+            if reply is not None and reply.kind is Reply.REQUEST:
+                # It may have come while the reset was being sent, which may restart the device.
+                restart_s = {"ignored": 0.0, "restarts": limit("first_version_s")}.get(
+                    bench.choice("tx_13"), bench.waits.silence_in_transfer_s
+                )
+                reply = bench.wait_for(Reply.BOOT_VERSION, within_s=restart_s) or reply
         else:
             within_s = bench.waits.burst_s if disturbance.name else limit("erase_s")
             with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
@@ -254,13 +261,16 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     when the device announced a restart: the upgrade starts over (R11).
     """
     total, began_at = packet_count(len(image)), bench.now
+    kinds = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
     for number in range(1, total + 1):
         disturbance = _next(left, "packet")
         with bench.step(f"packet {number}, {disturbance.name}" if disturbance.name else "packets"):
             with disturbance.send(bench, bench.encoder.packet_of(image, number)):
-                reply = bench.wait_for(Reply.ACK, Reply.NAK)
+                reply = bench.wait_for(*kinds, unlike=lambda one: is_leftover(one, began_at))
             last = ""
-            if reply is None or reply.kind is not Reply.ACK or reply.number != number:
+            if reply is not None and reply.kind is Reply.BOOT_VERSION:
+                last = str(reply)  # request transfer came while a reset was being sent
+            elif reply is None or reply.kind is not Reply.ACK or reply.number != number:
                 last = bench.host.deliver_packet(image, number, began_at)
             if last.startswith(Reply.BOOT_VERSION.value):
                 bench.info(f"the device restarts: {disturbance.name}")
