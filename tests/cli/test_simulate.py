@@ -214,3 +214,11 @@ def test_an_option_of_the_output_stands_before_an_action(
 def test_a_sweep_logs_no_upgrade(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "sweep", "limits", "--every", "100", "-vv"]) == ExitCode.OK
     assert "host:" not in capsys.readouterr().err
+
+
+def test_a_replay_of_a_bootloader_names_it_as_far_as_it_is_known() -> None:
+    assert command.replay_line("job ; subject", "./boot").endswith(
+        "replay --subject ./boot 'job ; subject'"
+    )
+    assert "--subject BOOTLOADER" in command.replay_line("job ; subject")
+    assert "--subject" not in command.replay_line("job ; mock")

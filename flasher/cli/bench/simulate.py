@@ -386,8 +386,9 @@ def _in_order(tallies: Mapping[str, Tally]) -> Sequence[tuple[str, Tally]]:
 
 
 def replay_line(plan: str, subject: str = "") -> str:
-    """Return the command that plays a plan again."""
-    device = ["--subject", subject] if subject else []
+    """Return the command that plays a plan again. Ledgers do not name the bootloader under test."""
+    is_subject = any(isinstance(each, Subject) for each in Plan.parse(plan).devices)
+    device = ["--subject", subject or "BOOTLOADER"] if is_subject else []
     return shlex.join(["flasher", "simulate", "replay", *device, plan])
 
 
