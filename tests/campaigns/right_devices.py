@@ -192,6 +192,10 @@ class AnswersLate(MockDevice):
         self._held.clear()
         return super()._restart(now)
 
+    def _boot(self, now: float) -> str:
+        self._held.clear()
+        return super()._boot(now)
+
     def _switch_off(self, now: float) -> str:
         self._held.clear()
         return super()._switch_off(now)
