@@ -49,6 +49,9 @@ class Guard:
 
     def __init__(self, target: Target, timings: Timings) -> None:
         self._own_id = target.request_id
+        in_first_frame = FRAME_DATA_SIZE - PREFIX_SIZE - COMMAND_SIZE
+        self._update_rest = target.update_text.encode("ascii")[in_first_frame:]
+        """Beginning of the second frame of an update command, which has the size."""
         battery_id = can_id(Node.BMS, None)
         self._battery = Reassembler(battery_id, timings.inter_frame_timeout_s)
         self._gap_s = timings.inter_frame_timeout_s
@@ -83,7 +86,9 @@ class Guard:
             if now - self._rest_at > self._gap_s:
                 self._rest_frames = 0
             self._rest_frames, self._rest_at = self._rest_frames + 1, now
-            return ForeignFrame(description, is_harmless=self._rest_frames <= _QUERY_REST_FRAMES)
+            is_query = not data.startswith(self._update_rest)
+            is_query = is_query and self._rest_frames <= _QUERY_REST_FRAMES
+            return ForeignFrame(description, is_harmless=is_query)
         self._rest_frames = 0
         if data[len(HEADER)] != Mode.READ:
             return ForeignFrame(description, is_harmless=False)

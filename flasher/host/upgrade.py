@@ -73,6 +73,9 @@ _PHASES: Final = {
 """Phase that each state reports; other states keep the phase."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
 """Reasons for an attempt that begins with the update command, not with a reset."""
+_OWN_INTERVAL: Final = 0.75
+"""A boot version this share of the documented interval after the one that was answered did not wait
+with it."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
 _DEVICE_LEFT: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
@@ -111,8 +114,9 @@ class _Attempt:
     watched_since: float = 0.0
     watched_until: float = 0.0
     first_update_left_at: float | None = None
+    update_began_at: float = inf
     announced_meanwhile: BootVersion | None = None
-    """Boot version that came while the update command was leaving."""
+    """Boot version that came too early for another update command, and after the last one began."""
     request_at: float = 0.0
 
     packet: int = 0
@@ -420,7 +424,7 @@ class UpgradeStage:
     def _send_update(self) -> None:
         size_bytes = self._plan.image.size_bytes
         self.in_session, self._asks_for_power = False, self._options.at_power_up
-        self._at.announced_meanwhile = None
+        self._at.update_began_at, self._at.announced_meanwhile = self._run.now, None
         self._send(UpdateCommand(self._plan.target.update_text, size_bytes))
 
     def _send_packet(self) -> None:
@@ -693,15 +697,18 @@ class UpgradeStage:
 
     def _answer_boot_again(self, boot: BootVersion) -> None:
         """Handle a boot version between update command and request transfer (R2)."""
-        now, timings = self._run.now, self._timings
+        now, timings, at = self._run.now, self._timings, self._at
+        next_at = self._update_left_at + timings.update_spacing_s
         if self._is_foreign(boot):
             self._end(Ending.WRONG_DEVICE, boot)
         elif self.unchecked is not None:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
-        elif not self._tx.idle:
-            self._at.announced_meanwhile = boot
-        elif now - self._update_left_at < timings.update_spacing_s:
-            pass  # too early for an answer to the update command
+        elif not self._tx.idle or now < next_at:
+            # Not one that queued up, if the last command took long to leave.
+            if now - at.update_began_at >= _OWN_INTERVAL * timings.boot_version_spacing_s:
+                at.announced_meanwhile = boot
+                if self._tx.idle:
+                    self._timer_at = next_at
         else:
             self._send_update_again(boot)
 

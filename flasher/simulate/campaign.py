@@ -28,9 +28,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from flasher.errors import UsageError
-from flasher.files import parse_toml
 from flasher.protocol.text import printable
 from flasher.simulate import plan as plans
+from flasher.simulate.corpus import corpus
 from flasher.simulate.draw import drawn
 from flasher.simulate.planting import swapped, upgrade_bugs
 from flasher.simulate.play import Verdict, play
@@ -64,7 +64,6 @@ SUBJECT_CANARY: Final = CANARIES[1]
 _SUBJECT: Final = "-"
 """Between the hash of the code and that of the bootloader under test, in `Result.campaign`."""
 NO_FAULT: Final = "none"
-_CORPUS: Final = Path(__file__).with_name("corpus.toml")
 _TIMES_PER_OCTAVE: Final = 4
 """Classes of times: each 2^(1/4) times as long as the one before."""
 
@@ -248,13 +247,6 @@ def _code_key() -> str:
         digest.update(f"{file.relative_to(package).as_posix()}\0".encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
-
-
-@cache
-def corpus() -> Mapping[str, plans.Plan]:
-    """Return the plans of the corpus, each by a place that it reaches."""
-    table = parse_toml(_CORPUS.read_bytes())["plans"]
-    return {place: plans.Plan.parse(line) for place, line in table.items()}
 
 
 def corpus_batch() -> Batch:

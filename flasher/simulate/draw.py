@@ -10,10 +10,13 @@ from typing import Final
 
 from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
 from flasher.simulate import plan as plans
+from flasher.simulate.corpus import parents
 from flasher.simulate.plan import Plan, When
 
 TWIN_SHARE: Final = 0.1
 """Share of the plans with two devices; their images are long, and take half of the time."""
+_MUTANT_EVERY: Final = 8
+"""One in so many seeds changes a plan that is kept, instead of drawing one."""
 _LONG_PACKETS: Final = 1000
 """Largest image for a bootloader under test."""
 _TOOL_DOES: Final = (
@@ -25,7 +28,8 @@ _HOW_MANY: Final = (0, 1, 1, 1, 2, 2, 2, 3, 3, 4, 6)
 
 def drawn(seed: int, twin_share: float = TWIN_SHARE) -> Plan:
     """The plan of a seed, which has two devices in it in a share of the seeds."""
-    return _Draw(seed, twin_share).plan()
+    draw = _Draw(seed, twin_share)
+    return draw.plan() if seed % _MUTANT_EVERY else draw.mutant()
 
 
 def drawn_for_subject(
@@ -123,6 +127,35 @@ class _Draw:
         if self._is(0.5):
             clauses.append(self._adapter())
         return Plan((*clauses, *devices, *events))
+
+    def mutant(self) -> Plan:
+        """A plan that is kept, with one to three changes."""
+        draw = self._random
+        one, other = draw.sample(parents(), 2)
+        job, adapter, devices = one.job, one.adapter, [*one.devices]
+        self._target, self._packets = job.target, job.packets
+        self._is_independent = isinstance(devices[0], plans.Independent)
+        events = [each for each in one.events if not isinstance(each, plans.Device)]
+        others = [each for each in other.events if not isinstance(each, plans.Device)]
+        for _ in range(draw.choice((1, 1, 2, 3))):
+            way, index = draw.random(), draw.randrange(len(events) + 1)
+            if index < len(events) and way < 0.3:
+                moved = When(draw.choice(("reset", "update", "end")), 0, self._between(1e-4, 1.0))
+                events[index] = replace(events[index], when=draw.choice((self._when(), moved)))
+            elif index < len(events) and way < 0.45:
+                events.pop(index)
+            elif others and way < 0.65:
+                events.append(draw.choice(others))
+            elif way < 0.75:
+                choices = self._independent() if self._is_independent else self._mock()
+                devices[0] = replace(devices[0], choices=choices)
+            elif way < 0.85:
+                adapter = self._adapter()
+            else:
+                events.append(self._event())
+        is_shared = any(isinstance(each, plans.Tool | plans.Load) for each in events)
+        job = replace(job, image=self._seed % 1000, others=job.others or is_shared)
+        return Plan((job, adapter, *devices, *events))
 
     def _adapter(self) -> plans.Adapter:
         return plans.Adapter(

@@ -14,7 +14,8 @@ from flasher.cli.bench import simulate as command
 from flasher.cli.main import main
 from flasher.errors import ExitCode
 from flasher.simulate import campaign, planting
-from flasher.simulate.campaign import Batch, Result, campaign_key, corpus, corpus_batch
+from flasher.simulate.campaign import Batch, Result, campaign_key, corpus_batch
+from flasher.simulate.corpus import corpus
 from flasher.simulate.planting import swapped, upgrade_bugs
 from flasher.simulate.reached import reachable
 from tests.loops import each

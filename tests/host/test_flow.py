@@ -186,6 +186,21 @@ def test_a_boot_version_within_30_ms_of_the_update_command_is_not_answered(
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == commands
 
 
+@each("gap_s, after_s", [(0.01, 0.029), (0.02, 0.001), (0.02, 0.029)])
+def test_the_next_boot_version_is_answered_later_where_the_command_took_long_to_leave(
+    gap_s: float, after_s: float
+) -> None:
+    bench = Bench(options=UpgradeOptions(frame_gap_s=gap_s, attempts=1))
+    bench.to_request()
+    left_at = bench.sent[-1][0]
+    bench.wait(left_at + after_s - bench.now)
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    assert left_at + 0.03 <= bench.sent[-1][0] <= left_at + 0.03 + 2 * gap_s + 0.01
+    bench.wait(5.0)
+    assert not bench.unread
+
+
 def _announced_while_the_command_leaves() -> Bench:
     bench = Bench(options=UpgradeOptions(frame_gap_s=0.08, attempts=1))
     bench.to_boot()

@@ -6,7 +6,8 @@ from flasher import events
 from flasher.bus.echoes import Echoes
 from flasher.host.guard import ForeignFrame, Guard
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import BMS, OBC, Target
+from flasher.protocol.messages import UpdateCommand
+from flasher.protocol.spec import BMS, OBC, TARGETS, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode, split
 from tests.loops import each
@@ -90,6 +91,23 @@ def test_a_frame_that_begins_no_message_is_not_judged_by_itself(frame: Frame) ->
     assert found is not None
     assert found.is_harmless
     assert found.query is None
+
+
+@each("target", TARGETS.values())
+def test_an_update_command_of_another_size_is_no_echo_of_the_own_one(target: Target) -> None:
+    """Its first frame is equal, and two frames may be the rest of a query."""
+
+    def update(size_bytes: int) -> list[Frame]:
+        row = UpdateCommand(target.update_text, size_bytes)
+        return split(target.request_id, encode(row.to_message(target.request_id)))
+
+    made = guard(target)
+    for frame in update(0x12345):
+        made.link.sent(frame)
+    found = [made.see(frame, 1.0) for frame in update(0x12344)]
+    assert found[0] is None
+    assert found[1] is not None
+    assert not found[1].is_harmless
 
 
 def test_an_adapter_without_echoes_hides_no_second_tool() -> None:

@@ -10,6 +10,7 @@ import pytest
 from flasher.host.duplicates import DuplicateDetector
 from flasher.host.outcome import Outcome
 from flasher.simulate import plan as plans
+from flasher.simulate.corpus import parents
 from flasher.simulate.draw import drawn
 from flasher.simulate.independent import frames_of
 from flasher.simulate.plan import Plan
@@ -41,6 +42,13 @@ def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
         assert Plan.parse(str(plan)) == plan
         assert Plan.parse("\n".join(map(str, plan.clauses))) == plan
         assert drawn(seed) == plan
+
+
+def test_every_eighth_seed_changes_a_plan_that_is_kept() -> None:
+    kept = [{*map(str, parent.events)} for parent in parents()]
+    for seed in range(0, 800, 8):
+        events = {*map(str, drawn(seed).events)}
+        assert any(len(each - events) <= 3 and len(events - each) <= 3 for each in kept)
 
 
 @each("line", ["@99999999999999999 drop", "@0.0000000001 drop", "@packet3+1e20 drop"])

@@ -12,10 +12,10 @@ from flasher.simulate.campaign import (
     Batch,
     Result,
     campaign_key,
-    corpus,
     corpus_batch,
     run_batch,
 )
+from flasher.simulate.corpus import corpus
 from flasher.simulate.ledger import Ledger
 from flasher.simulate.plan import Plan
 from flasher.simulate.play import play
