@@ -185,7 +185,9 @@ class Walk:
             bench.application_version(start_s)
             bench.forget()
         else:
-            self._listen(self._version_at + start_s - bench.now)
+            # A reset at the end of the window may have restarted the application meanwhile.
+            while (left_s := self._version_at + start_s - bench.now) > 0:
+                self._listen(left_s)
         if self.phase is DevicePhase.ANNOUNCING:
             self.phase = DevicePhase.APPLICATION
 
