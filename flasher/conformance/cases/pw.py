@@ -446,6 +446,8 @@ def _cut_start(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         _cut_after(bench, upgrade, more, _SHARES[1], times=_CUTS_IN_A_ROW)
         more += 1
     if upgrade.operations < _OPERATIONS_MAX and more < _OPERATIONS_MAX:
+        if upgrade.old != bench.good_image:  # else a device with two banks may go back to it
+            bench.check_upgrade()
         _cut_rare_operations(bench, bench.good_image, upgrade.operations, more)
 
 
