@@ -737,7 +737,9 @@ class Walk:
             self._await_version()
         refused = make_stimulus(name, self._place)
         self._feedback_due += refused.is_intact_write
-        self._naks_due, self._nak_numbers = 1 if name in UPDATES else 2, None
+        # In the short window nobody waits for the answers to the ones before.
+        earlier = self._naks_due if self.phase is DevicePhase.ANNOUNCING else 0
+        self._naks_due, self._nak_numbers = earlier + (1 if name in UPDATES else 2), None
         if name == "reset-nodes":  # each of them is answered by general feedback
             own = self.bench.encoder.to_all
             self._nodes_asked = frozenset(own | frame.can_id >> 4 & 0xF for frame in refused.frames)
