@@ -738,7 +738,8 @@ class Walk:
         refused = make_stimulus(name, self._place)
         self._feedback_due += refused.is_intact_write
         # In the short window nobody waits for the answers to the ones before.
-        earlier = self._naks_due if self.phase is DevicePhase.ANNOUNCING else 0
+        is_window = self.phase in (DevicePhase.ANNOUNCING, DevicePhase.UNCLEAR)
+        earlier = self._naks_due if is_window else 0
         self._naks_due, self._nak_numbers = earlier + (1 if name in UPDATES else 2), None
         if name == "reset-nodes":  # each of them is answered by general feedback
             own = self.bench.encoder.to_all
