@@ -237,7 +237,7 @@ class RunsEachMillisecond(PythonBootloader):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "cases", [("RS-01", "RS-05", "UP-04"), ("EN-01", "TX-12"), ("BU-02", "PW-02")]
+    "cases", [("RS-01", "RS-05", "UP-04"), ("EN-02", "TX-12"), ("BU-02", "PW-02")]
 )
 def test_idle_passes_in_its_own_process_change_nothing(
     cases: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
@@ -292,7 +292,7 @@ def test_frames_in_the_controller_are_sent_while_the_processor_waits_for_the_fla
 
 @pytest.mark.slow
 def test_time_passes_for_one_that_polls_the_clock() -> None:
-    assert _run(_FLAWS + "WaitsForTheClock", "EN-01").ok
+    assert _run(_FLAWS + "WaitsForTheClock", "EN-02").ok
 
 
 @pytest.mark.slow
@@ -425,7 +425,7 @@ def test_nobody_is_sent_to_look_for_wires_of_a_bootloader_on_the_computer(flaw: 
 
 @pytest.mark.slow
 def test_signals_to_the_group_of_processes_are_for_the_suite() -> None:
-    assert _run(_FLAWS + "EndsItsGroup", "EN-01").ok
+    assert _run(_FLAWS + "EndsItsGroup", "EN-02").ok
 
 
 def _children() -> set[str]:
