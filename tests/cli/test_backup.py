@@ -172,6 +172,7 @@ def test_a_battery_that_is_not_there_leaves_no_file(
     assert 0x4308 not in {command for command, _ in battery.received}
 
 
+@pytest.mark.slow
 def test_the_device_model_knows_its_own_area(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

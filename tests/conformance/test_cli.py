@@ -62,6 +62,7 @@ def test_a_failure_has_one_line_with_expected_got_and_a_command_that_repeats_it(
     assert "RS-04" not in again.out
 
 
+@pytest.mark.slow
 def test_the_replay_has_what_is_about_the_bench_and_nothing_about_the_run(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

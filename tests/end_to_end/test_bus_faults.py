@@ -89,6 +89,7 @@ def test_one_disturbed_frame_anywhere_never_ends_in_a_wrong_image(
     judge(upgrade(device, image=IMAGE, disturbance=at(index, fate)), device)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("index", range(TOTAL - 1))
 def test_two_swapped_frames_anywhere_never_end_in_a_wrong_image(index: int) -> None:

@@ -84,6 +84,7 @@ def test_the_frames_are_those_of_an_upgrade() -> None:
     assert len(carried) == len(FRAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("index", FRAMES)
 def test_one_late_frame_anywhere_never_ends_in_a_wrong_image(index: int) -> None:
@@ -100,6 +101,7 @@ def test_one_late_frame_anywhere_never_ends_in_a_wrong_image(index: int) -> None
     judge(upgrade(device, image=IMAGE, disturbance=hold, others=(sender,)), device)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("index", FRAMES)
 def test_a_device_that_goes_bus_off_at_any_frame_is_upgraded_or_the_end_is_explicit(
@@ -116,6 +118,7 @@ def test_a_device_that_goes_bus_off_at_any_frame_is_upgraded_or_the_end_is_expli
     judge(upgrade(device, image=IMAGE, disturbance=go_off), device)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("index", FRAMES)
 def test_somebody_who_speaks_with_the_devices_id_is_overcome_or_the_end_is_explicit(

@@ -37,6 +37,7 @@ COMPLETE = bytes.fromhex("55AA0C04C5020000")
 # -- the device's power ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("number", SAMPLE)
 def test_a_device_that_lost_power_at_any_packet_is_rescued(number: int) -> None:

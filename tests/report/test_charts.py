@@ -89,6 +89,7 @@ def test_missing_packet_numbers_keep_the_labels_true() -> None:
         assert place[f"packet {tick.value}: 1 ms"] == pytest.approx(tick.at, abs=0.11)
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.one_of(st.none(), st.floats(1e-6, 20)), min_size=1, max_size=900),
     st.sampled_from(sorted(WIDTHS.values())),

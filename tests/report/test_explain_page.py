@@ -25,6 +25,7 @@ EVERY_KIND = {
 }
 
 
+@pytest.mark.slow
 @each("name", EVERY_KIND)
 def test_every_page_is_well_formed_and_complete_in_itself(name: str) -> None:
     page = Page(render(EVERY_KIND[name]))

@@ -228,6 +228,7 @@ def code_of(bench: Bench, run_id: int = 2) -> str:
     return "\n".join(code_lines(details, bench.store.read.record_sha256(RunId(run_id)), head))
 
 
+@pytest.mark.slow
 def test_the_text_of_the_qr_code_is_checked(plant: Bench) -> None:
     code = code_of(plant)
     assert checked(plant, code).problems == ()

@@ -282,6 +282,7 @@ def test_who_guesses_at_a_page_does_not_stop_that_person_at_a_scanner(
     assert line.last(ScanAccepted).text == "REASON y"
 
 
+@pytest.mark.slow
 def test_a_pin_is_checked_beside_the_line_and_what_follows_waits(
     line: LineBench, bench: Bench
 ) -> None:

@@ -535,6 +535,7 @@ def _lost(*_: object, **__: object) -> None:
     raise BusError("The adapter is gone.")
 
 
+@pytest.mark.slow
 def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
     state = place.do(
         order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.find_areas

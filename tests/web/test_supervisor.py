@@ -513,6 +513,7 @@ def test_every_event_of_the_trail_can_be_chosen(overview: Overview) -> None:
 # -- what must not do harm -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_hostile_texts_stay_texts(bench: Bench) -> None:
     lot = HOSTILE[:100]
     claim = bench.claim(lot=lot)
@@ -546,6 +547,7 @@ def test_empty_records_have_pages_too(bench: Bench, path: str) -> None:
     assert client_of(app_of(bench.path, bench.keys)).get(path).status_code == 200
 
 
+@pytest.mark.slow
 def test_pages_change_nothing_and_wait_for_nobody(bench: Bench) -> None:
     bench.make()
     client = client_of(app_of(bench.path, bench.keys))

@@ -37,6 +37,7 @@ def changed(bench: Bench, statement: str) -> None:
         connection.exec_driver_sql(statement)
 
 
+@pytest.mark.slow
 def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) -> None:
     examined.make(RunState.FAIL, "W2605004")
     running = examined.claim("W2605005").run_id

@@ -268,6 +268,7 @@ def test_an_older_copy_is_told(bench: Bench) -> None:
     assert "an older copy" in problem.what
 
 
+@pytest.mark.slow
 def test_a_pass_with_the_trace_of_something_else_is_told(bench: Bench) -> None:
     """Written through the station's own operations, with its key: only the trace tells."""
     folder = bench.folder
