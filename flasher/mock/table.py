@@ -68,11 +68,6 @@ class BootloaderEvent(Enum):
 
 
 _S, _E = BootloaderState, BootloaderEvent
-MESSAGE_EVENTS: Final = frozenset(BootloaderEvent) - {
-    _E.RESTART_DUE, _E.ANNOUNCEMENT_DUE, _E.WINDOW_OVER, _E.FLASH_DONE, _E.PAUSE_OVER,
-    _E.HOLD_OVER, _E.START_DUE, _E.START_BY_RESTART_DUE, _E.POWER_CUT, _E.POWER_ON,
-}  # fmt: skip
-"""Events that are caused by messages."""
 
 
 class BootloaderTransition(NamedTuple):
@@ -89,10 +84,12 @@ _POWERED: Final[_Row] = {
     _E.POWER_CUT: BootloaderTransition("switch_off", _S.OFF),
     _E.POWER_ON: IGNORED,
 }
-_HEARING: Final[_Row] = _POWERED | {
-    event: IGNORED for event in BootloaderEvent if event in MESSAGE_EVENTS
+_HEARING: Final[_Row] = _POWERED | dict.fromkeys((_E.RESET, _E.QUERY, _E.NO_CONCERN), IGNORED)
+_IN_SESSION: Final[_Row] = _HEARING | {
+    _E.RESET_IGNORED: IGNORED,
+    _E.UPDATE_REFUSED: BootloaderTransition("refuse_update"),
 }
-_IN_BOOTLOADER: Final[_Row] = _HEARING | {_E.UPDATE_REFUSED: BootloaderTransition("refuse_update")}
+_IN_BOOTLOADER: Final[_Row] = _IN_SESSION | {_E.OUT_OF_TURN: IGNORED}
 _RESTARTED: Final = BootloaderTransition("restart", _S.RESTARTING)
 _ERASED: Final = BootloaderTransition("erase", _S.ERASING)
 _BOOTED: Final = BootloaderTransition("boot", _S.ANNOUNCING)
@@ -118,9 +115,10 @@ TABLE: Final[Mapping[BootloaderState, _Row]] = {
     _S.ERASING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
+        _E.UPDATE_AGAIN: IGNORED,
         _E.FLASH_DONE: BootloaderTransition("request", _S.TRANSFER),
     },
-    _S.TRANSFER: _IN_BOOTLOADER | {
+    _S.TRANSFER: _IN_SESSION | {
         _E.RESET: _RESTARTED,
         _E.UPDATE: _ERASED,
         _E.UPDATE_AGAIN: BootloaderTransition("request"),
@@ -140,6 +138,7 @@ TABLE: Final[Mapping[BootloaderState, _Row]] = {
     },
     _S.CHECKING: _IN_BOOTLOADER | {
         _E.RESET: _RESTARTED,
+        _E.END_AGAIN: IGNORED,
         _E.FLASH_DONE: BootloaderTransition("complete", _S.STARTING),
     },
     # On its way to the application: an update command would erase what was just completed.

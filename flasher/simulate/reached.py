@@ -24,26 +24,6 @@ from flasher.simulate.oracle import DOCUMENTED
 PHASES: Final = ("idle", "reset", "update", "packet", "end")
 """Last message that the host has begun when a fault happens."""
 _LASTING: Final = (plans.Job, plans.Adapter, plans.Independent, plans.Mock, plans.Subject)
-_S, _E = BootloaderState, BootloaderEvent
-_IN_BOOTLOADER: Final = frozenset(_S) - {_S.OFF, _S.RESTARTING, _S.APPLICATION}
-_HAPPENS_IN: Final[Mapping[BootloaderEvent, frozenset[BootloaderState]]] = {
-    _E.UPGRADE_IN_APPLICATION: frozenset({_S.APPLICATION}),
-    _E.RESET_IGNORED: _IN_BOOTLOADER,
-    _E.UPDATE: _IN_BOOTLOADER - {_S.CHECKING, _S.STARTING},
-    _E.UPDATE_AGAIN: frozenset({_S.ERASING, _S.TRANSFER}),
-    _E.UPDATE_REFUSED: _IN_BOOTLOADER,
-    **dict.fromkeys(
-        (
-            _E.PACKET_NEXT, _E.PACKET_REPEATED, _E.PACKET_OLDER, _E.PACKET_BAD,
-            _E.END_WHOLE, _E.END_WRONG, _E.END_EARLY,
-        ),
-        frozenset({_S.TRANSFER}),
-    ),
-    _E.END_AGAIN: frozenset({_S.CHECKING, _S.STARTING, _S.REFUSED}),
-    _E.OUT_OF_TURN: _IN_BOOTLOADER - {_S.TRANSFER},
-    _E.POWER_ON: frozenset({_S.OFF}),
-}  # fmt: skip
-"""States in which an event of the device model can happen, where they are not all of its rows."""
 _READINGS: Final[Mapping[str, tuple[str, ...]]] = {
     "R2": ("host: awaiting request transfer, boot version",),
     "R4": ("host: transferring, ACK", "host: transferring, NAK"),
@@ -100,14 +80,11 @@ DEVICE_PLACES: Final = "device: "
 READINGS: Final = "reading: "
 UNREACHABLE: Final[Mapping[str, str]] = {
     **{
-        f"device: {state.value}, {event.value}": (
+        f"device: {state.value}, {BootloaderEvent.POWER_ON.value}": (
             "a supply that is on is not switched on again"
-            if event is _E.POWER_ON
-            else "in this state the model takes the message for another event"
         )
-        for state, row in DEVICE_TABLE.items()
-        for event in row
-        if state not in _HAPPENS_IN.get(event, DEVICE_TABLE)
+        for state in BootloaderState
+        if state is not BootloaderState.OFF
     },
     "host: yielding to another tool, what one device does not send": (
         "the host does not judge answers that are for another tool"
