@@ -165,15 +165,10 @@ class Bench:
         self.measure(TimeName.FIRST, found.at - sent.left_at)
         return found
 
-    def wait_until_listening(self) -> None:
-        """After the first boot version, wait until the device accepts an update command: at once,
-        or after the burst (up_04_burst).
-        """
-        if self.choice("up_04_burst") != "accepted":
-            self.wait_for_window()
-
     def wait_for_window(self) -> None:
-        """After the first boot version, wait for the middle of the window after the burst."""
+        """After the first boot version, wait for the middle of the window after the burst: there
+        each device accepts an update command, and answers it by no further boot version (figure 2).
+        """
         gaps = self.number("versions") - 1
         spacing_s = self.limit("version_spacing_s") + self.limit("version_spacing_tolerance_s")
         last_at = self.now + gaps * spacing_s

@@ -6,6 +6,7 @@ covers; cases and `init` take their waits from here or from the profile, never a
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 from flasher.conformance.wire import PACKET_FRAMES, packet_count
@@ -49,12 +50,12 @@ class Waits:
         """Longest time from a restart, through the bootloader, to an application that answers."""
         return self._limit("first_version_s") + self.burst_s + self._limit("start_s")
 
-    @property
+    @cached_property  # it is asked for each frame
     def stall_s(self) -> float:
         """Shortest pause of this program that can make a device miss a message, or look late."""
         limit = self._limit
         windows_s = (limit("window_s") / 2, limit("version_spacing_tolerance_s"))
-        return max(min(limit("inter_frame_s"), *windows_s), _STALL_LEAST_S)
+        return float(max(min(limit("inter_frame_s"), *windows_s), _STALL_LEAST_S))
 
     @property
     def next_version_s(self) -> float:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import Final
 
 from flasher.conformance.catalogue import Selection
@@ -20,21 +21,30 @@ from flasher.conformance.init import NOT_ASKED, ask_device
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import FINAL_IMAGE_OK, InitResult
 from flasher.conformance.runner import run
+from tests.campaigns.right_c_devices import RightCDevice, right_c_device
 from tests.campaigns.right_devices import HELD, RightDevice, right_device
 
+_STRAINED: Final = partial(right_device, at_limits=True)
 AREA_BYTES: Final = 34 * 1024
 """More than 255 packets, and soon sent."""
 
 
-def faults(seed: int, selection: Selection = Selection()) -> list[str]:  # noqa: B008  frozen
+def faults(
+    seed: int,
+    selection: Selection = Selection(),  # noqa: B008  frozen
+    *,
+    make: Callable[[int], RightDevice | RightCDevice] = _STRAINED,
+) -> list[str]:
     """What is wrong with the profile that this device's answers give, by these cases."""
-    device = right_device(seed, at_limits=True)
-    asked = ask_device(device.subject(), ConformanceProfile())
+    device = make(seed)
+    with device.subject() as subject:
+        asked = ask_device(subject, ConformanceProfile())
     if asked.stopped:
         return [asked.stopped]
     found = list(_wrong_answers(device, asked))
     profile = asked.profile(ConformanceProfile())
-    report = run(device.subject(), profile, selection=selection)
+    with device.subject() as subject:
+        report = run(subject, profile, selection=selection)
     found += [
         f"{result.case_id} {result.verdict.text}: {result.reason}"
         for result in report.results
@@ -45,7 +55,7 @@ def faults(seed: int, selection: Selection = Selection()) -> list[str]:  # noqa:
     return found
 
 
-def _wrong_answers(device: RightDevice, asked: InitResult) -> Iterator[str]:
+def _wrong_answers(device: RightDevice | RightCDevice, asked: InitResult) -> Iterator[str]:
     """Answers that are not the device's, and keys that stay open without need."""
     own = device.profiles["fitting"]
     can_leave = own.choice("tx_12") == "announces" or own.choice("tx_13") == "restarts"
@@ -71,14 +81,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
+    parser.add_argument("--c", action="store_true", help="bootloaders in C, not the device model")
     given = parser.parse_args()
     seeds = range(given.seed, given.seed + given.count)
     wrong = 0
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for seed, found in zip(seeds, pool.map(faults, seeds), strict=True):
+    judge = partial(faults, make=right_c_device) if given.c else faults
+    with ProcessPoolExecutor(given.jobs) as pool:
+        for seed, found in zip(seeds, pool.map(judge, seeds), strict=True):
             wrong += bool(found)
             for one in found:
                 sys.stdout.write(f"{seed}: {one}\n")
+            sys.stdout.write(f"up to seed {seed}: {wrong} wrong\n")
+            sys.stdout.flush()
     sys.stdout.write(f"{given.count} devices, {wrong} with a profile that does not fit\n")
     return 1 if wrong else 0
 

@@ -16,8 +16,9 @@ import random
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -39,6 +40,7 @@ from flasher.protocol.spec import TARGETS, WELLING, Command, Mode
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Reassembler
 from tests.campaigns.dual_bank import CopiesImage, SwapsBanks
+from tests.campaigns.right_c_devices import RightCDevice, right_c_device
 
 HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
@@ -323,13 +325,14 @@ class RightDevice(NamedTuple):
             timings=dataclasses.replace(DEFAULT_TIMINGS, **self.timings),  # type: ignore[arg-type]
         )
 
-    def subject(self) -> MockSubject:
+    @contextmanager
+    def subject(self) -> Iterator[MockSubject]:
         """It on its bench."""
         made = MockSubject(self.target, profile=self.choices, make_device=self.make)
         if self.is_bare:
             for ability in ("has_power", "has_readback", "has_bus_off", "has_timed_cuts"):
                 setattr(made, ability, False)
-        return made
+        yield made
 
     def __str__(self) -> str:
         mro = self.device_type.__mro__
@@ -483,17 +486,18 @@ def faults_of(
     seed: int,
     selection: Selection = Selection(),  # noqa: B008  frozen
     *,
-    at_limits: bool = False,
+    make: Callable[[int], RightDevice | RightCDevice] = right_device,
     steps: int = 0,
 ) -> list[str]:
     """What the suite, and `steps` of random walks, find wrong with the device of that seed. It is
     right, so anything found is a fault of the suite.
     """
-    device = right_device(seed, at_limits=at_limits)
+    device = make(seed)
     found: list[str] = []
     for name, profile in device.profiles.items():
-        subject = device.subject()
-        report = run(subject, profile, selection=selection)
+        with device.subject() as subject:
+            report = run(subject, profile, selection=selection)
+            explored = Explorer(subject, profile, seed=str(seed)).explore(steps) if steps else None
         found += [
             f"{seed} {name} {result.case_id} {result.verdict.value}: {result.reason}"
             for result in report.results
@@ -501,7 +505,6 @@ def faults_of(
         ]
         if report.final_image != "verified":
             found.append(f"{seed} {name}: the good image at the end: {report.final_image}")
-        explored = Explorer(subject, profile, seed=str(seed)).explore(steps) if steps else None
         if explored is not None and (explored.finding or explored.stopped):
             finding = explored.finding
             text = f"{finding.text} ({' '.join(finding.steps)})" if finding else explored.stopped
@@ -515,27 +518,26 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=500, help="how many devices (500)")
     parser.add_argument("--seed", type=int, default=1, help="number of the first one (1)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
+    parser.add_argument("--c", action="store_true", help="bootloaders in C, not the device model")
     parser.add_argument("--plain", action="store_true", help="no times at their limits")
     parser.add_argument("--steps", type=int, default=0, help="steps of random walks (0)")
     parser.add_argument("--cases", default="", help="only these cases, separated by commas")
     options = parser.parse_args(words)
     cases = tuple(filter(None, options.cases.split(",")))
-    judge = partial(
-        faults_of,
-        selection=Selection(cases=cases),
-        at_limits=not options.plain,
-        steps=options.steps,
-    )
+    make: Callable[[int], RightDevice | RightCDevice] = right_c_device
+    if not options.c:
+        make = partial(right_device, at_limits=not options.plain)
+    judge = partial(faults_of, selection=Selection(cases=cases), make=make, steps=options.steps)
     began, bad = time.perf_counter(), 0
     seeds = range(options.seed, options.seed + options.count)
     with ProcessPoolExecutor(options.jobs) as pool:
         for seed, faults in zip(seeds, pool.map(judge, seeds), strict=True):
             bad += bool(faults)
             if faults:
-                sys.stdout.write(
-                    "\n".join([*faults, f"  {right_device(seed, at_limits=not options.plain)}", ""])
-                )
-                sys.stdout.flush()
+                sys.stdout.write("\n".join([*faults, f"  {make(seed)}", ""]))
+            took_s = time.perf_counter() - began
+            sys.stdout.write(f"up to seed {seed}: {bad} failed, {took_s:.0f} s\n")
+            sys.stdout.flush()
     took_s = time.perf_counter() - began
     sys.stdout.write(
         f"{options.count} right devices, each by two profiles: {bad} failed, {took_s:.0f} s\n"

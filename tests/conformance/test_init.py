@@ -330,7 +330,8 @@ def test_the_longest_gap_in_a_packet_is_found() -> None:
 def test_a_device_may_take_longer_for_an_answer_than_a_pause_lasts(
     seed: int, wanted: dict[str, Any]
 ) -> None:
-    found = values(ask_device(right_device(seed, at_limits=True).subject(), ConformanceProfile()))
+    with right_device(seed, at_limits=True).subject() as unit:
+        found = values(ask_device(unit, ConformanceProfile()))
     assert {key: found[key] for key in wanted} == wanted
 
 

@@ -7,6 +7,7 @@ limit.
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import pytest
@@ -121,7 +122,9 @@ def test_silence_in_a_transfer_is_no_pause(case_id: str) -> None:
 
 
 def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() -> None:
-    assert faults_of(21, Selection(cases=("UP-05",)), at_limits=True) == []
+    assert (
+        faults_of(21, Selection(cases=("UP-05",)), make=partial(right_device, at_limits=True)) == []
+    )
 
 
 @pytest.mark.slow
@@ -240,8 +243,9 @@ def test_a_flaw_is_found_in_a_device_that_listens_only_after_its_announcements(
 
 @each("case_id", ("UP-02", "UP-06"))
 def test_a_case_without_a_stimulus_that_was_heard_does_not_pass(case_id: str) -> None:
-    stated: dict[str, Value] = {"up_04_burst": "accepted", "up_02": "silence"}
-    (found,) = blamed(case_id, kind=ListensAfterBurst, given=stated)
+    # Its application runs in what the profile takes for the middle of its window.
+    stated: dict[str, Value] = {"limits.window_s": 0.9, "up_02": "silence"}
+    (found,) = blamed(case_id, given=stated)
     assert found.startswith(f"{case_id} inconclusive")
     assert "were heard" in found
 

@@ -110,7 +110,7 @@ def load(bench: Bench) -> None:
             bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
         bench.send(_under_load(bench.encoder.reset()))
         _expect_under_load(bench, Reply.BOOT_VERSION)
-        bench.wait_until_listening()
+        bench.wait_for_window()
     with bench.step("update command under load"):
         bench.send(_under_load(bench.encoder.update(len(image))))
         _expect_under_load(bench, Reply.REQUEST)
@@ -150,7 +150,7 @@ def two_upgrades(bench: Bench) -> None:
     for other in bench.encoder.others():
         with bench.step(f"beside the {other.target.upper()}"):
             bench.reset_to_bootloader()
-            bench.wait_until_listening()
+            bench.wait_for_window()
             _send_interleaved(bench, bench.encoder.update(len(image)), other.update(len(image)))
             bench.expect(Reply.REQUEST, ignoring=(Reply.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))

@@ -283,7 +283,7 @@ class _WrittenMessages:
         text = reply.data[3:] if reply is not None else b""
         version = build(encoder.to_tool, REPORT, BOOT_VERSION, encoder.boot_name.encode() + text)
         self._judge("boot version", version, reply)
-        bench.wait_until_listening()
+        bench.wait_for_window()
         for _ in range(UPDATES_MAX):
             sent = bench.send(update)
             for _ in range(UPDATES_MAX):

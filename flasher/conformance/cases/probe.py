@@ -110,7 +110,7 @@ class Probe(PacketTransfer):
         bench = self.bench
         if reset:
             bench.reset_to_bootloader()
-            bench.wait_until_listening()
+            bench.wait_for_window()
         sent = bench.send(frames)
         reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
         taken = reply is not None and reply.kind is Reply.REQUEST
@@ -131,12 +131,13 @@ class Probe(PacketTransfer):
         continues to announce itself, and then accepts the update command.
         """
         bench = self.bench
+        is_burst = bench.number("versions") > 1 and bench.choice("up_04_burst") == "accepted"
         bench.reset_to_bootloader()
-        bench.wait_until_listening()
+        if not is_burst:
+            bench.wait_for_window()
         for frames in stimuli:
             bench.send(frames)
             bench.judge.note_stimulus()
-        is_burst = bench.number("versions") > 1 and bench.choice("up_04_burst") == "accepted"
         if is_burst:
             expected = "boot version, at most NAK before it"
             found = bench.wait_for(*Reply, within_s=bench.waits.next_version_s, unlike=_is_nak)

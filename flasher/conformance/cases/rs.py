@@ -84,13 +84,15 @@ def reset_again(bench: Bench) -> None:
         bench.check_application()
     with bench.step("reset after the second boot version"):
         bench.reset_to_bootloader()
-        bench.next_version()
+        left = max(count - 2, 0)  # the burst may have just one
+        if count > 1:
+            bench.next_version()
         bench.send(bench.encoder.reset())
         if bench.choice("rs_02") == "either":
             # One boot version may be under way when the reset arrives.
-            _check_count(bench, count - 2, "the burst continues or restarts", count, count + 1)
+            _check_count(bench, left, "the burst continues or restarts", count, count + 1)
         elif bench.choice("rs_02") == "ignored":
-            _check_count(bench, count - 2, "the burst continues")
+            _check_count(bench, left, "the burst continues")
         else:
             bench.expect(Reply.BOOT_VERSION)
             # One boot version may be under way when the reset arrives.

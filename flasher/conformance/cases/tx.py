@@ -85,7 +85,7 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     or request transfer follows.
     """
     bench.reset_to_bootloader()
-    bench.wait_until_listening()
+    bench.wait_for_window()
     bench.send(frames)
     replies = bench.collect(bench.waits.burst_s + bench.limit("inter_frame_s"))
     bench.judge.note_stimulus(heard=any(one.kind is Reply.NAK for one in replies))
@@ -558,17 +558,18 @@ def _restart_s(bench: Bench) -> float:
     return min(within_s, max(_JUST_NOT * pause_s - bench.limit("ack_s"), pause_s / 2))
 
 
-def _restarts_later(bench: Bench, image: bytes, stored: int) -> Received | None:
+def _restarts_later(
+    bench: Bench, image: bytes, stored: int, early: Received | None = None
+) -> Received | None:
     """Send what is next, to learn whether the device ignored a reset or is still restarting.
-    Returns its boot version, or None when it answers.
+    Returns its boot version, or None when it answers; `early` when it does neither.
     """
     total, within_s = packet_count(len(image)), bench.limit("first_version_s")
     number = min(stored + 1, total)  # a repetition when all are stored
     bench.send_packet(image, number)
     kinds = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
-    reply = bench.require_received(
-        bench.wait_for(*kinds, within_s=within_s), "an answer, or boot version", within_s
-    )
+    reply = bench.wait_for(*kinds, within_s=within_s) or early
+    reply = bench.require_received(reply, "an answer, or boot version", within_s)
     return reply if reply.kind is Reply.BOOT_VERSION else None
 
 
@@ -578,7 +579,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
     """
     image = bench.good_image
     bench.reset_to_bootloader()
-    bench.wait_until_listening()
+    bench.wait_for_window()
     bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
     # Boot versions sent before the update command arrived do not count (R11).
     bench.wait(UPDATE_SPACING_S)
@@ -586,18 +587,22 @@ def _reset_while_it_erases(bench: Bench) -> None:
     reply = bench.wait_for(Reply.REQUEST, Reply.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(reply, "request transfer, or boot version", within_s)
     restarts: Received | None = found
+    early: Received | None = None
     is_begun = False
     if found.kind is Reply.REQUEST and bench.choice("tx_13") != "ignored":
-        # The device may process the reset after the erase; earlier boot versions do not count.
-        restarts = bench.wait_for(
-            Reply.BOOT_VERSION,
-            within_s=_restart_s(bench),
-            unlike=lambda one: one.at < found.at + LEFTOVER_S,
-        )
-        if restarts is None and bench.limit("first_version_s") > _restart_s(bench):
-            restarts = _restarts_later(bench, image, 0)
+        # The device may process the reset after the erase. What it announces at first may be from
+        # before the update command (R11), or a whole burst of a few.
+        early = bench.wait_for(Reply.BOOT_VERSION, within_s=LEFTOVER_S)
+        restarts = early if bench.choice("tx_13") == "restarts" else None
+        within_s = _restart_s(bench)
+        restarts = restarts or bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+        if restarts is None and (early or bench.limit("first_version_s") > within_s):
+            restarts = _restarts_later(bench, image, 0, early)
             is_begun = restarts is None
-    if restarts is not None and restarts.kind is Reply.BOOT_VERSION:
+    if restarts is not None and restarts is early:
+        bench.update_again(len(image))
+    elif restarts is not None and restarts.kind is Reply.BOOT_VERSION:
+        bench.wait_for_window()
         bench.update(len(image))
     bench.finish(image, 2 if is_begun else 1)
 

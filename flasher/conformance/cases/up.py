@@ -25,8 +25,8 @@ from flasher.conformance.wire import (
 )
 
 _SIZES: Final = (1, 127, 128, 129, 78351)
-_SENT_WHOLE_PACKETS: Final = 2
-"""Images of up to this many packets are sent in full, to check the expected number of packets."""
+_SENT_PACKETS: Final = 2
+"""Packets of an image that are sent at most, to check the expected number of packets."""
 _SIZE_BITS: Final = (16, 24, 31)
 """A device that stores the size in fewer bits would take it for a small image."""
 _UPDATE_HEAD: Final = joined(Encoder("bms").update(0))[:6]
@@ -56,8 +56,9 @@ def sizes(bench: Bench) -> None:
                 bench.restart_transfer(size)
             else:
                 bench.update(size)
-            if packet_count(size) <= _SENT_WHOLE_PACKETS:
-                bench.packets(bench.random.randbytes(size))
+            # With a packet stored, an update command starts over or is rejected (UP-08); before
+            # that it may also be ignored (R25).
+            bench.packets(bench.random.randbytes(size), 1, min(packet_count(size), _SENT_PACKETS))
     bench.restart_transfer(len(bench.good_image))
     bench.finish(bench.good_image)
 
@@ -355,7 +356,7 @@ def check_updates_rejected(bench: Bench, stimuli: Mapping[str, list[RawFrame]]) 
         _check_update_rejected(bench, step, frames, choice)
     with bench.step("a valid update command at the same moment"):
         bench.reset_to_bootloader()
-        bench.wait_until_listening()
+        bench.wait_for_window()
         bench.send(bench.encoder.update(len(bench.good_image)))
         listens = bench.wait_for(Reply.REQUEST) is not None
         bench.judge.note_listening(listens=listens)
@@ -366,7 +367,7 @@ def check_updates_rejected(bench: Bench, stimuli: Mapping[str, list[RawFrame]]) 
 def _check_update_rejected(bench: Bench, step: str, frames: list[RawFrame], choice: str) -> None:
     with bench.step(step):
         bench.reset_to_bootloader()
-        bench.wait_until_listening()
+        bench.wait_for_window()
         bench.send(frames)
         replies = bench.collect(bench.waits.burst_s + bench.waits.silence_s)
         answers = [one for one in replies if not _is_version(one)]

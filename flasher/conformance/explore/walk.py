@@ -43,6 +43,8 @@ from flasher.conformance.wire import (
 
 _GAP_S: Final = 0.02
 _BUS_OFF_S: Final = 0.02
+_FORM_NAKS: Final = 4
+"""NAKs to a packet that is not sent in its plain form, at most."""
 _UPDATES_MAX: Final = 8
 _MAYBE_PAUSE: Final = 0.8
 """A device may end a transfer after this share of limits.pause_s."""
@@ -408,8 +410,10 @@ class Walk:
 
     # -- update command ----------------------------------------------------------------------------
 
-    def _await_version(self) -> None:
-        """While the device announces itself, wait until it accepts an update command."""
+    def _await_version(self, *, is_last: bool = False) -> None:
+        """While the device announces itself, wait until it accepts an update command; with
+        `is_last` until its burst is over.
+        """
         if self.phase is not DevicePhase.ANNOUNCING:
             return
         bench = self.bench
@@ -417,7 +421,7 @@ class Walk:
         if self.has_application is False:  # it may restart just now
             within_s = bench.limit("first_version_s")
         reply = self._listen(within_s, _is_version)
-        if bench.choice("up_04_burst") != "accepted":
+        if is_last or bench.choice("up_04_burst") != "accepted":
             while reply is not None and self._announced < bench.number("versions"):
                 reply = self._listen(within_s, _is_version)
         if reply is None and self.has_application:  # its window is over, or nearly
@@ -443,11 +447,13 @@ class Walk:
         if is_same or self.phase is DevicePhase.UNCLEAR:
             self._updates_unanswered += 1
             self._naks_due, self._nak_numbers = 1, None
+            self._may_restart = True  # to a device that ignores it this is a long pause
             bench.send(frames)
             self._listen(bench.limit("erase_s"), lambda one: one.kind is Reply.REQUEST)
             return
         for _ in range(_UPDATES_MAX):
             self._updates_unanswered += 1
+            is_burst_over = self._announced >= bench.number("versions")
             sent = bench.send(frames)
             reply = self._listen(
                 bench.limit("erase_s"),
@@ -456,7 +462,8 @@ class Walk:
             if reply is None or reply.kind is Reply.REQUEST:
                 break
             is_late = reply.at > sent.left_at + LEFTOVER_S
-            if is_late and bench.choice("up_04_burst") == "accepted":
+            # In the burst: a device may process what it received after it (figure 2).
+            if is_late and is_burst_over and bench.choice("up_04_burst") == "accepted":
                 break
             self._feedback_due += 1
         if self.phase is not DevicePhase.BEGUN:
@@ -471,6 +478,8 @@ class Walk:
         self, frames: list[RawFrame], image: bytes, outcome: EndOutcome
     ) -> None:
         bench, choice = self.bench, self.bench.choice("up_08")
+        if self.phase is DevicePhase.BEGUN:  # before packet 1 any answer is right (R25)
+            choice = "either"
         self._naks_due, self._nak_numbers = 1, None
         if choice == "rejected":
             bench.send(frames)
@@ -515,7 +524,7 @@ class Walk:
         if is_end and self._expected_end is not EndOutcome.RUNS:
             return
         if not is_end:
-            self._await_version()
+            self._await_version(is_last=True)  # a boot version shall mean that it was cut
             if self.phase is not DevicePhase.ANNOUNCING:
                 return
         before = None if self.has_application is False else self.running_image
@@ -588,14 +597,18 @@ class Walk:
         largest_bytes = bench.number("largest_image_bytes")
         return TransferPosition(bench.encoder, self._image, self.wanted, largest_bytes)
 
-    def _packet(self, _: str, frames: Sequence[RawFrame] = (), gap_s: float = 0.0) -> None:
-        """Send the next packet, in these frames; outside a transfer it has to be rejected."""
+    def _packet(
+        self, _: str, frames: Sequence[RawFrame] = (), gap_s: float = 0.0, naks: int = 0
+    ) -> None:
+        """Send the next packet, in these frames, which may be answered by so many NAKs too; outside
+        a transfer it has to be rejected.
+        """
         bench, number = self.bench, self.wanted
         self._feedback_due += 1
         is_next = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER)
         if is_next or self.phase is DevicePhase.UNCLEAR:
             self._acks_due[number] += 1
-        self._naks_due, self._nak_numbers = int(not is_next), None
+        self._naks_due, self._nak_numbers = max(naks, int(not is_next)), None
         bench.send(frames or self.bench.encoder.frames(self._place.packet(number)), gap_s=gap_s)
         if is_next:
             self._await(Reply.ACK, bench.limit("ack_s"), f"packet {number}", number)
@@ -646,7 +659,7 @@ class Walk:
         """Send the next packet with empty frames in between."""
         empty = RawFrame(self.bench.encoder.to_device, b"")
         frames = self.bench.encoder.frames(self._place.next_packet)
-        self._packet("", [each for frame in frames for each in (frame, empty)])
+        self._packet_in_form("fr_01", [each for frame in frames for each in (frame, empty)])
 
     def _packet_slow(self, _: str) -> None:
         gap_s = min(_GAP_S, self.bench.limit("inter_frame_s") / 3)
@@ -662,15 +675,21 @@ class Walk:
         bench, (key, _, index) = self.bench, argument.partition("-")
         form = forms(bench.encoder)[key][int(index)]
         raw = form.before + self._place.next_packet
-        frames = bench.encoder.frames(raw, form.frame_bytes)
+        self._packet_in_form(key, bench.encoder.frames(raw, form.frame_bytes))
+
+    def _packet_in_form(self, key: str, frames: Sequence[RawFrame]) -> None:
+        """Send the next packet in these frames, which is accepted or not as the choice `key`
+        says.
+        """
+        bench = self.bench
         taken, not_taken = choice_words(key)
         if not bench.profile.allows(key, not_taken):
-            self._packet("", frames)
+            self._packet("", frames, naks=_FORM_NAKS)  # what precedes it may be a damaged message
             return
         is_next = self.phase in (DevicePhase.BEGUN, DevicePhase.TRANSFER, DevicePhase.UNCLEAR)
         if is_next and bench.profile.allows(key, taken):
             self._acks_due[self.wanted] += 1
-        self._naks_due, self._nak_numbers = 4, None
+        self._naks_due, self._nak_numbers = _FORM_NAKS, None
         self._feedback_due += 1
         bench.send(frames)
         self._listen_for_answers()
@@ -696,6 +715,7 @@ class Walk:
             was_in_transfer = self.phase in _IN_TRANSFER
             if self.phase is DevicePhase.UNCLEAR and self._stored == self.total:
                 return  # perhaps it is complete
+            self._may_restart = was_in_transfer  # the upgrade has failed (figure 2)
             bench.send(bench.encoder.end())
             self._listen_for_answers()
             if was_in_transfer and self.phase in _IN_TRANSFER:
@@ -752,6 +772,7 @@ class Walk:
                 named = int.from_bytes(joined(refused.frames)[7:9], "little")
                 self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
         self.bench.send(refused.frames)
+        self._apply_elapsed_time()  # a flood takes a second
         self._listen_for_answers()
 
 

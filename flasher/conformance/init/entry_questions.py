@@ -268,7 +268,7 @@ def rejected_update(session: InitSession) -> Findings:
     for stimulus, frames in stimuli.items():
         for _ in range(REPEATS):
             session.enter()
-            bench.wait_until_listening()
+            bench.wait_for_window()
             bench.send(frames)
             replies = bench.collect(bench.waits.burst_s + bench.waits.silence_s)
             answers = [one for one in replies if one.kind is not Reply.BOOT_VERSION]
@@ -410,7 +410,7 @@ def largest_image(session: InitSession) -> Findings:
     def is_taken(size_bytes: int) -> bool:
         nonlocal in_transfer
         if keeps_old and not in_transfer:
-            bench.wait_until_listening()
+            bench.wait_for_window()
         share = packet_count(size_bytes) / session.total
         within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
         reply = _answer_to_size(session, bench.encoder.update(size_bytes), within_s)

@@ -173,7 +173,7 @@ def splits(session: InitSession) -> Findings:
     bench = session.bench
     for _ in range(REPEATS):
         session.enter()
-        bench.wait_until_listening()
+        bench.wait_for_window()
         update = joined(bench.encoder.update(len(session.image)))
         taken = session.offer_update(bench.encoder.frames(update, 5))
         yield _accepted_trial(taken, "update command in frames of 5 bytes")
@@ -211,7 +211,7 @@ def padded(session: InitSession) -> Findings:
     bench = session.bench
     for byte in PADDINGS:
         session.enter()
-        bench.wait_until_listening()
+        bench.wait_for_window()
         taken = session.offer_update(
             padded_to_frame(bench.encoder.update(len(session.image)), byte)
         )
