@@ -1,0 +1,74 @@
+"""Bootloaders in C that are right, each with its own choices, pass. `python -m
+tests.campaigns.right_devices --c` runs the whole suite on hundreds of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import pytest
+
+from flasher.conformance.catalogue import Selection
+from flasher.conformance.explore import Explorer
+from tests.campaigns.right_c_devices import right_c_device
+from tests.campaigns.right_devices import faults_of
+from tests.loops import each
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler"),
+]
+
+
+@each("seed", (1, 4))
+def test_the_quick_suite_passes(seed: int) -> None:
+    assert faults_of(seed, Selection(quick=True), make=right_c_device) == []
+
+
+def test_a_seed_makes_the_same_device_again() -> None:
+    assert str(right_c_device(5)) == str(right_c_device(5)) != str(right_c_device(6))
+
+
+@each(
+    "seed, case_id",
+    (
+        (1, "FR-01"),  # an update command in the burst is processed after it
+        (6, "FR-07"),
+        (9, "PW-01"),
+        (3, "RS-02"),  # a burst of one
+        (3, "TX-13"),  # whose restart is over when request transfer may have left versions behind
+        (8, "TX-01"),
+        (4, "TX-13"),  # deaf in a burst of two
+        (9, "EN-07"),  # a bootloader that starts its application confirms a reset
+        (10, "UP-01"),  # an update command before packet 1 is ignored
+        (2, "FR-09"),  # an empty frame splits a message
+    ),
+)
+def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
+    assert faults_of(seed, Selection(cases=(case_id,)), make=right_c_device) == []
+
+
+def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> None:
+    device = right_c_device(9)
+    times = {"NAK_US": 356_220, "REFUSED_US": 0, "FIRST_US": 0, "SPACING_US": 50_000}
+    times |= {"WINDOW_US": 200_000, "START_US": 795_000}
+    device = dataclasses.replace(device, choices={**device.choices, **times})
+    assert faults_of(9, Selection(cases=("EN-02",)), make=lambda _: device) == []
+
+
+@each(
+    "seed, profile, steps",
+    (
+        (1, "fitting", "reset update=128 update=good"),  # ignored until the transfer is given up
+        (2, "fitting", "reset update=384 packet-between"),
+        (2, "fitting", "reset update=good packet-open=fr_04-1"),  # NAK to the damaged query
+        (9, "fitting", "power update=300 end"),
+        (9, "fitting", "reset cut=1 update=384 packet"),
+    ),
+)
+def test_a_walk_finds_nothing(seed: int, profile: str, steps: str) -> None:
+    device = right_c_device(seed)
+    with device.subject() as subject:
+        result = Explorer(subject, device.profiles[profile], seed="1").replay(steps.split())
+    assert result.finding is None
