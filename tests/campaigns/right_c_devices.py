@@ -84,6 +84,10 @@ def right_c_device(seed: int) -> RightCDevice:
     choices |= _flash(chance)
     choices |= _behaviour(chance, has_version_query=target == "bms")
     choices |= _times(chance, choices)
+    if choices["ACKS_FIRST"]:
+        # It hears what follows its ACK only when it has written, and here no filter of its
+        # controller keeps the frames of other nodes away.
+        choices["RECEIVE_FRAMES"] = 4096
     can_leave = choices["PAUSE_US"] or choices["RESET_RESTARTS_TRANSFER"]
     is_bare = chance.random() < 0.3 and bool(can_leave or choices["UPDATE_RESTARTS"])
     version = f"V{chance.randrange(10)}.{chance.randrange(10)}.{chance.randrange(10)}"
@@ -113,7 +117,6 @@ def _flash(chance: random.Random) -> dict[str, int]:
         "WRITE_BYTES": write,
         "APPLICATION_BYTES": area,
         "LARGEST_BYTES": chance.choice((area, area, chance.randint(2 * area // 3, area))),
-        # It may write while the suite sends more than a packet.
         "RECEIVE_FRAMES": chance.choice((64, 64, 256)),
         "BANKS": banks,
         "RECORD_FIRST": chance.randrange(2),

@@ -599,11 +599,9 @@ def _reset_while_it_erases(bench: Bench) -> None:
         if restarts is None and (early or bench.limit("first_version_s") > within_s):
             restarts = _restarts_later(bench, image, 0, early)
             is_begun = restarts is None
-    if restarts is not None and restarts is early:
+    if restarts is not None and restarts.kind is Reply.BOOT_VERSION:
+        bench.collect(bench.waits.burst_s)  # what is left of a burst it may not listen in
         bench.update_again(len(image))
-    elif restarts is not None and restarts.kind is Reply.BOOT_VERSION:
-        bench.wait_for_window()
-        bench.update(len(image))
     bench.finish(image, 2 if is_begun else 1)
 
 
