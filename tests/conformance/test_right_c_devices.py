@@ -65,6 +65,7 @@ def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> Non
         (2, "fitting", "reset update=good packet-open=fr_04-1"),  # NAK to the damaged query
         (9, "fitting", "power update=300 end"),
         (9, "fitting", "reset cut=1 update=384 packet"),
+        (18, "fitting", "reset update-reset update=384 packets=all"),
     ),
 )
 def test_a_walk_finds_nothing(seed: int, profile: str, steps: str) -> None:

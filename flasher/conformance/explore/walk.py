@@ -498,7 +498,7 @@ class Walk:
     def _update_reset(self, _: str) -> None:
         """Send an update command directly followed by a reset, which arrives during the erase."""
         bench = self.bench
-        self._await_version()
+        self._await_version(is_last=True)  # one that it takes only then is not sent another size
         if self.phase is not DevicePhase.ANNOUNCING:
             self._reset("")
             return
