@@ -22,9 +22,8 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import FINAL_IMAGE_OK, InitResult
 from flasher.conformance.runner import run
 from tests.campaigns.right_c_devices import RightCDevice, right_c_device
-from tests.campaigns.right_devices import HELD, RightDevice, right_device
+from tests.campaigns.right_devices import HELD, RightDevice, strained_device
 
-_STRAINED: Final = partial(right_device, at_limits=True)
 AREA_BYTES: Final = 34 * 1024
 """More than 255 packets, and soon sent."""
 
@@ -33,7 +32,7 @@ def faults(
     seed: int,
     selection: Selection = Selection(),  # noqa: B008  frozen
     *,
-    make: Callable[[int], RightDevice | RightCDevice] = _STRAINED,
+    make: Callable[[int], RightDevice | RightCDevice] = strained_device,
 ) -> list[str]:
     """What is wrong with the profile that this device's answers give, by these cases."""
     device = make(seed)

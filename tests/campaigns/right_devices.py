@@ -479,6 +479,11 @@ def _strained(
     return changed, found
 
 
+def strained_device(seed: int) -> RightDevice:
+    """The device of that seed with times at their limits."""
+    return right_device(seed, at_limits=True)
+
+
 # -- the run ---------------------------------------------------------------------------------------
 
 
@@ -524,9 +529,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", default="", help="only these cases, separated by commas")
     options = parser.parse_args(words)
     cases = tuple(filter(None, options.cases.split(",")))
-    make: Callable[[int], RightDevice | RightCDevice] = right_c_device
-    if not options.c:
-        make = partial(right_device, at_limits=not options.plain)
+    make: Callable[[int], RightDevice | RightCDevice] = strained_device
+    if options.c or options.plain:
+        make = right_c_device if options.c else right_device
     judge = partial(faults_of, selection=Selection(cases=cases), make=make, steps=options.steps)
     began, bad = time.perf_counter(), 0
     seeds = range(options.seed, options.seed + options.count)

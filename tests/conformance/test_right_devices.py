@@ -7,7 +7,6 @@ limit.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import pytest
@@ -43,6 +42,7 @@ from tests.campaigns.right_devices import (
     answers_late,
     faults_of,
     right_device,
+    strained_device,
 )
 from tests.conformance.bench import subject
 from tests.loops import each
@@ -122,15 +122,13 @@ def test_silence_in_a_transfer_is_no_pause(case_id: str) -> None:
 
 
 def test_an_update_command_that_comes_in_an_erase_may_be_confirmed_after_it() -> None:
-    assert (
-        faults_of(21, Selection(cases=("UP-05",)), make=partial(right_device, at_limits=True)) == []
-    )
+    assert faults_of(21, Selection(cases=("UP-05",)), make=strained_device) == []
 
 
 @pytest.mark.slow
 @each("case_id", ("BU-01", "BU-02"))
 def test_request_transfer_may_come_while_a_reset_that_restarts_is_being_sent(case_id: str) -> None:
-    assert faults_of(2017, Selection(cases=(case_id,)), at_limits=True) == []
+    assert faults_of(2017, Selection(cases=(case_id,)), make=strained_device) == []
 
 
 @pytest.mark.slow
