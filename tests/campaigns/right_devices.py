@@ -300,6 +300,8 @@ _FRAMINGS: Final[tuple[tuple[type[Reassembler], dict[str, Value]], ...]] = (
 
 _LIMITS: Final = Limits()
 _ON_BUS_S: Final = 0.012
+_END_AGAIN_S: Final = 0.05
+"""A device that restarts sooner after a NAK does not hear end of transfer again (R6)."""
 
 # -- a device by its seed --------------------------------------------------------------------------
 
@@ -377,6 +379,9 @@ def right_device(seed: int, *, at_limits: bool = False) -> RightDevice:
     for _, given in (*behaviours, *framings):
         fitting |= given
     fitting["limits.version_spacing_s"] = timings["boot_version_spacing_s"]
+    nak_s = getattr(device_type, "late_s", {}).get(messages.Nak, 0.0)
+    if choices.refused_hold_s - nak_s < _END_AGAIN_S:
+        fitting["en_02"] = "either"
     sizes: dict[str, Value] = {
         "device.application_bytes": choices.application_area_bytes,
         "device.largest_image_bytes": choices.image_limit_bytes,
