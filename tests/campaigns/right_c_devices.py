@@ -83,6 +83,8 @@ def right_c_device(seed: int) -> RightCDevice:
     choices: dict[str, int] = {"NODE": _NODES[target]}
     choices |= _flash(chance)
     choices |= _behaviour(chance, has_version_query=target == "bms")
+    if choices["RESET_FEEDBACK"]:  # as to any write that is not of the upgrade
+        choices["FEEDBACK"] = max(choices["FEEDBACK"], 1)
     choices |= _times(chance, choices)
     if choices["ACKS_FIRST"]:
         # It hears what follows its ACK only when it has written, and here no filter of its

@@ -11,6 +11,8 @@ import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.explore import Explorer
+from flasher.conformance.init import ask_device
+from flasher.conformance.profile import ConformanceProfile
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_devices import faults_of
 from tests.loops import each
@@ -55,6 +57,15 @@ def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> Non
     times |= {"WINDOW_US": 200_000, "START_US": 795_000}
     device = dataclasses.replace(device, choices={**device.choices, **times})
     assert faults_of(9, Selection(cases=("EN-02",)), make=lambda _: device) == []
+
+
+def test_init_finds_the_largest_image_of_one_that_ignores_updates_before_packet_1() -> None:
+    device = right_c_device(1)
+    assert not device.choices["BEFORE_FIRST"]
+    with device.subject() as subject:
+        asked = ask_device(subject, ConformanceProfile())
+    found = {one.key: one.value for one in asked.answers}
+    assert found["device.largest_image_bytes"] == device.choices["LARGEST_BYTES"]
 
 
 @each(

@@ -400,9 +400,9 @@ def largest_image(session: InitSession) -> Findings:
     if why:
         yield why
         return
+
     session.begin()
-    if not restarts_at_once:
-        bench.leave_transfer()
+    _prepare_for_next_size(session, len(session.image))
     erase_s = max(one.value_s for one in bench.judge.measurements if one.name == TimeName.REQUEST)
 
     in_transfer = restarts_at_once
@@ -415,8 +415,8 @@ def largest_image(session: InitSession) -> Findings:
         within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
         reply = _answer_to_size(session, bench.encoder.update(size_bytes), within_s)
         taken = reply is not None and reply.kind is Reply.REQUEST
-        if taken and not restarts_at_once:
-            bench.leave_transfer()
+        if taken:
+            _prepare_for_next_size(session, size_bytes)
         in_transfer = restarts_at_once and (
             taken or (in_transfer and reply is not None and reply.kind is Reply.NAK)
         )
@@ -441,6 +441,15 @@ def largest_image(session: InitSession) -> Findings:
     if high:
         seen += f", for {high} bytes rejected, by bisection"
     yield KeyAnswer("device.largest_image_bytes", low, seen)
+
+
+def _prepare_for_next_size(session: InitSession, size_bytes: int) -> None:
+    """After request transfer for that size: make the device accept another update command."""
+    bench = session.bench
+    if bench.choice("up_08") == "starts_over":
+        bench.packets(bytes(size_bytes), 1, 1)  # before packet 1 it may ignore one (R25)
+    else:
+        bench.leave_transfer()
 
 
 def _answer_to_size(

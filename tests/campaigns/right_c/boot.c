@@ -421,8 +421,10 @@ static void flow(void)
             due = now + START_US;
             do {
                 WAIT(due);
-                if (got && HEARS_LATE && wanted(got))
+                if (got && HEARS_LATE)
                     size = wanted(got);
+                if (got && HEARS_LATE && !size)
+                    refuse_update();
             } while (now < due && !size);
             if (size)
                 break;
