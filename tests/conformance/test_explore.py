@@ -14,12 +14,14 @@ from flasher.conformance.explore.steps import parse_step, reachable_pairs
 from flasher.conformance.explore.stimuli import REFUSED, TransferPosition, make_stimulus
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.profile import Value
 from flasher.conformance.restore import BY_NOTHING, restore
 from flasher.conformance.results import ExploreResult
 from flasher.conformance.wire import Encoder, joined
 from flasher.errors import UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.mock.variants.framing import ShortFrameEnds
 from flasher.protocol.spec import TARGETS, WELLING
 from tests.campaigns.right_devices import CountsFromPackets, answers_late
 from tests.cli.conftest import Flasher
@@ -253,14 +255,17 @@ def test_a_repeated_packet_is_judged_by_the_profile_as_in_the_case(
         assert Explorer(silent, stated).replay(steps).finding is not None
 
 
-def _walked(kind: type[MockDevice], steps: list[str], **choices: Any) -> ExploreResult:
+def _walked(
+    kind: type[MockDevice], steps: list[str], given: dict[str, Value] | None = None, **choices: Any
+) -> ExploreResult:
     device = replace(MOCK_PROFILE, **choices)
 
     def make(target: str, profile: DeviceProfile) -> MockDevice:
         return kind(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
     stated = profile_of_mock(device)
-    stated = replace(stated, given={**stated.given, "limits.pause_s": device.transfer_timeout_s})
+    pause: dict[str, Value] = {"limits.pause_s": device.transfer_timeout_s}
+    stated = replace(stated, given={**stated.given, **pause, **(given or {})})
     return Explorer(MockSubject(profile=device, make_device=make), stated).replay(steps)
 
 
@@ -274,3 +279,9 @@ def test_a_pause_may_count_from_the_last_packet_that_was_stored_and_end_within_a
     steps = ["reset", "update=128", "packets=4", "packet-again=other", "packet-mode", "flood"]
     choices = {"repeated_packet": "nak_next", "bad_packet": "silence", "transfer_timeout_s": 2.5}
     assert _walked(kind, steps, **choices).finding is None
+
+
+def test_a_device_that_rejects_short_frames_may_ignore_empty_ones() -> None:
+    kind = type("Short", (MockDevice,), {"reassembler_type": ShortFrameEnds})
+    steps = ["reset", "update=second", "packet-between"]
+    assert _walked(kind, steps, {"fr_01": "rejected"}).finding is None
