@@ -277,7 +277,11 @@ def test_feedback_to_an_update_command_may_come_after_the_reset_that_follows() -
 def test_a_pause_may_count_from_the_last_packet_that_was_stored_and_end_within_a_step() -> None:
     kind = type("Hasty", (CountsFromPackets, answers_late(Ack=0.488)), {})
     steps = ["reset", "update=128", "packets=4", "packet-again=other", "packet-mode", "flood"]
-    choices = {"repeated_packet": "nak_next", "bad_packet": "silence", "transfer_timeout_s": 2.5}
+    choices: dict[str, Any] = {
+        "repeated_packet": "nak_next",
+        "bad_packet": "silence",
+        "transfer_timeout_s": 2.5,
+    }
     assert _walked(kind, steps, **choices).finding is None
 
 
