@@ -194,7 +194,11 @@ def _erase_at_once(device: MockDevice) -> None:
         device.store.flash.execute(operation)
 
 
-@variant("listens-until-third-version", "UP-04", also="UP-05")
+@variant(
+    "listens-until-third-version",
+    "UP-04",
+    also="FR-01 FR-07 FR-08 CR-04 UP-05 TX-13 PW-01 CO-01 CO-02",
+)
 class StopsListening(MockDevice):
     """Accepts no update command from its third announcement on. Listens between its first
     announcements only, when it has an application to start.
@@ -304,7 +308,7 @@ class DiesAfter255(HangingDevice):
 @variant(
     "feedback-after-version",
     "RS-01",
-    also="FR-06 FR-10 CR-03 CR-04 RS-02 UP-02 UP-04 UP-06 SE-04 CO-02 CO-04",
+    also="FR-06 FR-10 CR-03 RS-02 UP-04 UP-06 CO-04",
 )
 class FeedbackAfterVersion(MockDevice):
     """Sends general feedback after the first boot version. Leaves the answer to a reset to the
