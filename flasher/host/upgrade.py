@@ -746,6 +746,7 @@ class UpgradeStage:
     def _await_request_or_begin_again(self, row: ReceivedContent) -> None:
         if self._is_updating:
             timeout_s = self._timings.request_transfer_timeout_s
+            self._at.announced_meanwhile = None  # the device may have begun to erase since
             self._timer_at = self._update_left_at + timeout_s
         else:
             self._begin_again(row)

@@ -228,6 +228,16 @@ def test_no_further_update_command_follows_a_request_that_came_in_time() -> None
     assert bench.expect(Packet).number == 1
 
 
+def test_a_boot_version_from_before_an_outage_is_not_answered_after_it() -> None:
+    """The device may be erasing by then (R2)."""
+    bench = _announced_while_the_command_leaves()
+    bench.now += 3.0
+    bench.engine.link_back(bench.now)
+    bench.wait(20.0)
+    assert not bench.unread
+    assert bench.outcome.ending is Ending.NO_REQUEST
+
+
 def test_a_device_that_announces_into_each_update_command_does_not_hear() -> None:
     bench = _announced_while_the_command_leaves()
     first_at = bench.now
