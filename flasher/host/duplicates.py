@@ -374,10 +374,11 @@ class DuplicateDetector:
         if announced is None or len(announced.times) < 2:
             return False
         earlier, later = list(announced.times)[-2:]
-        return later - earlier < self._shortest_s
+        return later - earlier < self.shortest_interval_s
 
     @property
-    def _shortest_s(self) -> float:
+    def shortest_interval_s(self) -> float:
+        """Shortest interval of two boot versions of one bootloader, in seconds."""
         return self._timings.boot_version_spacing_s * (1 - _TOLERANCE)
 
     @property
@@ -439,10 +440,10 @@ class DuplicateDetector:
                 text("a bootloader announced itself while an application was running")
             )
         gap_s = now - (times[-1] if times else announced.last_at)
-        is_documented = self._shortest_s <= gap_s <= self._longest_s
+        is_documented = self.shortest_interval_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
         announced.last_at = now
-        announced.rhythm.append((now, bool(times) and gap_s < self._shortest_s))
+        announced.rhythm.append((now, bool(times) and gap_s < self.shortest_interval_s))
         times.append(now)
         if self._alternate(announced.rhythm, is_documented=announced.is_documented):
             self._set_evidence(text("two bootloaders announced themselves alternately"))
@@ -453,7 +454,7 @@ class DuplicateDetector:
         """
         times = [each for each, _ in rhythm]
         if len(times) < 4 or not all(
-            self._shortest_s <= later - earlier <= self._longest_s
+            self.shortest_interval_s <= later - earlier <= self._longest_s
             for earlier, later in zip(times, times[2:], strict=False)
         ):
             return False

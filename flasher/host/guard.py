@@ -86,9 +86,9 @@ class Guard:
             if now - self._rest_at > self._gap_s:
                 self._rest_frames = 0
             self._rest_frames, self._rest_at = self._rest_frames + 1, now
-            is_query = not data.startswith(self._update_rest)
-            is_query = is_query and self._rest_frames <= _QUERY_REST_FRAMES
-            return ForeignFrame(description, is_harmless=is_query)
+            is_update = data.startswith(self._update_rest)
+            is_long = self._rest_frames > _QUERY_REST_FRAMES
+            return ForeignFrame(description, is_harmless=not (is_update or is_long))
         self._rest_frames = 0
         if data[len(HEADER)] != Mode.READ:
             return ForeignFrame(description, is_harmless=False)

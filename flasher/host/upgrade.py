@@ -73,9 +73,6 @@ _PHASES: Final = {
 """Phase that each state reports; other states keep the phase."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
 """Reasons for an attempt that begins with the update command, not with a reset."""
-_OWN_INTERVAL: Final = 0.75
-"""A boot version this share of the documented interval after the one that was answered did not wait
-with it."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
 _DEVICE_LEFT: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
@@ -705,7 +702,7 @@ class UpgradeStage:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
         elif not self._tx.idle or now < next_at:
             # Not one that queued up, if the last command took long to leave.
-            if now - at.update_began_at >= _OWN_INTERVAL * timings.boot_version_spacing_s:
+            if now - at.update_began_at >= self._duplicates.shortest_interval_s:
                 at.announced_meanwhile = boot
                 if self._tx.idle:
                     self._timer_at = next_at
