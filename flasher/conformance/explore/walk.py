@@ -46,8 +46,6 @@ _BUS_OFF_S: Final = 0.02
 _FORM_NAKS: Final = 4
 """NAKs to a packet that is not sent in its plain form, at most."""
 _UPDATES_MAX: Final = 8
-_MAYBE_PAUSE: Final = 0.8
-"""A device may end a transfer after this share of limits.pause_s."""
 
 
 class DevicePhase(Enum):
@@ -173,8 +171,7 @@ class Walk:
             elif self.has_application is None:
                 self.phase, self._may_restart = DevicePhase.UNCLEAR, True
         pause_s = bench.now - self._stored_at
-        limit_s = bench.limit("pause_s")
-        left_s = min(_MAYBE_PAUSE * limit_s, limit_s - bench.waits.settle_s)
+        left_s = min(0.8 * bench.limit("pause_s"), bench.limit("pause_s") - bench.waits.settle_s)
         may_end = bench.choice("tx_12") != "waits" and pause_s > left_s
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
@@ -267,13 +264,7 @@ class Walk:
         is_leftover = reply.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
-        # The pause of a device may have ended within this step.
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
-        is_expected = is_expected or (
-            self.phase in _IN_TRANSFER
-            and self.bench.choice("tx_12") != "waits"
-            and reply.at - self._stored_at > _MAYBE_PAUSE * self.bench.limit("pause_s")
-        )
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
             raise Violation("restart", f"{reply} without reset, pause or power cycle, phase: "
                             f"{self.phase.value}")  # fmt: skip
