@@ -119,6 +119,7 @@ class ErrorCode(StrEnum):
     UNCHECKED = "E603"
     VEHICLE_IN_USE = "E604"
     TWO_DEVICES = "E605"
+    LOW_CHARGE = "E606"
     TRANSFER = "E700"
     PACKET_FAILED = "E701"
     RESTARTED = "E702"

@@ -28,6 +28,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "implausible": "not plausible as firmware",
         "unchecked": "it cannot be checked whether the image is meant for this device",
         "in_use": "the vehicle is in use",
+        "low_charge": "the battery is nearly empty",
         "up_to_date": "the device already runs this version",
         "second_tool": "a second tool speaks on the bus",
         "packet_failed": "a packet was not acknowledged",

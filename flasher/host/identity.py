@@ -19,12 +19,14 @@ from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.image.plausible import Cpu, find_doubt
 from flasher.image.release import Release, target_problem
-from flasher.protocol.contents import RunningInformation
+from flasher.protocol.contents import BatteryStatus, RunningInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Target
 from flasher.protocol.text import FirmwareVersion, printable
 
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
+DEFAULT_MINIMUM_CHARGE_PERCENT: Final = 5
+"""An upgrade takes a minute or two; near 0 % the battery may switch itself off within it."""
 DEFAULT_IN_USE_MA: Final = 1000
 """Discharge current in mA: more than lights and displays use, less than the motor."""
 
@@ -54,11 +56,15 @@ WAIVABLE: Final = (
     IdentityCheck.DOWNGRADE,
     IdentityCheck.PREVIOUS,
     IdentityCheck.IN_USE,
+    IdentityCheck.CHARGE,
 )
 """Checks that can refuse an upgrade; the others only warn."""
+OF_STATE: Final = frozenset({IdentityCheck.IN_USE, IdentityCheck.CHARGE})
+"""Checks of a state that changes from one minute to the next."""
 _ENDINGS: Final[Mapping[IdentityCheck, Ending]] = {
     IdentityCheck.PLAUSIBLE: Ending.IMPLAUSIBLE,
     IdentityCheck.IN_USE: Ending.IN_USE,
+    IdentityCheck.CHARGE: Ending.LOW_CHARGE,
     IdentityCheck.SAME_VERSION: Ending.UP_TO_DATE,
 }
 """Ending of a session by its refused check, if not NOT_FOR_DEVICE."""
@@ -104,8 +110,9 @@ class CheckResult(NamedTuple):
 
     @property
     def waiver(self) -> str:
-        """Name of the check if it can be waived, else empty."""
-        return self.check.value if self.check in WAIVABLE else ""
+        """Name of the refused check if it can be waived, else empty."""
+        is_refused = self.verdict is CheckVerdict.REFUSED
+        return self.check.value if is_refused and self.check in WAIVABLE else ""
 
     @property
     def detail(self) -> str:
@@ -125,6 +132,8 @@ class Identity:
     skip_same_version: bool = False
     low_charge_percent: int = DEFAULT_LOW_CHARGE_PERCENT
     """Warn below this state of charge."""
+    minimum_charge_percent: int = DEFAULT_MINIMUM_CHARGE_PERCENT
+    """Refuse below this state of charge, unless a charger is connected."""
     in_use_ma: int = DEFAULT_IN_USE_MA
     """Discharge current in mA above which the vehicle counts as in use."""
     reports_unchecked: bool = False
@@ -348,9 +357,17 @@ def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckRes
             limit_ma=identity.in_use_ma,
         )
         yield identity.refusal(IdentityCheck.IN_USE, sentence)
-    if running.state_of_charge_percent < identity.low_charge_percent:
+    charge = running.state_of_charge_percent
+    is_charging = BatteryStatus.CHARGER_CONNECTED in running.status
+    if charge < identity.minimum_charge_percent and not is_charging:
         sentence = text(
-            "the battery is at {charge} %: charge it first, if it can wait",
-            charge=running.state_of_charge_percent,
+            "the battery is at {charge} %, less than {minimum} %, and no charger is connected",
+            charge=charge,
+            minimum=identity.minimum_charge_percent,
+        )
+        yield identity.refusal(IdentityCheck.CHARGE, sentence)
+    elif charge < identity.low_charge_percent:
+        sentence = text(
+            "the battery is at {charge} %: charge it first, if it can wait", charge=charge
         )
         yield CheckResult(IdentityCheck.CHARGE, CheckVerdict.WARNED, sentence)

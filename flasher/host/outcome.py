@@ -287,6 +287,14 @@ _EXPLANATIONS: Final = {
         "Let it stand still and switch its loads off; --allow-in-use upgrades it all the same.",
         code=ErrorCode.VEHICLE_IN_USE,
     ),
+    Ending.LOW_CHARGE: _Explanation(
+        WrongDeviceError,
+        "it was used or stored without being charged; an empty battery switches itself off, in the "
+        "middle of its upgrade too",
+        "Connect its charger: while it charges, the upgrade is allowed. "
+        "--allow-low-charge upgrades it all the same.",
+        code=ErrorCode.LOW_CHARGE,
+    ),
     Ending.SECOND_TOOL: _Explanation(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",

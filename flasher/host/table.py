@@ -81,6 +81,7 @@ class Ending(Enum):
     IMPLAUSIBLE = "implausible"
     UNCHECKED = "unchecked"
     IN_USE = "in_use"
+    LOW_CHARGE = "low_charge"
     UP_TO_DATE = "up_to_date"
     SECOND_TOOL = "second_tool"
     PACKET_FAILED = "packet_failed"
@@ -95,6 +96,7 @@ ENDED_BEFORE_START: Final = frozenset(
         Ending.IMPLAUSIBLE,
         Ending.NOT_FOR_DEVICE,
         Ending.IN_USE,
+        Ending.LOW_CHARGE,
         Ending.UP_TO_DATE,
     }
 )

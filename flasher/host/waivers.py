@@ -51,6 +51,10 @@ OF_DEVICE: Final[Mapping[str, Waiver]] = {
         text("a vehicle whose battery gives much current"),
         text("Whoever rides it loses the drive or the display in the middle of the ride."),
     ),
+    "low-charge": Waiver(
+        text("a battery that is nearly empty and not being charged"),
+        text("It may switch itself off during the upgrade, and does not start any more then."),
+    ),
     BOOT_NAME: Waiver(
         text("a bootloader that gives another name than the target's"),
         text("Another device than the one that was chosen may be erased."),

@@ -209,6 +209,10 @@ class Profile:
     """The device's processor; other: images need no vector table."""
     low_charge_percent: Annotated[int, NumberRange(ge=0, le=100)] = Identity.low_charge_percent
     """Warn before an upgrade below this state of charge."""
+    minimum_charge_percent: Annotated[int, NumberRange(ge=0, le=100)] = (
+        Identity.minimum_charge_percent
+    )
+    """Refuse an upgrade below this state of charge, unless a charger is connected."""
     in_use_ma: Annotated[int, NumberRange(ge=0, le=0x7FFF)] = Identity.in_use_ma
     """A larger discharge current means a vehicle in use."""
     frame_gap_s: Annotated[float, NumberRange(ge=0, le=1)] = UpgradeOptions.frame_gap_s
@@ -290,6 +294,7 @@ class Profile:
         """Create the settings of identity checks; `overrides` are other fields of `Identity`."""
         return Identity(
             low_charge_percent=self.low_charge_percent,
+            minimum_charge_percent=self.minimum_charge_percent,
             in_use_ma=self.in_use_ma,
             cpu=self.cpu,
             **overrides,

@@ -68,6 +68,11 @@ OLD_VERSION: Final = _fail(
 IN_USE: Final = _fail(
     "IN_USE", text("the battery supplies current"), text("Switch its loads off, then scan again.")
 )
+LOW_CHARGE: Final = _fail(
+    "LOW_CHARGE",
+    text("the battery is nearly empty"),
+    text("Charge it, or connect its charger, then scan again."),
+)
 NOT_FOR_DEVICE: Final = _fail(
     "NOT_FOR_DEVICE",
     text("the image is not meant for this device, or its bootloader is not the right one"),
@@ -181,6 +186,7 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.IMPLAUSIBLE: NOT_FOR_DEVICE,
     Ending.TWO_DEVICES: TWO_DEVICES,
     Ending.IN_USE: IN_USE,
+    Ending.LOW_CHARGE: LOW_CHARGE,
     Ending.SECOND_TOOL: SECOND_TOOL,
     Ending.PACKET_FAILED: TRANSFER_FAILED,
     Ending.RESTARTED: TRANSFER_FAILED,

@@ -26,6 +26,7 @@ OF_CHECK: Final = {
     IdentityCheck.DOWNGRADE: codes.OLD_VERSION,
     IdentityCheck.PREVIOUS: codes.OLD_VERSION,
     IdentityCheck.IN_USE: codes.IN_USE,
+    IdentityCheck.CHARGE: codes.LOW_CHARGE,
 }
 """Codes of failed checks; NOT_FOR_DEVICE for all others."""
 

@@ -21,7 +21,7 @@ from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
 from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
 from flasher.host.event_text import progress_line, warning_text
-from flasher.host.identity import DeviceAnswers, IdentityCheck, judge_device, new_version
+from flasher.host.identity import OF_STATE, DeviceAnswers, judge_device, new_version
 from flasher.host.outcome import AGAIN
 from flasher.host.query import memory_bytes
 from flasher.i18n import text, with_value
@@ -433,7 +433,7 @@ class BenchController:
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         seen = DeviceAnswers(bike.version, running)
         for found in judge_device(job.plan.image, job.plan.target, job.identity, seen):
-            error = None if found.check is IdentityCheck.IN_USE else refusal(job.plan, found)
+            error = None if found.check in OF_STATE else refusal(job.plan, found)
             if error is not None:
                 raise error
 

@@ -241,6 +241,24 @@ def test_a_low_charge_is_warned_of_and_the_limit_is_the_profiles(
     assert "the battery is at" not in bench.flash(Stage()).err
 
 
+def test_a_nearly_empty_battery_is_refused_and_the_limit_is_the_profiles(
+    bench: Workbench, tmp_path: Path
+) -> None:
+    limits = tmp_path / "limits.toml"
+    limits.write_text("minimum_charge_percent = 86\n")
+    stage = Stage()
+    run = bench.flash(stage, "--profile", str(limits))
+    assert run.code == ExitCode.WRONG_DEVICE
+    assert "the battery is at 85 %, less than 86 %, and no charger is connected" in run.err
+    assert "Connect its charger" in run.err
+    assert not wrote(stage)
+    run = bench.flash(stage, "--profile", str(limits), "--allow-low-charge")
+    assert run.code == ExitCode.OK
+    assert "warning: the battery is at 85 %, less than 86 %" in run.err
+    limits.write_text("minimum_charge_percent = 85\n")
+    assert bench.flash(Stage(), "--profile", str(limits)).code == ExitCode.OK
+
+
 def test_what_counts_as_in_use_is_the_profiles(bench: Workbench, tmp_path: Path) -> None:
     limits = tmp_path / "limits.toml"
     limits.write_text("in_use_ma = 32000\n")

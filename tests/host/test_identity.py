@@ -125,6 +125,11 @@ def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() ->
         ({"state_of_charge_percent": 19}, {IdentityCheck.CHARGE: WARNED}),
         ({"mean_current_ma": -5000, "state_of_charge_percent": 5},
          {IdentityCheck.IN_USE: REFUSED, IdentityCheck.CHARGE: WARNED}),
+        ({"state_of_charge_percent": 4}, {IdentityCheck.CHARGE: REFUSED}),
+        ({"state_of_charge_percent": 0}, {IdentityCheck.CHARGE: REFUSED}),
+        # Its charger keeps it on.
+        ({"state_of_charge_percent": 0, "status": BatteryStatus.CHARGER_CONNECTED},
+         {IdentityCheck.CHARGE: WARNED}),
     ],
 )  # fmt: skip
 def test_the_state_of_the_battery(
@@ -151,8 +156,7 @@ def test_a_waived_check_is_told_and_ends_nothing() -> None:
 
 
 def test_each_check_that_refuses_can_be_waived_and_no_other() -> None:
-    assert {IdentityCheck.SAME_VERSION, IdentityCheck.CHARGE}.isdisjoint(WAIVABLE)
-    assert set(WAIVABLE) == set(IdentityCheck) - {IdentityCheck.SAME_VERSION, IdentityCheck.CHARGE}
+    assert set(WAIVABLE) == set(IdentityCheck) - {IdentityCheck.SAME_VERSION}
 
 
 def test_the_same_version_is_skipped_on_request_only() -> None:
@@ -366,6 +370,12 @@ def test_a_battery_in_use_or_low_is_named_with_its_figures() -> None:
     assert found[IdentityCheck.CHARGE].ending is None
     assert found[IdentityCheck.CHARGE].waiver == ""
     assert found[IdentityCheck.CHARGE].detail == found[IdentityCheck.CHARGE].text
+    empty = judged(identity=Identity(minimum_charge_percent=8), device=device)
+    assert empty[IdentityCheck.CHARGE].detail == (
+        "the battery is at 7 %, less than 8 %, and no charger is connected; --allow-low-charge "
+        "waives this"
+    )
+    assert empty[IdentityCheck.CHARGE].ending is Ending.LOW_CHARGE
     limits = Identity(in_use_ma=1500, low_charge_percent=7)
     assert {IdentityCheck.IN_USE, IdentityCheck.CHARGE}.isdisjoint(
         judged(identity=limits, device=device)

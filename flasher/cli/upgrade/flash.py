@@ -149,6 +149,7 @@ class UpgradeChoices:
     allow_downgrade: Annotated[bool, _waiver_option("downgrade")]
     allow_previous_version: Annotated[bool, _waiver_option("previous-version")]
     allow_in_use: Annotated[bool, _waiver_option("in-use")]
+    allow_low_charge: Annotated[bool, _waiver_option("low-charge")]
     allow_boot_name: Annotated[bool, _waiver_option("boot-name")]
     allow_boot_version: Annotated[bool, _waiver_option("boot-version")]
     force: Annotated[bool, option(
