@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, BinaryIO, Final
 
 import click
 
-from flasher.api import Connection, as_dialect, connect, connect_mock
+from flasher.api import Connection, as_dialect, connect, connect_mock, find_release
 from flasher.api import bit_rate as settle_bit_rate
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.detect import DetectedAdapter
 from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
+from flasher.errors import ErrorCode, ImageError, UsageError
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
 from flasher.host.waivers import IMPLAUSIBLE, OUTSIDE_VECTOR, WAIVERS
 from flasher.image.image import Image
-from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
+from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FILE_MAX_SIZE, FORMATS, load
+from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Dialect, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -52,6 +56,8 @@ profile_option: Final = option(
 
 # -- the image -------------------------------------------------------------------------------------
 
+STANDARD_INPUT: Final = "-"
+
 
 @dataclass(frozen=True)
 class ImageOptions:
@@ -59,7 +65,7 @@ class ImageOptions:
 
     image: Annotated[str, argument(
         "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
-        help="Intel HEX, S-record, ELF or raw binary",
+        help="Intel HEX, S-record, ELF or raw binary; - is standard input",
     )]  # fmt: skip
     format: Annotated[str | None, option(
         "--format", type=click.Choice(FORMATS), panel="image",
@@ -83,10 +89,20 @@ class ImageOptions:
         help=f"send {WAIVERS[OUTSIDE_VECTOR].permits}",
     )]  # fmt: skip
 
+    @property
+    def is_piped(self) -> bool:
+        """True for standard input, which can be read once and has no manifest beside it."""
+        return self.image == STANDARD_INPUT
+
+    def find_release(self, given: str | None = None) -> Release | None:
+        """Read the manifest `given`, else the one beside the image; see `api.find_release`."""
+        return None if given is None and self.is_piped else find_release(self.image, given)
+
     def load(self, *, force: bool = False) -> Image:
         """Load the image. Raises ImageError and UsageError."""
         return load(
-            self.image,
+            "standard input" if self.is_piped else self.image,
+            stream=_standard_input() if self.is_piped else None,
             format=self.format,
             base=self.base,
             range_=self.range_,
@@ -96,6 +112,23 @@ class ImageOptions:
 
 
 image_options: Final = option_set("image", ImageOptions)
+
+
+def _standard_input() -> BinaryIO:
+    """Read standard input to its end. Raises UsageError for a terminal and for too many bytes."""
+    if sys.stdin.isatty():
+        raise UsageError(
+            "The image - is standard input, which is this terminal.",
+            remedy="Pipe a program's output or a file into the command, or name a file.",
+        )
+    data = sys.stdin.buffer.read(FILE_MAX_SIZE + 1)
+    if len(data) > FILE_MAX_SIZE:
+        raise ImageError(
+            f"Standard input has more than {FILE_MAX_SIZE:,} bytes.",
+            cause="another program or file was meant",
+            code=ErrorCode.IMAGE_TOO_LARGE,
+        )
+    return io.BytesIO(data)
 
 
 def allow_implausible_option(panel: str | None = None) -> Decorator:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import codecs
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 from pathlib import PurePath
@@ -75,6 +77,7 @@ _READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf
 def load(
     path: str | os.PathLike[str],
     *,
+    stream: BinaryIO | None = None,
     format: str | None = None,  # noqa: A002  the option's own name
     base: int | None = None,
     range_: tuple[int, int] | None = None,
@@ -83,17 +86,19 @@ def load(
 ) -> Image:
     """Load a firmware file and check it (R8, R9).
 
-    `format` is one of `FORMATS`; None detects it. `base` is the address of the first byte of a raw
-    binary. `range_` is (start, end), end exclusive: other bytes of the file are ignored. Gaps up to
-    `fill_gaps_up_to` bytes are filled with FF, from the start of the range. `allow_outside_vector`
-    waives the merged-file rule of R8.
+    The bytes of a seekable `stream` are loaded in place of the file, as those of standard input;
+    `path` is then its name in messages. `format` is one of `FORMATS`; None detects it. `base` is
+    the address of the first byte of a raw binary. `range_` is (start, end), end exclusive: other
+    bytes of the file are ignored. Gaps up to `fill_gaps_up_to` bytes are filled with FF, from the
+    start of the range. `allow_outside_vector` waives the merged-file rule of R8.
 
     Raises ImageError if the file cannot be used; UsageError if it does not exist, is not a regular
     file, or the options contradict each other.
     """
     _check_options(format, base, range_, fill_gaps_up_to)
     source = printable(os.fspath(path))
-    with opened(path, None, error=ImageError) as (file, size_bytes):
+    with _content(path, stream) as (file, size_bytes):
+        file.seek(0)
         head = file.read(HEAD_SIZE)
         file.seek(0)
         form = Format(format) if format else _detect(head, source)
@@ -121,6 +126,18 @@ def load(
     if not allow_outside_vector:
         check_starts_inside(image)
     return image
+
+
+@contextmanager
+def _content(
+    path: str | os.PathLike[str], stream: BinaryIO | None
+) -> Iterator[tuple[BinaryIO, int]]:
+    """Yield a file, or the stream in its place, with its size in bytes."""
+    if stream is not None:
+        yield stream, stream.seek(0, os.SEEK_END)
+    else:
+        with opened(path, None, error=ImageError) as content:
+            yield content
 
 
 def _check_options(

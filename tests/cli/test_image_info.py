@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,69 @@ def test_json_names_segments_vectors_and_hash(flasher: Flasher) -> None:
     assert len(document["image"]["sha256"]) == 64
     assert document["image"]["vector_table"]["plausible"] is True
     assert document["plan"]["packets"] == 92
+
+
+@pytest.fixture
+def pipe(monkeypatch: pytest.MonkeyPatch) -> Callable[[bytes], None]:
+    """Puts bytes on standard input."""
+
+    def put(data: bytes) -> None:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(data)))
+
+    return put
+
+
+@each("name", ["bms.hex", "wmc.s19", "obc.bin"])
+def test_an_image_is_read_from_standard_input_like_the_file(
+    flasher: Flasher, pipe: Callable[[bytes], None], name: str
+) -> None:
+    of_file = flasher("image-info", SAMPLES / name, "--json").document
+    pipe((SAMPLES / name).read_bytes())
+    piped = flasher("image-info", "-", "--json").document
+    assert piped["image"].pop("source") == "standard input"
+    del of_file["image"]["source"]
+    assert piped["image"] == of_file["image"]
+    assert piped["manifest"]["found"] is False
+
+
+def test_standard_input_that_is_empty_or_a_terminal_is_refused(
+    flasher: Flasher, pipe: Callable[[bytes], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipe(b"")
+    run = flasher("image-info", "-")
+    assert run.code == ExitCode.IMAGE
+    assert "standard input is empty" in run.err
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    run = flasher("image-info", "-")
+    assert run.code == ExitCode.USAGE
+    assert "is this terminal" in run.err
+
+
+def test_more_bytes_on_standard_input_than_any_file_has_are_refused(
+    flasher: Flasher, pipe: Callable[[bytes], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.cli.options.FILE_MAX_SIZE", 10)
+    pipe(bytes(11))
+    run = flasher("image-info", "-")
+    assert run.code == ExitCode.IMAGE
+    assert "more than 10 bytes" in run.err
+
+
+def test_the_manifest_of_standard_input_needs_a_name(
+    flasher: Flasher, pipe: Callable[[bytes], None], tmp_path: Path
+) -> None:
+    data = (SAMPLES / "bms.hex").read_bytes()
+    pipe(data)
+    run = flasher("manifest", "create", "-", "-t", "bms")
+    assert run.code == ExitCode.USAGE
+    assert "needs -o FILE" in run.err
+    pipe(data)
+    path = tmp_path / "bms.toml"
+    assert flasher("manifest", "create", "-", "-t", "bms", "-o", path).code == ExitCode.OK
+    pipe(data)
+    assert flasher("manifest", "check", "-", "--manifest", path).code == ExitCode.OK
+    pipe(data)
+    assert flasher("manifest", "check", "-").code == ExitCode.IMAGE
 
 
 def test_a_binary_says_that_its_address_is_unknown(flasher: Flasher) -> None:

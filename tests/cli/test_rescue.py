@@ -125,6 +125,8 @@ def repair_of(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> Callable[...
         ("--log flash flash a.hex -t bms", "--log-file flash rescue a.hex -t bms"),
         ("flash -t bms -- --timeout", "rescue -t bms -- --timeout"),
         ("flash flash -t bms", "rescue flash -t bms"),
+        # Standard input was read: whoever has the image pipes it in again, or names a file.
+        ("flash - -t bms", "rescue IMAGE -t bms"),
         ("flash 'a b.hex' -t bms -c '$x'", "rescue 'a b.hex' -t bms -c '$x'"),
     ],
 )

@@ -15,6 +15,7 @@ from flasher.cli import values
 from flasher.cli.adapters import check_heard, choose_adapter
 from flasher.cli.framework import Decorator, command, option, option_set, rebuild_command_line
 from flasher.cli.options import (
+    STANDARD_INPUT,
     Bus,
     ImageOptions,
     bus_options,
@@ -261,7 +262,7 @@ class _Upgrade:
         output, choices = self.output, self.choices
         output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
-        release = api.find_release(self.image.image, choices.manifest)
+        release = self.image.find_release(choices.manifest)
         # Check the file before looking for an adapter.
         image = api.with_release(self.image.load(force=choices.force), release)
         profile.check_fits(image)
@@ -312,7 +313,8 @@ class _Upgrade:
     def _carry_out(self, job: api.Job) -> int:
         output = self.output
         ctx = click.get_current_context()
-        again = shlex.join(["flasher", *rebuild_command_line(ctx, str(ctx.info_name))])
+        name, replaced = str(ctx.info_name), _image_again(ctx)
+        again = shlex.join(["flasher", *rebuild_command_line(ctx, name, replaced=replaced)])
         upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
         result = upgrade_run.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
@@ -388,12 +390,18 @@ class _Upgrade:
 
 OTHER_IMAGE: Final = "OTHER_IMAGE"
 """Placeholder for another image, after the device refused the one sent."""
+SAME_IMAGE: Final = "IMAGE"
+"""Placeholder for an image from standard input, which is read once."""
 _LEFT_OUT: Final = frozenset({"--timeout", "--trace-file", "--skip-same-version"})
 """Options that the repair command omits: a deadline for a device that answers at once (a rescue
 waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
 _OF_THE_IMAGE: Final = frozenset(
     {"--format", "--base", "--range", "--fill-gaps-up-to", "--manifest", "--force"}
 )
+
+
+def _image_again(ctx: click.Context) -> dict[str, str]:
+    return {"image": SAME_IMAGE} if ctx.params["image"] == STANDARD_INPUT else {}
 
 
 def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
@@ -405,7 +413,7 @@ def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
         of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
         return name in _LEFT_OUT or (is_refused and of_the_image)
 
-    replaced = {"image": OTHER_IMAGE} if is_refused else {}
+    replaced = {"image": OTHER_IMAGE} if is_refused else _image_again(ctx)
     return shlex.join(
         ["flasher", *rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)]
     )

@@ -77,7 +77,7 @@ def image_info(
         loaded, settings.target, settings.dialect, has_upgrade=settings.has_upgrade
     )
     chosen = settings.upgrade_options(frame_gap_s=frame_gap_s, packet_gap_s=packet_gap_s)
-    beside = manifest_beside(image.image, loaded, target)
+    beside = manifest_beside(image, loaded, target)
     lines = [*text.image_lines(loaded), *text.vector_lines(table), beside_line(beside)]
     output.results((*lines, *text.plan_lines(plan, chosen)))
     document = ImageInfoDocument(
@@ -87,7 +87,7 @@ def image_info(
     )
     release = None
     with contextlib.suppress(FlasherError):  # reported in `beside`
-        release = api.find_release(image.image)
+        release = image.find_release()
     waived = frozenset({IdentityCheck.PLAUSIBLE} if allow_implausible else ())
     identity = settings.identity(release=release, waived=waived)
     for found in judge_bytes(loaded, identity):

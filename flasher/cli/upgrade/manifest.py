@@ -28,7 +28,6 @@ from flasher.protocol.text import BOOT_VERSION_FORM, FIRMWARE_VERSION_FORM, prin
 from flasher.settings.manifest import (
     STATEMENTS,
     check_statement,
-    find_release,
     manifest_path,
     release_of,
     to_toml,
@@ -155,6 +154,8 @@ def create(
 ) -> int:
     """Write the release manifest of an image."""
     loaded = image.load()
+    if file is None and image.is_piped:
+        raise UsageError("An image from standard input needs -o FILE for its manifest.")
     path = Path(file) if file else manifest_path(image.image)
     _check_destination(path, image.image, overwrite=overwrite)
     if not allow_implausible:
@@ -178,7 +179,7 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
     check_writable(path, "-o")
     if not path.exists():
         return
-    if path.samefile(image):
+    if os.path.lexists(image) and path.samefile(image):
         raise UsageError(
             f"{printable(str(path))} is the image itself, which would be overwritten.",
             remedy="Name another file with -o.",
@@ -204,16 +205,16 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
 def check(output: Output, image: ImageOptions, target: Target | None, *, file: str | None) -> int:
     """Check the bytes that would be sent against the release manifest."""
     loaded = image.load()
-    release = find_release(image.image, file)
+    release = image.find_release(file)
     if release is None:
         raise ImageError(
-            f"There is no manifest for {printable(image.image)}.",
-            where=printable(str(manifest_path(image.image))),
+            f"There is no manifest for {loaded.source}.",
+            where="" if image.is_piped else printable(str(manifest_path(image.image))),
             remedy="Name it with --manifest, or write it with `flasher manifest create`.",
             code=ErrorCode.MANIFEST,
         )
     checks = checks_of(release, loaded, target)
-    output.result(f"{printable(release.source)}, compared with {printable(image.image)}")
+    output.result(f"{printable(release.source)}, compared with {loaded.source}")
     output.table(((f"{each.check}:", each.detail) for each in checks), indent=2)
     document = ManifestCheckDocument(image.image, release.source, release, checks)
     try:
@@ -285,6 +286,7 @@ class ManifestBesideDocument:
     """Manifest next to an image; `problem` explains why it does not match."""
 
     file: str
+    """Empty for standard input."""
     found: bool
     agrees: bool | None
     problem: str | None
@@ -292,15 +294,15 @@ class ManifestBesideDocument:
 
 
 def manifest_beside(
-    path: str | os.PathLike[str], image: Image, target: Target | None
+    options: ImageOptions, image: Image, target: Target | None
 ) -> ManifestBesideDocument:
     """Find the manifest next to an image and compare it with the image and `target`. Errors are
     reported in the result, not raised.
     """
-    beside = str(manifest_path(path))
+    beside = "" if options.is_piped else str(manifest_path(options.image))
     release = None
     try:
-        release = find_release(path)
+        release = options.find_release()
         if release is not None:
             release.check_bytes(image)
             check_target(image, release, target or release.target)
@@ -322,7 +324,7 @@ def beside_line(beside: ManifestBesideDocument) -> str:
     """Format the manifest's line in `image-info`."""
     file, release = printable(beside.file), beside.release
     if not beside.found:
-        return f"  release: no manifest beside it ({file})"
+        return f"  release: no manifest beside it{f' ({file})' if file else ''}"
     if release is None or not beside.agrees:
         return f"  release: {file}: {beside.problem}"
     version = release.firmware_version or "without a version"
