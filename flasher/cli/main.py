@@ -80,6 +80,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "explain": CommandEntry(
             "look.explain:explain", "explain a recorded trace or a bundle, with a verdict"
         ),
+        "bundle": CommandEntry(
+            "look.bundle:bundle", "pack what explains a failure into one file to send"
+        ),
     },
     "without hardware, and for bootloaders": {
         "mock": CommandEntry("bench.mock:mock", "run the device model on a bus until interrupted"),

@@ -242,7 +242,9 @@ def _leave_bundle(
     else:
         output.error_line(f"bundle: {printable(str(path))}")
         if is_own:
-            output.error_line("        flasher explain --last explains it")
+            output.error_line(
+                "        flasher explain --last explains it, flasher bundle --last packs it to send"
+            )
 
 
 def _error(error: BaseException) -> dict[str, Any]:

@@ -156,16 +156,21 @@ def _circumstances(recorder: FlightRecorder, now: float) -> dict[str, Any]:
     return {
         "bundle": FORMAT,
         "written_at": now,
-        "versions": {
-            **{name: _version(package) for name, package in _PACKAGES.items()},
-            "python": platform.python_version(),
-            "os": platform.platform(),
-        },
+        "versions": versions(),
         "frames_seen": recorder.frames,
         "frames_kept": len(recorder),
         "last_frame": None
         if last is None
         else {"monotonic_s": last.at_s, "wall_s": last.at_s + offset_s},
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of flasher, of what it stands on, and of the operating system."""
+    return {
+        **{name: _version(package) for name, package in _PACKAGES.items()},
+        "python": platform.python_version(),
+        "os": platform.platform(),
     }
 
 

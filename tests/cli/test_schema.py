@@ -109,6 +109,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),
         ("explain", Path("upgrade.log")),
         ("explain", Path("nothing.log")),
+        ("bundle", Path("failed"), "-o", Path("help.zip")),
         ("export", "wireshark", "-o", Path("welling.lua")),
         ("export", "csv", Path("upgrade.log"), "-o", Path("upgrade.csv")),
         ("export", "trace", Path("upgrade.log"), "-o", Path("upgrade.pcapng")),
@@ -136,6 +137,8 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
     named = {str(word) for word in request.getfixturevalue("words")}
     Path("right.toml").write_text("attempts = 5\n", "utf-8")
     Path("nothing.log").write_text("(1.0) can0 123#616263\n", "utf-8")
+    Path("failed").mkdir()
+    Path("failed/trace.log").write_text("(1.0) can0 123#616263\n", "utf-8")
     for name in ("image.bin", "stated.bin"):
         Path(name).write_bytes(OBC.read_bytes())
     if "stated.bin" in named:

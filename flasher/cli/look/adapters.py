@@ -86,9 +86,8 @@ def adapters(output: Output, *, network: bool) -> int:
     """List the adapters of this computer, each with the arguments that select it, and the back ends
     that cannot list theirs.
     """
-    detected = detect_adapters(on_network=network)
-    serial = slcan_ports()
-    unseen = list(_list_unseen(detected, on_network=network, lists_ports=serial is not None))
+    detected, serial = detect_adapters(on_network=network), slcan_ports()
+    document = adapters_document(detected, serial, on_network=network)
     if detected.found:
         output.table(_rows(detected.found))
     else:
@@ -100,18 +99,23 @@ def adapters(output: Output, *, network: bool) -> int:
     output.result("")
     output.result("not seen, even when plugged in:")
     alike: dict[str, list[str]] = {}  # one line for back ends with the same reason
-    for each in unseen:
+    for each in document.not_seen:
         reason = f"{each.text}: {each.fix}" if each.fix else each.text
         alike.setdefault(reason, []).append(each.interface)
     rows = [(", ".join(names), reason) for reason, names in alike.items()]
     rows.append(("any other", "as long as its maker's driver is not installed"))
     output.table(rows, indent=2)
-    return output.document(
-        AdaptersDocument(
-            adapters=[_document(each) for each in detected.found],
-            serial_ports=None if serial is None else [_document(each) for each in serial],
-            not_seen=unseen,
-        )
+    return output.document(document)
+
+
+def adapters_document(
+    detected: DetectionResult, serial: list[DetectedAdapter] | None, *, on_network: bool = False
+) -> AdaptersDocument:
+    unseen = _list_unseen(detected, on_network=on_network, lists_ports=serial is not None)
+    return AdaptersDocument(
+        adapters=[_document(each) for each in detected.found],
+        serial_ports=None if serial is None else [_document(each) for each in serial],
+        not_seen=list(unseen),
     )
 
 

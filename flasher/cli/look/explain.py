@@ -86,7 +86,7 @@ def explain(
     from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE  # noqa: PLC0415  loads python-can
     from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
 
-    source = _source(trace, last=last)
+    source = find_source(trace, last=last)
     in_folder = (TRACE, OLDER_TRACE, REPORT) if source.is_dir() else ()
     check_writable(html, _HTML, [source, *(source / name for name in in_folder)])
     story = explain_path(source, bitrate_bps=bitrate, everything=everything)
@@ -102,16 +102,16 @@ def explain(
     return output.document(ExplainDocument(story=story))
 
 
-def _source(trace: Path | None, *, last: bool) -> Path:
-    """Return the trace or bundle to read. Raises UsageError unless exactly one is given."""
+def find_source(named: Path | None, *, last: bool) -> Path:
+    """Return the named trace or bundle, or the latest bundle. Raises UsageError unless exactly one
+    is given, and without a bundle of the latest failure.
+    """
     from flasher.trace.bundle import bundles  # noqa: PLC0415  loads python-can
 
-    if last == (trace is not None):
-        raise UsageError(
-            "flasher explain: name one trace or bundle.", remedy=f"Write either TRACE or {_LAST}."
-        )
-    if trace is not None:
-        return trace
+    if last == (named is not None):
+        raise UsageError("Name one trace or bundle.", remedy=f"Write either its name or {_LAST}.")
+    if named is not None:
+        return named
     folder = bundle_folder()
     found = bundles(folder)
     unfinished = _unfinished(found[-1] if found else None)
