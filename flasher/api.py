@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import datetime
 import os
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -23,7 +24,7 @@ from typing import (
     overload,
 )
 
-from flasher.errors import FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import FlasherError, InterruptedByUserError, UsageError, printable
 from flasher.host import waivers
 from flasher.host.identity import WAIVABLE, CheckResult, Identity, IdentityCheck, judge_image
 from flasher.host.options import UpgradeOptions
@@ -37,7 +38,7 @@ from flasher.host.write import WritePlan, WriteResult
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
-from flasher.image.release import Release
+from flasher.image.release import Provenance, Release
 from flasher.procedures import CallOptions, DeviceInfo, EventHandler, Procedures, plan_for
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
@@ -62,6 +63,7 @@ __all__ = [
     "make_plan",
     "prepare",
     "find_release",
+    "open_image",
     "as_dialect",
     "as_level",
     "as_target",
@@ -80,8 +82,10 @@ __all__ = [
     "Job",
     "Level",
     "Outcome",
+    "OpenedImage",
     "Plan",
     "Profile",
+    "Provenance",
     "Release",
     "Result",
     "UpgradeOptions",
@@ -639,6 +643,92 @@ class _LoopBridge:
 
 
 @dataclass(frozen=True)
+class OpenedImage:
+    """Image of a file, with what is known of its origin."""
+
+    image: Image
+    release: Release | None = None
+    """Manifest: beside the image, or of a signed release."""
+    provenance: Provenance | None = None
+    """Result of checking signatures; None on a computer without a trust file."""
+
+
+def open_image(
+    path: str | os.PathLike[str],
+    target: Target,
+    *,
+    manifest: str | os.PathLike[str] | None = None,
+    require_signed: bool = False,
+    allow_outside_vector: bool = False,
+    **options: Any,
+) -> OpenedImage:
+    """Load the image for a target from a firmware file or a release (`*.wfw`), and check its
+    signatures against the trust file of this computer, if there is one.
+
+    `manifest` and `options`, further ones of `load`, are for firmware files. A refusal by the trust
+    file is in the result, and raised by `Job.checked`. Raises ImageError and UsageError for a file
+    that cannot be used, WrongDeviceError for a release without an image for the target.
+    """
+    opened = None
+    if "stream" not in options:
+        opened = _signed(
+            path, target, require_signed=require_signed, allow_outside_vector=allow_outside_vector
+        )
+    if opened is not None:
+        if manifest is not None or options:
+            raise UsageError(
+                f"{printable(os.fspath(path))} is signed with its manifest, as a whole file.",
+                cause="an option that chooses another manifest, or a part of the file",
+                remedy="Leave --manifest, --format, --base, --range and --fill-gaps-up-to out.",
+            )
+        return opened
+    has_place = "stream" not in options or manifest is not None
+    release = find_release(path, manifest) if has_place else None
+    loaded = load(path, allow_outside_vector=allow_outside_vector, **options)
+    image = with_release(loaded, release)
+    return OpenedImage(image, release, _unsigned(path, require_signed=require_signed))
+
+
+def _signed(
+    path: str | os.PathLike[str],
+    target: Target,
+    *,
+    require_signed: bool = False,
+    allow_outside_vector: bool,
+) -> OpenedImage | None:
+    """Open a release, or the image that one lies beside; None for any other file."""
+    from flasher.release.places import detached_path, is_container  # noqa: PLC0415
+
+    beside = None
+    if not is_container(path):
+        beside = detached_path(path)
+        if not os.path.lexists(beside):
+            return None
+    from flasher.release import verify  # noqa: PLC0415  for releases alone
+
+    package = verify.open_package(beside or path)
+    today = datetime.datetime.now(datetime.UTC).date()
+    provenance = verify.provenance_of(package, target, today, is_required=require_signed)
+    image, release = verify.image_of(
+        package,
+        target,
+        beside=path if beside else None,
+        allow_outside_vector=allow_outside_vector,
+    )
+    return OpenedImage(with_release(image, release), release, provenance)
+
+
+def _unsigned(path: str | os.PathLike[str], *, require_signed: bool = False) -> Provenance | None:
+    from flasher.release.places import has_trust  # noqa: PLC0415
+
+    if not (require_signed or has_trust()):
+        return None
+    from flasher.release import verify  # noqa: PLC0415  only with a trust file
+
+    return verify.unsigned(os.fspath(path))
+
+
+@dataclass(frozen=True)
 class Job:
     """Upgrade prepared without the device; run by `flash`, the bench page and the station."""
 
@@ -655,10 +745,15 @@ class Job:
         return tuple(judge_image(self.plan.image, self.plan.target, self.identity))
 
     def checked(self) -> Job:
-        """Return this job. Raises ImageError for an implausible image, WrongDeviceError if the
-        image or its manifest contradicts the target, UsageError if the upgrade cannot be verified
-        at this level.
+        """Return this job. Raises ImageError for an implausible image, and for one that the trust
+        file does not allow, WrongDeviceError if the image or its manifest contradicts the target,
+        UsageError if the trust file cannot be used, or the upgrade cannot be verified at this
+        level.
         """
+        provenance = self.identity.provenance
+        problem = None if provenance is None else provenance.problem
+        if problem is not None and IdentityCheck.UNSIGNED not in self.identity.waived:
+            raise problem
         for found in self.checks:
             error = refusal(self.plan, found)
             if error is not None:
@@ -699,17 +794,25 @@ def prepare(
     ImageError and UsageError.
     """
     names = frozenset(waived)
+    outside = waivers.OUTSIDE_VECTOR in names
     if isinstance(image, Image):
-        loaded, beside = image, None
+        opened = OpenedImage(image)
+    elif identity is None:
+        opened = open_image(image, profile.target, allow_outside_vector=outside)
     else:
-        loaded = load(image, allow_outside_vector=waivers.OUTSIDE_VECTOR in names)
-        beside = find_release(image) if identity is None else None
+        opened = _signed(image, profile.target, allow_outside_vector=outside) or OpenedImage(
+            load(image, allow_outside_vector=outside)
+        )
     if identity is None:
         identity = profile.identity(
-            release=beside,
+            release=opened.release,
             waived=frozenset(check for check in WAIVABLE if check.value in names),
             reports_unchecked=at_power_up,
         )
+    if identity.provenance is None:
+        provenance = opened.provenance or _unsigned(opened.image.source)
+        identity = replace(identity, provenance=provenance)
+    loaded = opened.image
     release = identity.release
     plan = plan_for(with_release(loaded, release), profile, bitrate_bps)
     chosen = options or profile.upgrade_options(allow_boot_name=waivers.BOOT_NAME in names or None)

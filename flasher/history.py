@@ -84,6 +84,12 @@ class Began:
     """Command line, quoted for a shell; empty for a page."""
     folder: str = ""
     """Working directory of the command."""
+    product: str = ""
+    """Product of a signed release; empty for other images."""
+    counter: int = 0
+    """Counter of a signed release; 0 for other images."""
+    signers: str = ""
+    """Ids of the trusted keys that signed the image, separated by commas."""
 
 
 @dataclass(frozen=True)
@@ -358,6 +364,20 @@ def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | Non
             found = each
         elif each.shows_application:
             found = None
+    return found
+
+
+def highest_counters(flashes: list[Flash], *, target: str, product: str) -> dict[str, int]:
+    """Return the highest counter of a product's signed releases that each device of a target
+    received, by serial number.
+    """
+    found: dict[str, int] = {}
+    for each in flashes:
+        began, ended = each.began, each.ended
+        if (began.target, began.product) == (target, product) and ended and ended.transferred:
+            serial_number = ended.serial_number or ""
+            found[serial_number] = max(began.counter, found.get(serial_number, 0))
+    found.pop("", None)
     return found
 
 

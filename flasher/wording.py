@@ -25,6 +25,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "boot_too_old": "its bootloader is older than the image needs",
         "two_devices": "two devices answer on the same id",
         "not_for_device": "the image is not meant for this device",
+        "not_trusted": "the trust file does not allow this release",
         "implausible": "not plausible as firmware",
         "unchecked": "it cannot be checked whether the image is meant for this device",
         "in_use": "the vehicle is in use",

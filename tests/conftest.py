@@ -75,6 +75,9 @@ def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
     # Signing keys of stations.
     os.environ["XDG_DATA_HOME"] = str(tmp_path_factory.mktemp("data"))
+    # Trust files: of this user and of this computer, if somebody tests there.
+    os.environ["XDG_CONFIG_HOME"] = str(tmp_path_factory.mktemp("config"))
+    os.environ["XDG_CONFIG_DIRS"] = str(tmp_path_factory.mktemp("system"))
     # Locks of adapters.
     os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
 

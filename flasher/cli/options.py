@@ -100,15 +100,22 @@ class ImageOptions:
 
     def load(self, *, force: bool = False) -> Image:
         """Load the image. Raises ImageError and UsageError."""
-        return load(
-            "standard input" if self.is_piped else self.image,
-            stream=_standard_input() if self.is_piped else None,
-            format=self.format,
-            base=self.base,
-            range_=self.range_,
-            fill_gaps_up_to=self.fill_gaps_up_to,
-            allow_outside_vector=self.allow_outside_vector or force,
-        )
+        return load(self.source, **self.options(force=force))
+
+    @property
+    def source(self) -> str:
+        """Name of the image in messages."""
+        return "standard input" if self.is_piped else self.image
+
+    def options(self, *, force: bool = False) -> dict[str, Any]:
+        """Keywords for `load` that differ from its defaults."""
+        names = ("format", "base", "range_")
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.fill_gaps_up_to != DEFAULT_FILL_GAPS_UP_TO:
+            given["fill_gaps_up_to"] = self.fill_gaps_up_to
+        if self.is_piped:
+            given["stream"] = _standard_input()
+        return {**given, "allow_outside_vector": self.allow_outside_vector or force}
 
 
 image_options: Final = option_set("image", ImageOptions)

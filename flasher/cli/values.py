@@ -15,7 +15,7 @@ from flasher.errors import UsageError, did_you_mean
 from flasher.protocol.spec import TARGET_ALIASES, TARGETS, Node, Target
 
 IMAGE_SUFFIXES: Final = (
-    "hex", "ihex", "ihx", "s19", "s28", "s37", "srec", "mot", "elf", "axf", "out", "bin",
+    "hex", "ihex", "ihx", "s19", "s28", "s37", "srec", "mot", "elf", "axf", "out", "bin", "wfw",
 )  # fmt: skip
 TRACE_SUFFIXES: Final = (
     "asc", "blf", "csv", "db", "log", "mf4", "pcap", "pcapng", "trc", "gz",

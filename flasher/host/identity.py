@@ -18,7 +18,7 @@ from flasher.host.table import Ending
 from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.image.plausible import Cpu, find_doubt
-from flasher.image.release import Release, target_problem
+from flasher.image.release import Provenance, Release, target_problem
 from flasher.protocol.contents import BatteryStatus, RunningInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Target
@@ -42,6 +42,8 @@ class IdentityCheck(Enum):
     SAME_VERSION = "same-version"
     IN_USE = "in-use"
     CHARGE = "low-charge"
+    UNSIGNED = "unsigned"
+    """Rules of the trust file: signatures before, counters with the device."""
 
     @property
     def option(self) -> str:
@@ -57,6 +59,7 @@ WAIVABLE: Final = (
     IdentityCheck.PREVIOUS,
     IdentityCheck.IN_USE,
     IdentityCheck.CHARGE,
+    IdentityCheck.UNSIGNED,
 )
 """Checks that can refuse an upgrade; the others only warn."""
 OF_STATE: Final = frozenset({IdentityCheck.IN_USE, IdentityCheck.CHARGE})
@@ -66,6 +69,7 @@ _ENDINGS: Final[Mapping[IdentityCheck, Ending]] = {
     IdentityCheck.IN_USE: Ending.IN_USE,
     IdentityCheck.CHARGE: Ending.LOW_CHARGE,
     IdentityCheck.SAME_VERSION: Ending.UP_TO_DATE,
+    IdentityCheck.UNSIGNED: Ending.NOT_TRUSTED,
 }
 """Ending of a session by its refused check, if not NOT_FOR_DEVICE."""
 
@@ -141,6 +145,8 @@ class Identity:
     application (rescue)."""
     cpu: Cpu = Cpu.CORTEX_M
     """Processor type of the device, for the plausibility check."""
+    provenance: Provenance | None = None
+    """Result of checking the image against the trust file; None without one."""
 
     def matches_bytes(self, image: Image) -> bool:
         """True if the manifest contains the SHA-256 of this image."""
@@ -192,7 +198,11 @@ def new_version(image: Image, release: Release | None) -> str | None:
 
 
 def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[CheckResult]:
-    """Check that image and manifest are for the target, and that the image can be a program."""
+    """Check signatures, that image and manifest are for the target, and that the image can be a
+    program.
+    """
+    if identity.provenance is not None:
+        yield _provenance(identity, identity.provenance)
     yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
@@ -213,6 +223,13 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
             wanted=wanted,
         )
         yield CheckResult(IdentityCheck.TARGET, CheckVerdict.UNKNOWN, sentence)
+
+
+def _provenance(identity: Identity, found: Provenance) -> CheckResult:
+    if found.problem is not None:
+        return identity.refusal(IdentityCheck.UNSIGNED, found.text)
+    verdict = CheckVerdict.PASSED if found.signers else CheckVerdict.UNKNOWN
+    return CheckResult(IdentityCheck.UNSIGNED, verdict, found.text)
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
@@ -243,6 +260,7 @@ def judge_device(
     else:
         yield _hardware(identity, answers.hardware_version)
         yield from _versions(image, identity, answers.firmware_version or "")
+        yield from _counter(identity, str(getattr(answers.version, "serial_number", "")))
     if answers.running is not None:
         yield from _state(identity, answers.running)
 
@@ -346,6 +364,21 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
                 oldest=release.previous_from,
             )
         yield identity.refusal(IdentityCheck.PREVIOUS, sentence)
+
+
+def _counter(identity: Identity, serial_number: str) -> Iterator[CheckResult]:
+    """Compare the counter of a signed release with the highest that the device received."""
+    release, provenance = identity.release, identity.provenance
+    if release is None or release.counter is None or provenance is None or not provenance.signers:
+        return
+    highest = provenance.highest_counters.get(serial_number, 0)
+    if release.counter < highest:
+        sentence = text(
+            "the counter of the release is {counter}, and this device received {highest} before",
+            counter=release.counter,
+            highest=highest,
+        )
+        yield identity.refusal(IdentityCheck.UNSIGNED, sentence)
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:

@@ -269,6 +269,12 @@ _EXPLANATIONS: Final = {
         "Compare the image (flasher image-info) with the device (flasher info).",
         code=ErrorCode.NOT_FOR_DEVICE,
     ),
+    Ending.NOT_TRUSTED: _Explanation(
+        WrongDeviceError,
+        "an older release than the device has received: faults that were mended would come back",
+        "Take the newest release of the maker.",
+        code=ErrorCode.NOT_TRUSTED,
+    ),
     Ending.IMPLAUSIBLE: _Explanation(
         ImageError,
         LIKELY_CAUSES,

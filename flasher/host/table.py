@@ -78,6 +78,7 @@ class Ending(Enum):
     BOOT_TOO_OLD = "boot_too_old"
     TWO_DEVICES = "two_devices"
     NOT_FOR_DEVICE = "not_for_device"
+    NOT_TRUSTED = "not_trusted"
     IMPLAUSIBLE = "implausible"
     UNCHECKED = "unchecked"
     IN_USE = "in_use"
@@ -95,6 +96,7 @@ ENDED_BEFORE_START: Final = frozenset(
     {
         Ending.IMPLAUSIBLE,
         Ending.NOT_FOR_DEVICE,
+        Ending.NOT_TRUSTED,
         Ending.IN_USE,
         Ending.LOW_CHARGE,
         Ending.UP_TO_DATE,

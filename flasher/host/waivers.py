@@ -20,6 +20,7 @@ IMPLAUSIBLE: Final = "implausible"
 OUTSIDE_VECTOR: Final = "outside-vector"
 BOOT_NAME: Final = "boot-name"
 BOOT_VERSION: Final = "boot-version"
+UNSIGNED: Final = "unsigned"
 OF_DEVICE: Final[Mapping[str, Waiver]] = {
     IMPLAUSIBLE: Waiver(
         text("bytes that do not look like a program for the device"),
@@ -65,6 +66,10 @@ OF_DEVICE: Final[Mapping[str, Waiver]] = {
     ),
 }
 OF_IMAGE: Final[Mapping[str, Waiver]] = {
+    UNSIGNED: Waiver(
+        text("an image that the trust file of this computer does not allow"),
+        text("Nobody vouches for it: it may be a forgery, or an old release with known faults."),
+    ),
     OUTSIDE_VECTOR: Waiver(
         text("an image whose reset vector points outside of it"),
         text("The device may jump to where no program is, and does not start any more then."),

@@ -7,11 +7,12 @@ them.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Annotated
+from typing import Annotated, Final
 
-from flasher.errors import ErrorCode, ImageError, WrongDeviceError
+from flasher.errors import ErrorCode, FlasherError, ImageError, WrongDeviceError
 from flasher.image.image import Image
 from flasher.protocol.spec import IMAGE_MAX_SIZE, TARGETS, Target, find_target
 from flasher.protocol.text import (
@@ -68,6 +69,9 @@ FirmwareText = Annotated[
 BootText = Annotated[str, Parsed(f"a text of the form {BOOT_VERSION_FORM}", _boot_version)]
 
 
+COUNTER_MAX: Final = 0xFFFF_FFFF
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Value of a manifest key, compared with the image."""
@@ -89,6 +93,10 @@ class Release:
     """Device that the image is for."""
     firmware_version: FirmwareText | None = None
     """Firmware version inside the image."""
+    product: DeviceText | None = None
+    """Product whose releases share a counter."""
+    counter: Annotated[int, NumberRange(ge=1, le=COUNTER_MAX)] | None = None
+    """Number of the release: each one of a product is higher than all before."""
     size_bytes: Annotated[int, NumberRange(ge=1, le=IMAGE_MAX_SIZE)]
     """Number of bytes to send."""
     sha256: Annotated[str, Parsed("64 hex digits", _sha256)]
@@ -155,6 +163,23 @@ class Release:
                     "build: `flasher manifest create --force`.",
                     code=ErrorCode.MANIFEST,
                 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Result of checking an image against the trust file of this computer (`flasher.release`)."""
+
+    text: str
+    """The result as a sentence."""
+    problem: FlasherError | None = None
+    """Refusal; None if the image may be sent."""
+    signers: tuple[str, ...] = ()
+    """Ids of the trusted keys that signed the image; empty if no signature was checked."""
+    trust_version: int | None = None
+    """Version of the trust file; None without one."""
+    warnings: tuple[str, ...] = ()
+    highest_counters: Mapping[str, int] = field(default_factory=dict)
+    """Highest counter that a device has received, by serial number."""
 
 
 def _compared(key: str, stated: str | None, found: str | None) -> Comparison:

@@ -122,7 +122,7 @@ def release_of(
     *,
     source: str = "",
     firmware_version: str | None = None,
-    **statements: str | Sequence[str] | None,
+    **statements: str | int | Sequence[str] | None,
 ) -> Release:
     """Create the release of an image; `statements` are further manifest keys. The default firmware
     version is the one inside the image.

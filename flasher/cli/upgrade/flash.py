@@ -32,7 +32,7 @@ from flasher.cli.upgrade import text
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import ExitCode, FlasherError, UsageError
 from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import (
     DEFAULT_ATTEMPTS,
@@ -42,7 +42,7 @@ from flasher.host.options import (
 )
 from flasher.host.outcome import AGAIN
 from flasher.host.verify import Level
-from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR
+from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR, UNSIGNED, WAIVERS
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -155,13 +155,23 @@ class UpgradeChoices:
     allow_boot_version: Annotated[bool, _waiver_option("boot-version")]
     force: Annotated[bool, option(
         "-f", "--force", is_flag=True, panel="checks before the first write",
-        help="the same as every --allow-... together; neither a damaged file nor a second tool is "
-        "waived by any",
+        help="the same as every --allow-... together but --allow-unsigned; neither a damaged file "
+        "nor a second tool is waived by any",
+    )]  # fmt: skip
+    require_signed: Annotated[bool, option(
+        "--require-signed", is_flag=True, panel="checks before the first write",
+        help="refuse an image that no trusted key has signed (default once this computer has a "
+        "trust file)",
+    )]  # fmt: skip
+    allow_unsigned: Annotated[bool, option(
+        "--allow-unsigned", is_flag=True, panel="checks before the first write",
+        help=f"let through {WAIVERS[UNSIGNED].permits}; --force does not",
     )]  # fmt: skip
 
     def allows(self, name: str) -> bool:
-        """True if --allow-NAME or --force was given."""
-        return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
+        """True if --allow-NAME was given, or --force, which does not waive signatures."""
+        given: bool = getattr(self, f"allow_{name.replace('-', '_')}")
+        return given or (self.force and name != UNSIGNED)
 
     def waived_checks(self) -> frozenset[IdentityCheck]:
         """Waived checks of image and device."""
@@ -262,15 +272,16 @@ class _Upgrade:
         output, choices = self.output, self.choices
         output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
-        release = self.image.find_release(choices.manifest)
         # Check the file before looking for an adapter.
-        image = api.with_release(self.image.load(force=choices.force), release)
+        opened = self._open()
+        image = opened.image
         profile.check_fits(image)
         self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
             self.bus = choose_adapter(self.bus, output)
         waived = [name for name in OF_DEVICE if choices.allows(name)]
         waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
+        waived += [UNSIGNED] * choices.allow_unsigned
         job = api.prepare(
             image,
             profile,
@@ -278,7 +289,8 @@ class _Upgrade:
             options=choices.options(profile, power_up_timeout_s),
             verify=None if choices.dry_run else choices.verify,
             identity=profile.identity(
-                release=release,
+                release=opened.release,
+                provenance=opened.provenance,
                 waived=choices.waived_checks(),
                 skip_same_version=skip_same_version,
                 reports_unchecked=at_power_up,
@@ -295,6 +307,8 @@ class _Upgrade:
         ):
             show(line)
         job.checked()
+        for warning in opened.provenance.warnings if opened.provenance else ():
+            output.error_line(f"warning: {warning}")
         if not choices.dry_run:
             return self._carry_out(job)
         checks = [each.event for each in job.checks]
@@ -308,6 +322,21 @@ class _Upgrade:
                 plan=text.plan_document(job.plan, job.options),
                 checks=checks,
             )
+        )
+
+    def _open(self) -> api.OpenedImage:
+        choices = self.choices
+        if choices.require_signed and choices.allow_unsigned:
+            raise UsageError(
+                "--require-signed and --allow-unsigned contradict each other.",
+                remedy="Leave one of them out.",
+            )
+        return api.open_image(
+            self.image.source,
+            self.target,
+            manifest=choices.manifest,
+            require_signed=choices.require_signed,
+            **self.image.options(force=choices.force),
         )
 
     def _carry_out(self, job: api.Job) -> int:

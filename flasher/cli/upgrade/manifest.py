@@ -129,6 +129,11 @@ def _key_option(key: str, metavar: str, text: str, *, is_list: bool = False) -> 
 @target_option()
 @allow_implausible_option()
 @_key_option("firmware_version", FIRMWARE_VERSION_FORM, "(default: the one inside)")
+@_key_option("product", "NAME", "the product whose releases share a counter")
+@option(
+    "--counter", type=values.count, metavar="N", panel="manifest",
+    help="number of the release: higher than all before of its product",
+)  # fmt: skip
 @_key_option("minimum_boot_version", BOOT_VERSION_FORM, "the oldest bootloader that may receive it")
 @_key_option(
     "previous_from", FIRMWARE_VERSION_FORM, "the oldest running version that it may replace"

@@ -9,6 +9,7 @@ import datetime
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import Any
 
 from flasher.api import CallOptions, Connection, Job
 from flasher.cli.options import Bus
@@ -169,6 +170,7 @@ class UpgradeRun:
             waived=", ".join(self.job.waived),
             again=printable(self.again),
             folder=working_folder(),
+            **_signed(self.job),
         )
 
         def write() -> None:
@@ -207,6 +209,18 @@ class UpgradeRun:
             reason = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
             self.warning = printable(f"no history in {self._history.path}: {reason}")
             self.output.error_line(f"warning: {self.warning}")
+
+
+def _signed(job: Job) -> dict[str, Any]:
+    """Return what the history records of a signed release."""
+    release, provenance = job.identity.release, job.identity.provenance
+    if release is None or provenance is None or not provenance.signers:
+        return {}
+    return {
+        "product": release.product or "",
+        "counter": release.counter or 0,
+        "signers": ", ".join(provenance.signers),
+    }
 
 
 def _now() -> str:
