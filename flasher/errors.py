@@ -141,6 +141,7 @@ class ErrorCode(StrEnum):
     OTHER_VERSION = "E1001"
     WRITE_DIFFERS = "E1002"
     RECORDS_UNPROVEN = "E1003"
+    IN_BOOTLOADER = "E1004"
 
 
 def did_you_mean(

@@ -42,8 +42,8 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "untouched": "this run erased nothing: the device is as it was before",
         "perhaps_erased": "it received the command to erase its application and did not answer: "
         "flash it again, or check after a power cycle what it runs",
-        "no_application": "its application is erased or half written: it stays in its "
-        "bootloader until an image is flashed completely",
+        "no_application": "its application is erased, half written or not accepted: it stays in "
+        "its bootloader until an image is flashed completely",
         "unknown": "it has every byte of the image; whether it runs it is not known",
         "new": "it has the new image",
     },
@@ -54,6 +54,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "memory_right": "every byte read back is the image's",
         "version_other": "the application runs another version than the image names",
         "no_answer": "the application does not answer",
+        "in_bootloader": "a bootloader continues to announce itself, and no application answers",
         "memory_other": "the memory differs from the image",
         "two_devices": "two devices answer on the same id",
         "second_tool": "a second tool speaks on the bus",

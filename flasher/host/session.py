@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
@@ -217,6 +217,7 @@ class UpgradeSession(Runner[Result]):
         if outcome.ok:
             self.limit_at = self.deadline_at
             verification = yield from self._verified()
+            outcome = replace(outcome, device_left=verification.device_left)
         return Result(outcome, verification, self._guard.shutdown_heard, previous)
 
     def _new_identify(self) -> IdentifyStage:

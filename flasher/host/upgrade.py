@@ -44,7 +44,7 @@ from flasher.protocol.messages import (
     UpgradeMessage,
     decode,
 )
-from flasher.protocol.spec import BOOT_VERSION_BURST, Command, Mode
+from flasher.protocol.spec import Command, Mode
 from flasher.protocol.text import boot_version_number, printable
 from flasher.protocol.wire import Damage, Message, encode, split
 
@@ -606,7 +606,7 @@ class UpgradeStage:
         )
         at.watched_since, at.watched_until = now, now + wait_s
         if self._tx.idle:
-            self._timer_at = min(at.watched_until, now + self._burst_s)
+            self._timer_at = min(at.watched_until, now + timings.burst_s)
 
     def _watch_on(self, row: BootVersion | GeneralFeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at
@@ -627,12 +627,7 @@ class UpgradeStage:
             two_rounds_s = 2 * timings.boot_version_spacing_s
             at.watched_until = max(at.watched_until, at.watched_since + two_rounds_s)
         if self._tx.idle:
-            self._timer_at = min(at.watched_until, now + self._burst_s)
-
-    @property
-    def _burst_s(self) -> float:
-        """Silence after which a bootloader has ended its announcement, in seconds."""
-        return BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
+            self._timer_at = min(at.watched_until, now + timings.burst_s)
 
     def _answer_boot(self, row: ReceivedContent) -> None:
         """Send the update command, as there is no evidence of a second device."""
@@ -917,7 +912,7 @@ class UpgradeStage:
             # It announces itself before it can have received the end.
             self._restarted(boot, Reason.RESTARTED)
             return
-        if at.announced_at is None or now - at.announced_last_at > self._burst_s:
+        if at.announced_at is None or now - at.announced_last_at > self._timings.burst_s:
             at.announced_at = now
         at.announced_last_at = now
         if now - at.announced_at >= self._timings.announcing_on_s:
@@ -925,7 +920,7 @@ class UpgradeStage:
             self._restarted(boot, Reason.RESTARTED)
         elif self.state is UpgradeState.ENDING:
             self._tx.drop_unstarted()
-            self._timer_at = now + self._burst_s
+            self._timer_at = now + self._timings.burst_s
             self._report(boot, "boot version after end of transfer")
 
     def _query_version(self, row: ReceivedContent) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import Any, Final
 
 from flasher import events
@@ -23,10 +24,12 @@ from flasher.errors import (
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLeft
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
-from flasher.host.runner import Runner, Stage
+from flasher.host.runner import Runner, Stage, StageInput, filtered
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
+from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Target
+from flasher.protocol.wire import Message
 from flasher.wording import wording
 
 
@@ -47,13 +50,19 @@ class Verdict(Enum):
     MEMORY_RIGHT = "memory_right"
     VERSION_OTHER = "version_other"
     NO_ANSWER = "no_answer"
+    IN_BOOTLOADER = "in_bootloader"
     MEMORY_OTHER = "memory_other"
     TWO_DEVICES = "two_devices"
     SECOND_TOOL = "second_tool"
     INTERRUPTED = "interrupted"
 
 
-_IT_HAS: Final = f"State of the device: {wording(DeviceLeft.NEW)}."
+_LEFT: Final = {
+    Verdict.NO_ANSWER: DeviceLeft.UNKNOWN,
+    Verdict.IN_BOOTLOADER: DeviceLeft.NO_APPLICATION,
+    Verdict.TWO_DEVICES: DeviceLeft.UNKNOWN,
+}
+"""State of the device after verdicts that leave open whether it runs the image."""
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}
 )
@@ -73,43 +82,68 @@ class Verification:
         """True unless an answer contradicts the new image, or is missing."""
         return self.verdict in GOOD
 
+    @property
+    def device_left(self) -> DeviceLeft:
+        """State of a device that has confirmed the image."""
+        if self.running_version and self.verdict is Verdict.NO_ANSWER:
+            return DeviceLeft.NEW  # it ran when it was asked for its version
+        return _LEFT.get(self.verdict, DeviceLeft.NEW)
+
     def error(self, target: Target) -> FlasherError | None:
         """Create the error for the verdict; None for a good one."""
         if self.ok:
             return None
+        error = self._error(target)
+        error.needs_rescue = self.device_left.needs_rescue
+        return error
+
+    def _error(self, target: Target) -> FlasherError:
         ending = f"completed, but {wording(self.verdict)}"
         what = f"{target.node.name}: {ending}"
         what += f" ({self.detail})." if self.detail else "."
+        left = wording(self.device_left)
+        state = f"State of the device: {left}."
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(
                 what,
                 where=f"verification by {self.level.value}",
-                remedy=f"Show its version with flasher info. {_IT_HAS}",
+                remedy=f"Show its version with flasher info. {state}",
             )
         if self.verdict is Verdict.TWO_DEVICES:
-            error = WrongDeviceError(
+            return WrongDeviceError(
                 what,
                 where=f"verification by {self.level.value}",
                 cause=TWO_DEVICES_CAUSE,
                 remedy=TWO_DEVICES_REMEDY,
                 code=ErrorCode.TWO_DEVICES,
             )
-            error.needs_rescue = True  # one of them does
-            return error
         if self.verdict is Verdict.SECOND_TOOL:
             return BusError(
                 what,
                 where=f"verification by {self.level.value}",
                 cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
-                remedy=f"End the other tool, then look at the device with flasher info. {_IT_HAS}",
+                remedy=f"End the other tool, then look at the device with flasher info. {state}",
                 code=ErrorCode.SECOND_TOOL,
             )
+        if self.verdict is Verdict.IN_BOOTLOADER:
+            return VerificationError(
+                what,
+                where=f"verification by {self.level.value}",
+                cause="the device does not start the image that it confirmed, or a second device "
+                "of its kind has lost its application",
+                remedy=f"Connect one {target.node.name} only and flash it again. {state}",
+                code=ErrorCode.IN_BOOTLOADER,
+            )
+        remedy = (
+            "Power-cycle the device and look at it with flasher info; then flash the right image."
+        )
+        if self.device_left.needs_rescue:
+            remedy += f" {state}"
         return VerificationError(
             what,
             where=f"verification by {self.level.value}",
             cause="the device runs another image, fell back to an older one, or does not start",
-            remedy="Power-cycle the device and look at it with flasher info; then flash the right "
-            "image.",
+            remedy=remedy,
             code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,
         )
 
@@ -189,14 +223,16 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     if request is None:
         raise ValueError("this target has no version query")
     give_up_at = run.now + run.timings.application_start_timeout_s
+    announced = _Announcements(run, plan.target)
     while True:
-        query = yield from ask(run, Query(request, quiet=True))
+        query = yield from filtered(ask(run, Query(request, quiet=True)), announced.look)
         if query.answer is not None:
             break
         if run.is_cancelled:
             return Verification(Level.VERSION, Verdict.INTERRUPTED)
-        if run.now >= give_up_at:
-            return Verification(Level.VERSION, Verdict.NO_ANSWER)
+        if run.now >= max(give_up_at, announced.judged_at):
+            verdict = Verdict.IN_BOOTLOADER if announced.go_on else Verdict.NO_ANSWER
+            return Verification(Level.VERSION, verdict)
     again = yield from ask(run, Query(request, quiet=True))
     yield from count_answers(run, [again])
     version = firmware_version(query.answer)
@@ -209,6 +245,39 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
         return Verification(Level.VERSION, Verdict.VERSION_RIGHT, version)
     detail = f"{version} instead of {expected}"
     return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, detail)
+
+
+class _Announcements:
+    """Boot versions of a device whose application is awaited: one that starts it sends a burst, one
+    without any goes on (R11, R14).
+    """
+
+    def __init__(self, run: Runner[Any], target: Target) -> None:
+        self._run, self._answer_id = run, target.answer_id
+        self._first_at, self._last_at = inf, -inf
+        run.also_listen_on(target.answer_id)
+
+    @property
+    def go_on(self) -> bool:
+        return self._last_at - self._first_at >= self._run.timings.announcing_on_s
+
+    @property
+    def judged_at(self) -> float:
+        """Time at which those that have begun have ended or go on; -inf without any."""
+        if self._first_at == inf:
+            return -inf
+        timings = self._run.timings
+        return self._first_at + timings.announcing_on_s + 2 * timings.burst_s
+
+    def look(self, came: StageInput) -> StageInput:
+        """Note a boot version among the inputs of a query."""
+        match came:
+            case Message() if came.can_id == self._answer_id and (
+                isinstance(decode(came), BootVersion)
+            ):
+                self._first_at = min(self._first_at, self._run.now)
+                self._last_at = self._run.now
+        return came
 
 
 def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:

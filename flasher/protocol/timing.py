@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from flasher.protocol.spec import BOOT_VERSION_BURST
 from flasher.validation import NumberRange
 
 Timeout = Annotated[float, NumberRange(gt=0, le=3600)]
@@ -59,6 +60,11 @@ class Timings:
     application_start_timeout_s: Timeout = 5.0
     """From a lost final answer to the version answer of the new application (not in R12: as long as
     a restart may take in the other direction)."""
+
+    @property
+    def burst_s(self) -> float:
+        """Silence after which a bootloader has ended its announcement, in seconds."""
+        return BOOT_VERSION_BURST * self.boot_version_spacing_s
 
 
 DEFAULT_TIMINGS = Timings()

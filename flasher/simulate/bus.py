@@ -17,6 +17,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import OVERHEAD_SIZE, WELLING
+from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
     ACK,
@@ -333,6 +334,10 @@ class PlanBus(SimulatedBus):
         """Time up to which boot versions do not count either; set by the player. One device may
         continue its burst after the update command, or begin it anew.
         """
+        self.awaits_burst = False
+        """The next boot version begins a burst that does not count: one device may start its new
+        application through the bootloader.
+        """
         self._watch = watch
 
     def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
@@ -343,8 +348,8 @@ class PlanBus(SimulatedBus):
         self._delivered_at = ends_at
         self.frames_carried += 1
         word: plans.Sender | None = "device"
-        if self.host is not None and sender is self.host.node:
-            word = "host"
+        if sender in self._hosts:
+            word = "host"  # a killed process may have left frames in its adapter
         elif getattr(sender, "engine", None) is self.agenda:
             word = None
         self._watch(frame, word, ends_at)
@@ -357,14 +362,20 @@ class PlanBus(SimulatedBus):
         if self.is_garbled and self.host is not None:
             self.host.node.inbox.append(ERROR_FRAME)
         if word == "host":
-            if self.host is not None:
+            if self.host is not None and sender is self.host.node:
                 self.host.echo(frame, ends_at)
         elif takes_part and len(senders) == 1 and word is not None:
-            data = frame.data
-            is_ignored = data[4:6] == _GENERAL_FEEDBACK
-            is_ignored |= data[4:6] == _BOOT_VERSION and ends_at <= self.burst_ends_at
-            if data[:2] == _HEADER and not is_ignored:
-                self.heard.add(sender.engine)
+            self._hear(sender, frame.data, ends_at)
+
+    def _hear(self, sender: Any, data: bytes, now: float) -> None:
+        """Note a unit that sends what another one would not."""
+        word = data[4:6]
+        if data[:2] != _HEADER or word == _GENERAL_FEEDBACK:
+            return
+        if word == _BOOT_VERSION and self.awaits_burst:
+            self.awaits_burst, self.burst_ends_at = False, now + DEFAULT_TIMINGS.burst_s
+        if word != _BOOT_VERSION or now > self.burst_ends_at:
+            self.heard.add(sender.engine)
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
         for device in self._devices:

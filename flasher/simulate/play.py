@@ -292,7 +292,9 @@ class Player:
                 if what == "update":
                     self._at_update = self._present
                     self.bus.heard.clear()
-                    self.bus.burst_ends_at = inf
+                    self.bus.burst_ends_at, self.bus.awaits_burst = inf, False
+                elif what == "end" and not self._facts.rules.ends:
+                    self.bus.awaits_burst = True
                 elif what == "packet":
                     ends_at = now + DEFAULT_TIMINGS.leftover_boot_version_s
                     self.bus.burst_ends_at = min(self.bus.burst_ends_at, ends_at)

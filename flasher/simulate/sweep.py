@@ -591,7 +591,7 @@ def _late_boot_versions(trace: Trace) -> Iterator[Limit]:
         )
     end = trace.of(END)
     silent = plans.Answer(when=When("end"), becomes="silence")
-    on_s, burst_s = _TIMES.announcing_on_s, BOOT_VERSION_BURST * _TIMES.boot_version_spacing_s
+    on_s, burst_s = _TIMES.announcing_on_s, _TIMES.burst_s
     series = [after(end, _s(0.3 + 0.1 * turn)) for turn in range(round(on_s / 0.1))]
     yield Limit(
         "announcing_on_s",

@@ -55,6 +55,7 @@ from flasher.wording import wording
 _OF_VERDICT: Final = {
     Verdict.VERSION_OTHER: codes.OTHER_VERSION,
     Verdict.NO_ANSWER: codes.NOT_RUNNING,
+    Verdict.IN_BOOTLOADER: codes.IN_BOOTLOADER,
     Verdict.MEMORY_OTHER: codes.MEMORY_DIFFERS,
     Verdict.SECOND_TOOL: codes.SECOND_TOOL,
     Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
@@ -383,6 +384,10 @@ class UnitSteps:
         answer = target.await_application()
         if answer is None and was_running:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
+        if answer is None and target.continuity.is_announcing:
+            raise StepFailedError(
+                codes.IN_BOOTLOADER, f"The {target.name} stays in its bootloader."
+            )
         if answer is None:
             raise StepFailedError(codes.NOT_RUNNING, f"The {target.name} does not answer.")
         own = self._identified[target.name]

@@ -11,6 +11,7 @@ from pathlib import Path
 from flasher import events
 from flasher.api import DeviceInfo, Result
 from flasher.errors import FlasherError
+from flasher.host.verify import Verdict
 from flasher.protocol.spec import Target
 from flasher.report.base import visible
 from flasher.settings.area import Area
@@ -91,9 +92,16 @@ class Done:
 
     @property
     def is_running(self) -> bool | None:
-        """True if the application answered and does not contradict the new version."""
+        """True if the application answered and does not contradict the new version; False as well
+        if a bootloader announces itself instead.
+        """
         result = self.result
-        if result is None or result.running_version is None:
+        if result is None:
+            return None
+        if (
+            result.running_version is None
+            and result.verification.verdict is not Verdict.IN_BOOTLOADER
+        ):
             return None
         return result.ok
 

@@ -203,6 +203,21 @@ def application_is_silent(scene: Scene) -> Words:
     return scene.flash()
 
 
+def stays_in_its_bootloader(scene: Scene) -> Words:
+    stage = scene.stage
+    device = stage.device
+    device.profile = replace(SMALL, after_complete="restarts")
+
+    def disturb(frame: Frame, _now: float) -> list[Frame]:
+        if frame.data == COMPLETE:
+            erase_the_record, *_ = device.store.erasing(0)
+            device.store.flash.execute(erase_the_record)
+        return [frame]
+
+    stage.disturb = disturb
+    return scene.flash()
+
+
 def up_to_date(scene: Scene) -> Words:
     assert scene.stage.flash().ok
     scene.stage.wait(2.0)
@@ -265,6 +280,8 @@ CASES = [
          "new application", "answer was lost", "Unconfirmed"),
     Case("does not run", ExitCode.VERIFICATION, application_is_silent,
          "verification by version", "does not start", "Power-cycle"),
+    Case("stays in its bootloader", ExitCode.VERIFICATION, stays_in_its_bootloader,
+         "verification by version", "second device", "one BMS only"),
     Case("up to date", ExitCode.NOTHING_TO_DO, up_to_date),
     Case("Ctrl-C", ExitCode.INTERRUPTED, interrupted, P3, "", "seconds to time out"),
     Case("Ctrl-C twice", ExitCode.INTERRUPTED, interrupted_twice,
@@ -313,7 +330,7 @@ def test_a_failure_in_the_transfer_says_what_the_device_is_left_with_and_leaves_
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("flasher.api.connect", stage.connect)
         run = flasher(*case.make(Scene(stage, patch, tmp_path)))
-    assert "State of the device: its application is erased or half written" in run.err
+    assert "State of the device: its application is erased, half written or not accepted" in run.err
     assert "  to repair it:\n    flasher rescue " in run.err
     assert "bundle: " in run.err
     assert "no bundle" not in run.err

@@ -188,7 +188,7 @@ STAGES = [
     (Phase.RESET, "this run erased nothing", False),
     (Phase.BOOT, "this run erased nothing", False),
     (Phase.UPDATE, "it received the command to erase its application", True),
-    (Phase.TRANSFER, "its application is erased or half written", True),
+    (Phase.TRANSFER, "its application is erased, half written or not accepted", True),
     (Phase.END, "it has every byte of the image", True),
 ]
 

@@ -240,7 +240,7 @@ def test_a_signal_in_the_transfer_ends_it_cleanly_and_says_what_to_do(
     assert "stopping at the end of the message ..." in said
     assert "cancelled by the user" in said
     assert "Run the same command again" in said
-    assert "State of the device: its application is erased or half written" in said
+    assert "State of the device: its application is erased, half written or not accepted" in said
     assert "Traceback" not in said
 
 

@@ -116,7 +116,7 @@ def test_ctrl_c_in_an_upgrade_says_what_is_left(
     (tmp_path / IMAGE).write_bytes(image_of(300).data)
     run = flasher("ui", "--mock", "--mock-speed", "2", "--images", tmp_path)
     assert run.code == ExitCode.INTERRUPTED
-    assert "its application is erased or half written" in run.err
+    assert "its application is erased, half written or not accepted" in run.err
     assert "bundle:" in run.err
 
 

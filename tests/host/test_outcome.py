@@ -188,7 +188,8 @@ def test_a_device_needs_rescue_unless_it_is_untouched_or_has_the_image(left: Dev
     "verdict, exit_code, code, needs_rescue",
     [
         (Verdict.VERSION_OTHER, ExitCode.VERIFICATION, ErrorCode.OTHER_VERSION, False),
-        (Verdict.NO_ANSWER, ExitCode.VERIFICATION, ErrorCode.VERIFICATION, False),
+        (Verdict.NO_ANSWER, ExitCode.VERIFICATION, ErrorCode.VERIFICATION, True),
+        (Verdict.IN_BOOTLOADER, ExitCode.VERIFICATION, ErrorCode.IN_BOOTLOADER, True),
         (Verdict.MEMORY_OTHER, ExitCode.VERIFICATION, ErrorCode.VERIFICATION, False),
         (Verdict.TWO_DEVICES, ExitCode.WRONG_DEVICE, ErrorCode.TWO_DEVICES, True),
         (Verdict.SECOND_TOOL, ExitCode.BUS, ErrorCode.SECOND_TOOL, False),

@@ -13,6 +13,7 @@ from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
 from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import DeviceLeft
 from flasher.host.runner import Runner
 from flasher.host.session import Result, UpgradeSession
 from flasher.host.verify import (
@@ -31,6 +32,7 @@ from flasher.protocol import catalogue
 from flasher.protocol.contents import Memory, ReadMemory, VersionInformation
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
+from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, Reassembler, encode, split
@@ -112,9 +114,11 @@ def test_an_application_that_does_not_answer_is_exit_code_10_in_bounded_time() -
     )
     assert result.outcome.ok
     assert result.verification.verdict is Verdict.NO_ANSWER
+    assert result.outcome.device_left is DeviceLeft.UNKNOWN
     error = result.error()
     assert error is not None
     assert error.exit_code == ExitCode.VERIFICATION
+    assert error.needs_rescue
 
 
 def test_the_version_answer_that_replaced_a_lost_final_answer_is_counted_too() -> None:
@@ -297,6 +301,59 @@ def test_an_application_that_starts_slowly_is_waited_for() -> None:
     assert application.next_question() is not None, "it is asked again, to count its answers"
     application.answer(VERSION, VersionInformation(*texts))
     assert application.next_question() is None
+    assert check.result.verdict is Verdict.VERSION_RIGHT
+
+
+_BURST_S = 4 * 0.05
+
+
+@each(
+    "begins_s, pause_s, bursts, verdict",
+    [
+        (0.3, 0.2, 40, Verdict.IN_BOOTLOADER),
+        (0.3, 2.0, 3, Verdict.IN_BOOTLOADER),
+        (4.7, 0.2, 40, Verdict.IN_BOOTLOADER),
+        (0.3, 0.2, 1, Verdict.NO_ANSWER),
+        (0.3, 0.2, 2, Verdict.NO_ANSWER),
+        (4.7, 0.2, 1, Verdict.NO_ANSWER),
+    ],
+)
+def test_a_bootloader_that_announces_itself_beyond_a_burst_runs_no_application(
+    begins_s: float, pause_s: float, bursts: int, verdict: Verdict
+) -> None:
+    check = version_check(planned(), UpgradeOptions())
+    boot = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
+    frames = split(boot.can_id, encode(boot))
+    due = [
+        50.0 + begins_s + burst * (_BURST_S + pause_s) + number * 0.05
+        for burst in range(bursts)
+        for number in range(4)
+    ]
+    application = Application(check)
+    while application.next_question() is not None:
+        while due and due[0] <= application.now:
+            del due[0]
+            for frame in frames:
+                check.receive(frame, application.now)
+    assert check.result.verdict is verdict
+    assert application.now < 50.0 + 8.0
+
+
+def test_an_application_that_starts_after_the_bootloader_announced_itself_late_is_right() -> None:
+    check = version_check(planned(), UpgradeOptions())
+    boot = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
+    application = Application(check)
+    has_announced = False
+    while application.next_question() is not None:
+        if application.now > 54.7 and not has_announced:
+            has_announced = True
+            for frame in split(boot.can_id, encode(boot)):
+                check.receive(frame, application.now)
+        elif application.now > 55.5:
+            texts = ("BM36", "W1", "V1r0r0_20200101", NEW)
+            application.answer(
+                VERSION, VersionInformation(*(WireText(encode_text(each, 16)) for each in texts))
+            )
     assert check.result.verdict is Verdict.VERSION_RIGHT
 
 

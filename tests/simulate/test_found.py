@@ -25,3 +25,48 @@ def test_the_deadline_counts_while_a_second_device_is_waited_for(line: str) -> N
 def test_ctrl_c_ends_the_wait_for_a_second_device() -> None:
     verdict = play(Plan.parse("job packets=4 ; mock ; @end+0.05 interrupt"))
     assert (verdict.ending, verdict.exit_code) == ("completed, interrupted", ExitCode.INTERRUPTED)
+
+
+_TWO_DEVICES = "job packets=60 ; independent {0} ; independent answers=false {0}"
+
+
+@each(
+    "choices, ending",
+    [("", "completed, in_bootloader"), ("empty=listens", "completed, no_answer")],
+)
+def test_a_second_device_that_lost_its_application_needs_a_rescue(
+    choices: str, ending: str
+) -> None:
+    """It is in its bootloader, and the other one confirms for both and answers no query."""
+    devices = _TWO_DEVICES.format(choices)
+    verdict = play(Plan.parse(f"{devices} ; @packet41 power ; @packet82 busoff"))
+    assert verdict.violations == ()
+    assert (verdict.ending, verdict.left) == (ending, "none / new")
+
+
+def test_a_restart_after_the_last_packet_looks_like_the_start_of_the_new_application() -> None:
+    choices = (
+        "restart=0.28644 window=0.674998 empty=listens erase=1.505184 bad_packet=nak_received"
+        " older_packet=silent store=0.141036 start=0.306286 app_upgrade=silent"
+    )
+    verdict = play(
+        Plan.parse(
+            f"job ; independent {choices} ; independent {choices}"
+            " ; @flash112+0.000756 hang seconds=1.230382 ; @end restart"
+        )
+    )
+    assert [each.kind for each in verdict.violations] == ["UNSEEN"]
+    assert (verdict.ending, verdict.left) == ("completed", "none / new")
+
+
+def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() -> None:
+    """They leave when a device that acknowledges them has power again."""
+    verdict = play(
+        Plan.parse(
+            "job packets=10 others=false ; independent spacing=0.0481 listens=after_burst"
+            " empty=listens deaf_in_erase=true update_again=ignored start=0.028774"
+            " ; @packet5+0.002032 power seconds=14.760073"
+            " ; @1.310641 kill again=8.261613 rescue=true"
+        )
+    )
+    assert verdict.violations == ()

@@ -144,6 +144,22 @@ def test_a_dead_unit_fails_with_no_answer(tmp_path: Path) -> None:
     assert bench.journal.rows[-1] == ("step", "identify", "FAIL", "NO_ANSWER")
 
 
+def test_a_unit_that_stays_in_its_bootloader_after_it_confirmed_the_image_fails(
+    tmp_path: Path,
+) -> None:
+    def lose_the_image(frame: Frame, _now: float) -> list[Frame]:
+        if frame.data[4:6] == b"\xc5\x02":
+            erase_the_record, *_ = bench.device.store.erasing(0)
+            bench.device.store.flash.execute(erase_the_record)
+        return [frame]
+
+    profile = replace(NEW_UNIT, after_complete="restarts")
+    bench = UnitBench(tmp_path, profile=profile, disturbance=lose_the_image)
+    result = bench.run()
+    assert (result.outcome, result.code) == (RunState.FAIL, "IN_BOOTLOADER")
+    assert "stays in its bootloader until an image is flashed" in result.text
+
+
 def test_a_unit_that_refuses_the_image_fails(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, profile=replace(NEW_UNIT, image_checksum="crc32"))
     result = bench.run()

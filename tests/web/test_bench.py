@@ -27,6 +27,7 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.history import FlashHistory
+from flasher.host.verify import Level, Verdict, Verification
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
@@ -353,6 +354,15 @@ def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
     assert done.bundle.is_dir()
 
 
+def test_a_bootloader_that_announces_itself_instead_runs_no_new_version(place: BenchPlace) -> None:
+    done = _done(place)
+    assert done.result is not None
+    for verdict, is_running in ((Verdict.IN_BOOTLOADER, False), (Verdict.NO_ANSWER, None)):
+        verification = Verification(Level.VERSION, verdict)
+        result = replace(done.result, verification=verification)
+        assert replace(done, result=result).is_running is is_running
+
+
 def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> None:
     error = _done(place, BikeFault.POWER).error
     assert error is not None
@@ -458,7 +468,7 @@ def test_who_stops_it_is_told_in_which_state_the_device_is_left(
     done = _done(place)
     assert isinstance(done.error, InterruptedByUserError)
     assert done.error.needs_rescue
-    assert "its application is erased or half written" in done.error.remedy
+    assert "its application is erased, half written or not accepted" in done.error.remedy
     assert done.packet in (7, 8)
 
 

@@ -135,7 +135,8 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
     took = f"  {took_s:.1f} s"
     error = result.error()
     if error is not None:
-        left = "" if outcome.ok else f"; {_LEFT[outcome.device_left]}"
+        is_new = outcome.device_left is DeviceLeft.NEW
+        left = "" if is_new else f"; {_LEFT[outcome.device_left]}"
         return failed(error, left + took)
     if not result.ok:
         return ClosingLine("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
