@@ -68,6 +68,7 @@ def _wrong_answers(device: RightDevice | RightCDevice, asked: InitResult) -> Ite
         *NOT_ASKED,
         *(("limits.pause_s",) if own.choice("tx_12") == "waits" else ()),
         *(("rs_03", "device.buffer_bytes") if keeps_old else ()),
+        *(("rs_03_old",) if keeps_old and device.is_bare else ()),
         *(("device.buffer_bytes",) if device.is_bare else ()),
         *(_OF_A_BURST if own.number("versions") == 1 else ()),
         *(("rs_03", "rs_03_old") if device.is_bare and not can_leave else ()),

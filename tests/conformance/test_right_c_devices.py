@@ -12,7 +12,9 @@ import pytest
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.explore import Explorer
 from flasher.conformance.init import ask_device
-from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.results import CaseVerdict
+from flasher.conformance.runner import run
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_devices import faults_of
 from tests.loops import each
@@ -59,13 +61,47 @@ def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> Non
     assert faults_of(9, Selection(cases=("EN-02",)), make=lambda _: device) == []
 
 
-def test_init_finds_the_largest_image_of_one_that_ignores_updates_before_packet_1() -> None:
-    device = right_c_device(1)
-    assert not device.choices["BEFORE_FIRST"]
+def test_an_early_end_may_be_refused_so_late_that_the_bootloader_has_just_restarted() -> None:
+    device = right_c_device(5)
+    profile = ConformanceProfile({**device.profiles["default"].given, "limits.ack_s": 1.5})
+    with device.subject() as subject:
+        report = run(subject, profile, selection=Selection(cases=("EN-02",)))
+    assert [one.verdict for one in report.results] == [CaseVerdict.PASS_IN_PART]
+
+
+@each(
+    "seed, changed, wanted",
+    (
+        # An update command before packet 1 is ignored.
+        (1, {"BEFORE_FIRST": 0}, {"device.largest_image_bytes": 5824}),
+        # The old application is erased with the first full page, of four packets.
+        (3, {}, {"rs_03_old": "either", "rs_03": "listens", "device.buffer_bytes": 256}),
+        # The whole image is one page, written at end of transfer.
+        (3, {"PAGE_BYTES": 8448}, {"rs_03_old": "either", "rs_03": None}),
+        # The old application is kept until packet 1.
+        (5, {}, {"rs_03_old": "either", "rs_03": "announces", "device.largest_image_bytes": 4098}),
+        # An update command in the burst is answered after it.
+        (6, {}, {"up_04_burst": "accepted"}),
+    ),
+)
+def test_init_finds(seed: int, changed: dict[str, int], wanted: dict[str, Value | None]) -> None:
+    device = right_c_device(seed)
+    device = dataclasses.replace(device, choices={**device.choices, **changed})
     with device.subject() as subject:
         asked = ask_device(subject, ConformanceProfile())
     found = {one.key: one.value for one in asked.answers}
-    assert found["device.largest_image_bytes"] == device.choices["LARGEST_BYTES"]
+    assert {key: found[key] for key in wanted} == wanted
+
+
+def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without_power() -> None:
+    device = right_c_device(3)
+    choices = {**device.choices, "PAGE_BYTES": 8448, "PAUSE_US": 2_500_000}
+    device = dataclasses.replace(device, choices=choices, is_bare=True)
+    with device.subject() as subject:
+        asked = ask_device(subject, ConformanceProfile())
+    answer = next(one for one in asked.answers if one.key == "rs_03_old")
+    assert answer.value is None
+    assert answer.seen.endswith("can only be seen with power control")
 
 
 @each(

@@ -179,10 +179,11 @@ def _restart_transfer(
     bench: Bench, image: bytes, stored: int, reply: Received | None = None
 ) -> None:
     """Send packets 1 to `stored` in a new transfer; `reply` is the last message received."""
-    bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
     found = reply if reply is not None and reply.kind is Reply.BOOT_VERSION else None
-    found = found or bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
+    if found is None:
+        bench.send(bench.encoder.reset())
+        found = bench.wait_for(Reply.BOOT_VERSION, within_s=within_s)
     if found is None and bench.profile.allows("rs_03_old", "kept"):
         # The old application started while the early end and what followed it were judged.
         bench.update_again(len(image))

@@ -27,6 +27,9 @@ _ERASE_LEAST_S: Final = 10.0
 _ERASE_MOST_S: Final = 120.0
 _UNKNOWN: Final = 0x7704
 """An unused command."""
+_END_SHARES: Final = (0.0, 0.5, 0.9)
+"""Parts of the time from end of transfer to complete after which to cut the power."""
+_OFF_S: Final = 0.5
 
 
 def burst(session: InitSession) -> Findings:
@@ -344,22 +347,73 @@ def _choice_for(replies: list[Received]) -> str:
 
 
 def old_application(session: InitSession) -> Findings:
-    """Determine whether the old application runs after a transfer that was broken off."""
+    """Determine whether the old application runs after a transfer that was broken off: before
+    packet 1, after it, after the last one, and at end of transfer.
+    """
     bench = session.bench
     why = session.why_no_exit()
     if why:
         yield why
         return
-    for _ in range(REPEATS):
+    trials = list[Trial]()
+    for stored in (0, 1, session.total):
         session.begin()
-        session.packets(1)
+        session.packets(stored)
         bench.leave_transfer()
-        bench.collect(bench.waits.burst_s)
-        runs = bench.application_runs()
-        answer = "the application runs" if runs else "no application runs"
-        yield Trial("kept" if runs else "erased", answer, "a transfer that was broken off", "after")
-        session.begin() if runs else session.update()
-        session.finish()
+        place = f"after packet {stored}" if stored else "before packet 1"
+        trials.append(_old_application_trial(session, place))
+    # A device may buffer a whole image, and erase its application only then.
+    if all(trial.value == "kept" for trial in trials):
+        if not bench.subject.has_power:
+            yield (
+                "kept after each transfer that was broken off before its end; whether end of "
+                "transfer erases it can only be seen with power control"
+            )
+            return
+        for cut in range(len(_END_SHARES)):
+            session.begin()
+            session.packets()
+            if _cut_after_end(session, cut):
+                trials.append(_old_application_trial(session, "after end of transfer"))
+            else:
+                session.await_application()
+    yield from trials
+
+
+def _old_application_trial(session: InitSession, place: str) -> Trial:
+    """After a restart: see whether an application runs, and upgrade the device."""
+    bench = session.bench
+    bench.collect(bench.waits.burst_s)
+    runs = bench.application_runs()
+    answer = "the application runs" if runs else "no application runs"
+    session.begin() if runs else session.update()
+    session.finish()
+    stimulus = f"a transfer that was broken off {place}"
+    return Trial("kept" if runs else "erased", answer, stimulus, "after")
+
+
+def _cut_after_end(session: InitSession, cut: int) -> bool:
+    """Send end of transfer and cut the power before complete: after a flash operation, or where
+    these are not visible after a share of the shortest time that complete took. Returns whether it
+    was cut; otherwise complete was sent first.
+    """
+    bench = session.bench
+    bench.forget()
+    if not bench.subject.has_timed_cuts:
+        times_s = [one.value_s for one in bench.judge.measurements if one.name == TimeName.COMPLETE]
+        bench.send(bench.encoder.end())
+        if bench.wait_for(Reply.COMPLETE, within_s=_END_SHARES[cut] * min(times_s)) is not None:
+            return False
+        bench.power_cycle()
+        bench.await_message(Reply.BOOT_VERSION)
+        return True
+    bench.subject.cut_in_operation(cut, 1.0, _OFF_S)
+    bench.send(bench.encoder.end())
+    within_s = bench.limit("complete_s") + _OFF_S + bench.limit("first_version_s")
+    reply = bench.wait_for(Reply.COMPLETE, Reply.BOOT_VERSION, within_s=within_s)
+    was_cut = bench.subject.take_cut()
+    found = bench.require_received(reply, "complete or boot version", within_s)
+    return was_cut and found.kind is Reply.BOOT_VERSION
 
 
 def without_application(session: InitSession) -> Findings:
@@ -369,12 +423,14 @@ def without_application(session: InitSession) -> Findings:
     if why:
         yield why
         return
-    if bench.choice("rs_03_old") == "kept":
+    old = bench.choice("rs_03_old")
+    if old == "kept":
         yield "the device keeps its old application until complete"
         return
     count = bench.number("versions")
     for _ in range(REPEATS):
         session.begin()
+        session.packets(0 if old == "erased" else session.total)
         bench.leave_transfer()
         more, last_at = 0, bench.now
         while more < 2 * count:
@@ -383,6 +439,11 @@ def without_application(session: InitSession) -> Findings:
                 break
             bench.measure(TimeName.GAP, reply.at - last_at)
             more, last_at = more + 1, reply.at
+        if old != "erased" and more < 2 * count and bench.application_runs():
+            session.begin()
+            session.finish()
+            yield "the device keeps its old application until end of transfer"
+            return
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} more boot versions" + ("" if value == "announces" else ", then silence")
         stimulus = "the first one, without an application"

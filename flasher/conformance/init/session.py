@@ -115,10 +115,13 @@ class InitSession(PacketTransfer):
         return found
 
     def offer_update(self, frames: Sequence[RawFrame]) -> bool:
-        """Send a possible update command for the good image; True when it is accepted."""
+        """Send a possible update command for the good image; True when it is accepted. A device may
+        process one that arrives in its burst only after it.
+        """
         bench = self.bench
         sent = bench.send(frames)
-        reply = bench.wait_for(Reply.REQUEST)
+        within_s = bench.limit("erase_s") + bench.waits.burst_s
+        reply = bench.wait_for(Reply.REQUEST, within_s=within_s)
         if reply is not None:
             bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
             self.stored = 0

@@ -398,14 +398,13 @@ def buffer(session: InitSession) -> Findings:
         left_at = bench.send_packet(image, number).left_at
         reply = bench.expect(Reply.ACK, within_s=ANSWER_S, number=number)
         bench.measure(TimeName.ANSWER, reply.at - left_at)
-        if bench.subject.has_readback and not why:
+        if bench.subject.has_readback:
             stored = image[: number * PACKET_BYTES]
-            if number == 1 and bench.is_kept_aside(stored):
-                why = "the device keeps its old application until complete"
-                continue
             same = bench.difference(stored)
             lacking = max(lacking, 0 if same is None else len(stored) - same)
             written = written or same is None or same >= PACKET_BYTES
+    if bench.subject.has_readback and not written and bench.is_kept_aside(image):
+        why = "the device keeps its old application until complete"
     bench.restart_transfer(len(session.image))
     session.stored = 0
     session.finish()
