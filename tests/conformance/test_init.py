@@ -310,7 +310,7 @@ def test_the_longest_gap_in_a_packet_is_found() -> None:
     "seed, wanted",
     (
         (3, {"device.largest_image_bytes": 31744, "up_08": "rejected"}),
-        (9, {"device.largest_image_bytes": 2348, "rs_03_old": "kept"}),
+        (9, {"device.largest_image_bytes": 2348, "rs_03_old": None}),
         (21, {"device.largest_image_bytes": 14336, "up_08": "starts_over"}),
         (6, {"tx_01": "nak_received", "tx_03": "silence", "tx_13": "restarts"}),
         (7, {"en_02": "same_answer", "fr_10": "either"}),

@@ -442,7 +442,7 @@ def without_application(session: InitSession) -> Findings:
         if old != "erased" and more < 2 * count and bench.application_runs():
             session.begin()
             session.finish()
-            yield "the device keeps its old application until end of transfer"
+            yield "the old application runs after each transfer that was broken off before its end"
             return
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} more boot versions" + ("" if value == "announces" else ", then silence")
