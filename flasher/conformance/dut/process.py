@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import sys
 import tempfile
 import traceback
 from collections.abc import Callable
@@ -92,7 +91,7 @@ class BootloaderProcess:
         its_read_fd, write_fd = os.pipe()
         self._pipe = Pipe(read_fd, write_fd)
         try:
-            if self._is_program and sys.platform == "linux":
+            if self._is_program and hasattr(os, "pidfd_open"):  # Linux
                 self._process = self._spawn(its_read_fd, its_write_fd)
             else:
                 self._process = os.fork()
