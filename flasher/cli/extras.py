@@ -12,7 +12,6 @@ from flasher.errors import ErrorCode, UsageError
 _PACKAGES: Final = {
     "cluster": ("distributed",),
     "mf4": ("asammdf",),
-    "signed": ("cryptography", "securesystemslib"),
     "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("itsdangerous", "pygal", "starlette", "uvicorn"),
 }

@@ -84,6 +84,14 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
             "look.bundle:bundle", "pack what explains a failure into one file to send"
         ),
     },
+    "signed releases": {
+        "release": CommandEntry(
+            "release.release:release", "build, sign, verify and show signed releases"
+        ),
+        "trust": CommandEntry(
+            "release.trust:trust", "choose whose releases are flashed; keys, rotation, revocation"
+        ),
+    },
     "without hardware, and for bootloaders": {
         "mock": CommandEntry("bench.mock:mock", "run the device model on a bus until interrupted"),
         "conformance": CommandEntry(

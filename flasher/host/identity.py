@@ -257,6 +257,7 @@ def judge_device(
     """Compare image and manifest with the application's answers, which may be missing."""
     if answers.version is None:
         yield _versions_unknown(identity, target)
+        yield from _counter(identity, "")
     else:
         yield _hardware(identity, answers.hardware_version)
         yield from _versions(image, identity, answers.firmware_version or "")
@@ -370,6 +371,12 @@ def _counter(identity: Identity, serial_number: str) -> Iterator[CheckResult]:
     """Compare the counter of a signed release with the highest that the device received."""
     release, provenance = identity.release, identity.provenance
     if release is None or release.counter is None or provenance is None or not provenance.signers:
+        return
+    if not serial_number:
+        sentence = text(
+            "the device reports no serial number: whether it received a newer release is not known"
+        )
+        yield CheckResult(IdentityCheck.UNSIGNED, CheckVerdict.UNKNOWN, sentence)
         return
     highest = provenance.highest_counters.get(serial_number, 0)
     if release.counter < highest:

@@ -37,8 +37,6 @@ TOKEN_LIBRARY: Final = "PYKCS11LIB"  # noqa: S105
 """Environment variable with the path of the token's PKCS#11 library."""
 _KEY_FILE_MAX_SIZE: Final = 16 * 1024
 _ID_LENGTH: Final = 16
-_KDF_ROUNDS: Final = 600_000
-"""Rounds of PBKDF2: a tenth of a second for whoever knows the passphrase, and for each guess."""
 
 
 class Scheme(Enum):
@@ -157,9 +155,7 @@ def generate(scheme: Scheme, passphrase: str) -> tuple[bytes, PublicKey]:
     encrypted = private.private_bytes(
         form.Encoding.PEM,
         form.PrivateFormat.PKCS8,
-        form.PrivateFormat.PKCS8.encryption_builder()
-        .kdf_rounds(_KDF_ROUNDS)
-        .build(passphrase.encode("utf-8")),
+        form.BestAvailableEncryption(passphrase.encode("utf-8")),
     )
     der = private.public_key().public_bytes(
         form.Encoding.DER, form.PublicFormat.SubjectPublicKeyInfo
@@ -274,6 +270,6 @@ def _errors() -> Any:
 def missing_package() -> UsageError:
     return UsageError(
         text("Signatures need a package that is not installed: securesystemslib."),
-        remedy=text("Install it: pip install 'welling-flasher[signed]'"),
+        remedy=text("Install it: pip install '.[signed]'"),
         code=ErrorCode.PACKAGE_MISSING,
     )

@@ -162,12 +162,12 @@ def unsigned(source: str, store: TrustStore | None = None) -> Provenance:
     """Provenance of an image without a release, on a computer with a trust file."""
     problem = _load_problem(store or TrustStore())
     if problem is None:
-        problem = _refusal(
-            ErrorCode.RELEASE_UNSIGNED,
+        problem = ImageError(
             text("{file} is not signed.", file=printable(source)),
             remedy=text(
                 "Take the release (*.wfw) of its maker; --allow-unsigned flashes your own image."
             ),
+            code=ErrorCode.RELEASE_UNSIGNED,
         )
     return Provenance(text=text("the image is not signed"), problem=problem)
 
@@ -215,8 +215,6 @@ def provenance_of(
             return unchecked(package.source, is_required=is_required)
         known = _with_chain(package, known, store, warnings)
         signers = _check(package, target, known)
-    except _Refused as refused:
-        return Provenance(text=refused.error.what, problem=refused.error)
     except FlasherError as error:
         return Provenance(text=error.what, problem=error)
     date = max(package.statement.released, known.trust.issued)
@@ -236,12 +234,6 @@ def provenance_of(
         warnings=(*dict.fromkeys(warnings), *warnings_of(known, today)),
         highest_counters=_counters_seen(target, release.product or ""),
     )
-
-
-class _Refused(Exception):  # noqa: N818  carries the error
-    def __init__(self, error: FlasherError) -> None:
-        super().__init__(error.what)
-        self.error = error
 
 
 def _with_chain(package: Package, known: Known, store: TrustStore, warnings: list[str]) -> Known:
@@ -275,44 +267,42 @@ def _learned(
 
 
 def _check(package: Package, target: Target, known: Known) -> frozenset[str]:
-    """Return the ids of the keys that signed. Raises _Refused."""
+    """Return the ids of the keys that signed. Raises ImageError for a release that the trust file
+    does not allow.
+    """
     trust, shown = known.trust, printable(package.source)
     check_target(package, target)
     signers = _check_signatures(package.envelope, target, known, shown)
     if package.statement.released > trust.expires:
-        raise _Refused(
-            _refusal(
-                ErrorCode.RELEASE_EXPIRED,
-                text(
-                    "{file} was released on {released}, when the trust file had expired.",
-                    file=shown,
-                    released=package.statement.released,
-                ),
-                where=text(
-                    "version {version} is valid for releases until {expires}",
-                    version=trust.version,
-                    expires=trust.expires,
-                ),
-                cause=text("the maker has not renewed the trust file, or an old key was misused"),
-                remedy=text("Take a release with a newer trust file from its maker."),
-            )
+        raise ImageError(
+            text(
+                "{file} was released on {released}, when the trust file had expired.",
+                file=shown,
+                released=package.statement.released,
+            ),
+            where=text(
+                "version {version} is valid for releases until {expires}",
+                version=trust.version,
+                expires=trust.expires,
+            ),
+            cause=text("the maker has not renewed the trust file, or an old key was misused"),
+            remedy=text("Take a release with a newer trust file from its maker."),
+            code=ErrorCode.RELEASE_EXPIRED,
         )
     _check_log(package, known, shown)
     release = package.statement.release_for(target)
     minimum = trust.minimum_counters.get(target.name, {}).get(release.product or "", 0)  # type: ignore[call-overload]
     if (release.counter or 0) < minimum:
-        raise _Refused(
-            _refusal(
-                ErrorCode.RELEASE_OLD,
-                text(
-                    "{file} has the counter {counter}; its maker withdrew all below {minimum}.",
-                    file=shown,
-                    counter=release.counter,
-                    minimum=minimum,
-                ),
-                cause=text("an old release, with a fault that was mended since"),
-                remedy=text("Take the newest release from its maker."),
-            )
+        raise ImageError(
+            text(
+                "{file} has the counter {counter}; its maker withdrew all below {minimum}.",
+                file=shown,
+                counter=release.counter,
+                minimum=minimum,
+            ),
+            cause=text("an old release, with a fault that was mended since"),
+            remedy=text("Take the newest release from its maker."),
+            code=ErrorCode.RELEASE_OLD,
         )
     return signers
 
@@ -324,13 +314,11 @@ def _check_signatures(
     role = trust.role(target.name)
     name = target.node.name
     if role is None:
-        raise _Refused(
-            _refusal(
-                ErrorCode.RELEASE_UNSIGNED,
-                text("Nobody may sign images for the {target}.", target=name),
-                where=text("version {version} of the trust file", version=trust.version),
-                remedy=text("Take a newer trust file from the maker of this target's firmware."),
-            )
+        raise ImageError(
+            text("Nobody may sign images for the {target}.", target=name),
+            where=text("version {version} of the trust file", version=trust.version),
+            remedy=text("Take a newer trust file from the maker of this target's firmware."),
+            code=ErrorCode.RELEASE_UNSIGNED,
         )
     signers = trust.signers(role, envelope)
     if len(signers) >= role.threshold:
@@ -350,23 +338,21 @@ def _check_signatures(
         cause = text(
             "keys signed it that the trust file does not name for the {target}", target=name
         )
-    raise _Refused(
-        _refusal(
-            ErrorCode.RELEASE_UNSIGNED,
-            text(
-                "{file} has {count} of the {threshold} signatures that the trust file asks for.",
-                file=shown,
-                count=len(signers),
-                threshold=role.threshold,
-            ),
-            where=text(
-                "the {target}, version {version} of the trust file",
-                target=name,
-                version=trust.version,
-            ),
-            cause=cause,
-            remedy=remedy,
-        )
+    raise ImageError(
+        text(
+            "{file} has {count} of the {threshold} signatures that the trust file asks for.",
+            file=shown,
+            count=len(signers),
+            threshold=role.threshold,
+        ),
+        where=text(
+            "the {target}, version {version} of the trust file",
+            target=name,
+            version=trust.version,
+        ),
+        cause=cause,
+        remedy=remedy,
+        code=ErrorCode.RELEASE_UNSIGNED,
     )
 
 
@@ -397,13 +383,11 @@ def _check_log(package: Package, known: Known, shown: str) -> None:
     elif trust.log is not None and not log.agrees_with(known.seen.log):
         why = text("its log of releases contradicts the one that this computer has seen")
     if why:
-        raise _Refused(
-            _refusal(
-                ErrorCode.RELEASE_LOG,
-                text("{file} is not proven to be public: {why}.", file=shown, why=why),
-                cause=text("a release that its maker never listed, or lists for some only"),
-                remedy=text("Do not flash it, and ask the maker: keys may have been stolen."),
-            )
+        raise ImageError(
+            text("{file} is not proven to be public: {why}.", file=shown, why=why),
+            cause=text("a release that its maker never listed, or lists for some only"),
+            remedy=text("Do not flash it, and ask the maker: keys may have been stolen."),
+            code=ErrorCode.RELEASE_LOG,
         )
 
 
@@ -431,9 +415,3 @@ def _counters_seen(target: Target, product: str) -> dict[str, int]:
     except FlasherError:
         return {}
     return highest_counters(flashes, target=target.name, product=product)
-
-
-def _refusal(
-    code: ErrorCode, what: str, *, where: str = "", cause: str = "", remedy: str = ""
-) -> ImageError:
-    return ImageError(what, where=where, cause=cause, remedy=remedy, code=code)

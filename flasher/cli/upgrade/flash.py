@@ -302,6 +302,7 @@ class _Upgrade:
         table = vector_table(image)
         for line in (
             *text.image_lines(image),
+            *([f"  origin:  {opened.provenance.text}"] if opened.provenance else []),
             *text.vector_lines(table),
             *text.plan_lines(job.plan, job.options),
         ):

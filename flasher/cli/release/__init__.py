@@ -1,0 +1,1 @@
+"""Commands for signed releases and for the keys that this computer trusts."""
