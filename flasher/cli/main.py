@@ -51,6 +51,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "scan": CommandEntry(
             "look.scan:scan", "list the devices on the bus, and identify its dialect"
         ),
+        "verify": CommandEntry(
+            "look.verify:verify", "compare what a device runs with an image, without flashing"
+        ),
         "read": CommandEntry(
             "look.read:read", "read an item of a device by its name, or its memory"
         ),

@@ -36,6 +36,7 @@ from flasher.events import TwoDevicesSeen
 from flasher.host.event_text import warning_text
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
+from flasher.settings.profile import Profile
 from flasher.trace.figures import LinkMeter, LinkReport
 from flasher.trace.taps import EchoFilter, FlightRecorder
 
@@ -187,7 +188,11 @@ def recorded_connection(
 
 @contextmanager
 def recorded_device(
-    options: RecordingOptions, bus: Bus, output: Output, target: Target
+    options: RecordingOptions,
+    bus: Bus,
+    output: Output,
+    target: Target,
+    profile: Profile | None = None,
 ) -> Iterator[tuple[Device, Recording]]:
     """Open a device, with its calls recorded and stopped on request."""
     with (
@@ -197,7 +202,8 @@ def recorded_device(
         watch: CallOptions = {
             "taps": record.taps, "cancelled": stopped, "on_event": partial(record.warn, output),
         }  # fmt: skip
-        yield connection.device(target, dialect=bus.dialect, **watch), record
+        device = connection.device(target, dialect=bus.dialect, profile=profile, **watch)
+        yield device, record
 
 
 @contextmanager

@@ -1,7 +1,7 @@
-"""Verification after an upgrade: version query, or reading the memory back.
+"""Verification of what a device runs: version query, or reading the memory back.
 
-`version`: the new application reports the firmware version named in the image. `memory`: every byte
-of the image is read back.
+`version`: the application reports the firmware version named in the image. `memory`: every byte of
+the image is read back.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from flasher.errors import (
     ErrorCode,
     FlasherError,
     InterruptedByUserError,
+    NoAnswerError,
     UsageError,
     VerificationError,
     WrongDeviceError,
@@ -25,6 +26,7 @@ from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLeft
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
 from flasher.host.runner import Runner, Stage, StageInput, filtered
+from flasher.image.image import AddressSpan
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
 from flasher.protocol.messages import BootVersion, decode
@@ -34,7 +36,7 @@ from flasher.wording import wording
 
 
 class Level(Enum):
-    """Level of the verification after the device has confirmed an upgrade."""
+    """Level of a verification."""
 
     NONE = "none"
     VERSION = "version"
@@ -63,6 +65,7 @@ _LEFT: Final = {
     Verdict.TWO_DEVICES: DeviceLeft.UNKNOWN,
 }
 """State of the device after verdicts that leave open whether it runs the image."""
+_JOINED_BYTES: Final = 16
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}
 )
@@ -76,6 +79,8 @@ class Verification:
     verdict: Verdict
     running_version: str | None = None
     detail: str = ""
+    differing: tuple[AddressSpan, ...] = ()
+    """Address ranges whose memory differs from the image."""
 
     @property
     def ok(self) -> bool:
@@ -89,18 +94,54 @@ class Verification:
             return DeviceLeft.NEW  # it ran when it was asked for its version
         return _LEFT.get(self.verdict, DeviceLeft.NEW)
 
-    def error(self, target: Target) -> FlasherError | None:
-        """Create the error for the verdict; None for a good one."""
+    def error(self, target: Target, *, is_after_upgrade: bool = True) -> FlasherError | None:
+        """Create the error for the verdict; None for a good one. Without an upgrade before it, the
+        device has confirmed nothing.
+        """
         if self.ok:
             return None
-        error = self._error(target)
-        error.needs_rescue = self.device_left.needs_rescue
-        return error
-
-    def _error(self, target: Target) -> FlasherError:
-        ending = f"completed, but {wording(self.verdict)}"
+        verdict = wording(self.verdict)
+        ending = f"completed, but {verdict}" if is_after_upgrade else verdict
         what = f"{target.node.name}: {ending}"
         what += f" ({self.detail})." if self.detail else "."
+        if is_after_upgrade or self.verdict in (Verdict.TWO_DEVICES, Verdict.SECOND_TOOL):
+            error = self._error(target, what)
+            error.needs_rescue = self.device_left.needs_rescue
+            return error
+        return self._error_of_comparison(target, what)
+
+    def _error_of_comparison(self, target: Target, what: str) -> FlasherError:
+        if self.verdict is Verdict.IN_BOOTLOADER:
+            return VerificationError(
+                what,
+                where=f"verification by {self.level.value}",
+                cause="an upgrade of it was broken off or refused: it has no application",
+                remedy=f"Flash it: flasher flash IMAGE -t {target.name}.",
+                code=ErrorCode.IN_BOOTLOADER,
+            )
+        if self.verdict is Verdict.NO_ANSWER:
+            return NoAnswerError(
+                what,
+                where=f"verification by {self.level.value}",
+                cause="it is off, asleep or not connected, or an older device that does not know "
+                "the query",
+                remedy="Wake the device with its key; list the devices on the bus with flasher "
+                "scan.",
+            )
+        is_other = self.verdict is Verdict.VERSION_OTHER
+        cause = "it was flashed with another image"
+        if not is_other:
+            cause = "it was flashed with another image, or another build of the same version"
+        return VerificationError(
+            what,
+            where=f"verification by {self.level.value}",
+            cause=cause,
+            remedy=f"flasher flash IMAGE -t {target.name} upgrades it; "
+            "flasher image-info shows what is in an image.",
+            code=ErrorCode.OTHER_VERSION if is_other else None,
+        )
+
+    def _error(self, target: Target, what: str) -> FlasherError:
         left = wording(self.device_left)
         state = f"State of the device: {left}."
         if self.verdict is Verdict.INTERRUPTED:
@@ -185,7 +226,7 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
         raise UsageError(
             f"A {plan.target.node.name} cannot be verified by {level.value}.",
             cause="the document gives no query for it, and no profile names one",
-            remedy="Leave --verify out, or use --verify none.",
+            remedy="Leave --verify or --level out.",
         )
     if level is Level.MEMORY and plan.image.base is None:
         raise UsageError(
@@ -281,11 +322,15 @@ class _Announcements:
 
 
 def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:
-    """Read the whole image back and compare it; the image must have a base address."""
+    """Read the whole image back and compare it; the image must have a base address. Goes on after a
+    difference, so that the result has all of them.
+    """
     data, base = plan.image.data, plan.image.base or 0
+    differing: list[AddressSpan] = []
+    first = ""
 
     def found(verdict: Verdict, detail: str = "") -> Verification:
-        return Verification(Level.MEMORY, verdict, running_version, detail)
+        return Verification(Level.MEMORY, verdict, running_version, detail, tuple(differing))
 
     for request in memory_requests(base, base + len(data)):
         query = yield from ask(run, Query(request, quiet=True))
@@ -296,11 +341,18 @@ def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> S
         if not isinstance(query.answer, Memory):
             return found(Verdict.NO_ANSWER, f"to a memory read at 0x{start:08X}")
         expected, got = data[start - base : end - base], memory_bytes(query.answer)
-        if got != expected:
-            at = next(index for index, byte in enumerate(expected) if got[index] != byte)
-            detail = f"first at 0x{start + at:08X}: {got[at]:02X} instead of {expected[at]:02X}"
-            return found(Verdict.MEMORY_OTHER, detail)
+        for at, byte in enumerate(expected):
+            if got[at] != byte:
+                first = first or f"first at 0x{start + at:08X}: {got[at]:02X} instead of {byte:02X}"
+                _add_address(differing, start + at)
         run.emit(events.MemoryRead(end - base, len(data)))
         if run.is_cancelled and end - base < len(data):
             return Verification(Level.MEMORY, Verdict.INTERRUPTED)
-    return found(Verdict.MEMORY_RIGHT)
+    return found(Verdict.MEMORY_OTHER, first) if first else found(Verdict.MEMORY_RIGHT)
+
+
+def _add_address(spans: list[AddressSpan], address: int) -> None:
+    """Add an address after all others; a few equal bytes between do not separate two ranges."""
+    is_near = bool(spans) and address - spans[-1].end <= _JOINED_BYTES
+    start = spans.pop().start if is_near else address
+    spans.append(AddressSpan(start, address + 1 - start))

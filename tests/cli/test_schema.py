@@ -91,6 +91,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("info", *MOCK),
         ("info", "-t", "wmc", "--mock", "--mock-speed", "0"),
         ("scan", "--mock", "--mock-speed", "0"),
+        ("verify", Path("nameless.bin"), "--level", "version", *MOCK),
         ("read", "history", *MOCK),
         ("read", "serial-number", *MOCK),
         ("read", "memory", "0x8008000", "0x8008020", *MOCK, "--events"),
@@ -140,6 +141,7 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
     named = {str(word) for word in request.getfixturevalue("words")}
     Path("right.toml").write_text("attempts = 5\n", "utf-8")
     Path("nothing.log").write_text("(1.0) can0 123#616263\n", "utf-8")
+    Path("nameless.bin").write_bytes(bytes(300))
     Path("failed").mkdir()
     Path("failed/trace.log").write_text("(1.0) can0 123#616263\n", "utf-8")
     for name in ("image.bin", "stated.bin"):

@@ -263,6 +263,49 @@ def test_the_first_difference_is_named() -> None:
     assert error.exit_code == ExitCode.VERIFICATION
 
 
+@each(
+    "changed, ranges",
+    [
+        ([200], [(200, 1)]),
+        ([0, len(BYTES) - 1], [(0, 1), (len(BYTES) - 1, 1)]),
+        ([126, 127, 128, 129], [(126, 4)]),  # across two answers
+        ([10, 26], [(10, 17)]),  # 15 equal bytes do not separate
+        ([10, 28], [(10, 1), (28, 1)]),
+        (list(range(len(BYTES))), [(0, len(BYTES))]),
+    ],
+)
+def test_every_range_that_differs_is_found(
+    changed: list[int], ranges: list[tuple[int, int]]
+) -> None:
+    other = bytearray(BYTES)
+    for at in changed:
+        other[at] ^= 0xFF
+    check = memory_check(planned(), UpgradeOptions(), NEW)
+    read_all(Application(check), bytes(other))
+    found = [(span.start - BASE, span.size_bytes) for span in check.result.differing]
+    assert found == ranges
+
+
+@each(
+    "verdict, exit_code",
+    [
+        (Verdict.VERSION_OTHER, ExitCode.VERIFICATION),
+        (Verdict.MEMORY_OTHER, ExitCode.VERIFICATION),
+        (Verdict.IN_BOOTLOADER, ExitCode.VERIFICATION),
+        (Verdict.NO_ANSWER, ExitCode.NO_ANSWER),
+        (Verdict.TWO_DEVICES, ExitCode.WRONG_DEVICE),
+        (Verdict.SECOND_TOOL, ExitCode.BUS),
+    ],
+)
+def test_a_comparison_without_an_upgrade_claims_no_completion(
+    verdict: Verdict, exit_code: ExitCode
+) -> None:
+    error = Verification(Level.VERSION, verdict).error(BMS, is_after_upgrade=False)
+    assert error is not None
+    assert error.exit_code == exit_code
+    assert "completed" not in str(error)
+
+
 def test_an_answer_for_another_address_is_not_taken() -> None:
     check = memory_check(planned(), UpgradeOptions(), NEW)
     application = Application(check)
