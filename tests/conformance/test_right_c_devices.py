@@ -44,6 +44,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (3, "TX-13"),  # whose restart is over when request transfer may have left versions behind
         (8, "TX-01"),
         (4, "TX-13"),  # deaf in a burst of two
+        (21, "EN-07"),  # it takes longer to announce itself than the reset is repeated
         (9, "EN-07"),  # a bootloader that starts its application confirms a reset
         (10, "UP-01"),  # an update command before packet 1 is ignored
         (2, "FR-09"),  # an empty frame splits a message

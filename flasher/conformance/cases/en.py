@@ -11,6 +11,8 @@ from flasher.conformance.wire import END, WRITE, Received, Reply, describe, pack
 
 _RESET_PERIOD_S: Final = 0.2
 """Interval at which a tool repeats a command (4.3)."""
+_RESET_TRIES: Final = 5
+"""Tries within 1 s (4.3)."""
 _SECTOR_BYTES: Final = 8192
 """Padded images are as large as whole sectors of this size, or of a smaller one."""
 _PADDING_MIN: Final = 8
@@ -278,14 +280,18 @@ def in_a_row(bench: Bench) -> None:
         with bench.step(f"upgrade {turn}, {len(image)} bytes"):
             if turn > 1:
                 # A device that is starting its application receives nothing: repeat the reset until
-                # it answers (4.3).
-                within_s = bench.limit("start_s") + bench.limit("first_version_s")
-                deadline, reply = bench.now + within_s, None
+                # it answers (4.3). Each may restart a bootloader before it announces itself
+                # (RS-02), so there is a pause after the tries of a second.
+                first_s = bench.limit("first_version_s")
+                within_s = bench.limit("start_s") + first_s + _RESET_TRIES * _RESET_PERIOD_S
+                deadline, reply, tries = bench.now + within_s, None, 0
                 while reply is None and bench.now < deadline:
+                    tries += 1
+                    pause_s = _RESET_PERIOD_S if tries % _RESET_TRIES else first_s
                     with bench.tester.collecting_feedback():
                         bench.send(bench.encoder.reset())
                         kinds = (Reply.FEEDBACK, Reply.BOOT_VERSION)
-                        reply = bench.wait_for(*kinds, within_s=_RESET_PERIOD_S)
+                        reply = bench.wait_for(*kinds, within_s=pause_s)
                     is_announced = reply is not None and reply.kind is Reply.BOOT_VERSION
                     # A reset that came into its announcements may restart it (RS-02). A bootloader
                     # that ignores it until it starts its application may confirm it (R15).
