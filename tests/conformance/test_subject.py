@@ -129,6 +129,23 @@ class LosesComplete(PythonBootloader):
         self.host.start_application()
 
 
+class RecordsAfterComplete(PythonBootloader):
+    """Writes the record of an image as soon as complete has left the controller."""
+
+    def _end(self) -> None:
+        self._send(b"\xc5\x02", bytes(2))
+        self._start_application()
+
+    def tick(self, now_us: int) -> int | None:
+        is_due = self._is_starting and self._stored > 0
+        if is_due and not self._frames and not self.host.transmit_pending():
+            self._stored = 0
+            check = zlib.crc32(self.host.flash_read(0x1000, self._size))
+            self.host.flash_write(0, struct.pack("<IIII", 0x600DC0DE, self._size, check, 0))
+        due_us = super().tick(now_us)
+        return now_us + 100 if self._is_starting else due_us
+
+
 class SendsWithoutEnd(PythonBootloader):
     """Always has another frame to send, with the number of pending frames, and never waits."""
 
@@ -309,6 +326,7 @@ def test_time_passes_for_one_that_polls_the_clock() -> None:
         ("ReadsOutside", "EN-01", "flash_read at offset 0xFFF0: 32 bytes at 0x08016FF0"),
         ("EndsAtOnce", "BR-01", "the bootloader ended with status 3 in flasher_dut_start"),
         ("StartsWhatIsTorn", "PW-01", "an incomplete application"),
+        ("RecordsAfterComplete", "PW-01", "just after complete: expected application"),
         ("LosesComplete", "EN-01", "expected complete"),
         ("Restarts", "EN-01", "boot version"),
     ],

@@ -152,7 +152,9 @@ class CompiledDevice(Machine):
 
     def frame_sent(self, now: float) -> None:
         if self._to_send:
-            self._left_at = now + frame_bits(self._to_send.popleft()[0]) / self._bitrate_bps
+            # The bus may take a frame while the one before is on the wire.
+            begins_at = max(now, self._left_at)
+            self._left_at = begins_at + frame_bits(self._to_send.popleft()[0]) / self._bitrate_bps
             if self._is_full:
                 self._tick_at = min(self._tick_at, self._left_at)
         else:
