@@ -423,6 +423,8 @@ class Bench:
         if source != BY_BUS:
             stored = self.subject.readback()[: len(image)]
             self.tester.forgive_stall()
+            if stored == image:
+                return None
             pairs = enumerate(zip(stored, image, strict=False))
             at = next((at for at, (one, other) in pairs if one != other), len(stored))
             return None if at == len(image) else at

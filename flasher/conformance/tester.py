@@ -172,8 +172,8 @@ class BusTester:
         """What this program did since it last used the port takes its time, like a power switch."""
         self._left_port_at = self.now
 
-    def _note_stall(self, since: float) -> None:
-        gap_s = self.port.now() - since
+    def _note_stall(self, since: float, now: float) -> None:
+        gap_s = now - since
         if gap_s > self.waits.stall_s:
             self._stalled_s = max(self._stalled_s, gap_s)
 
@@ -296,24 +296,25 @@ class BusTester:
 
     def _pump(self, deadline: float) -> None:
         """Receive one frame, or let time pass until `deadline` or for `_POLL_S`."""
-        now = self.port.now()
+        port = self.port
+        now = port.now()
         if now >= self.ends_at:
             raise CaseLimitReached(
                 f"not finished after {self.ends_at - self.began_at:g} s, the time limit of the case"
             )
         if self._stopped():
             raise RunStopped("the run was stopped")
-        self._note_stall(self._left_port_at)
+        self._note_stall(self._left_port_at, now)
         until = float(min(deadline, self.ends_at, now + _POLL_S))
         try:
-            arrival = self.port.receive(until)
+            arrival = port.receive(until)
         except DeviceCrashed:
-            while (arrival := self.port.receive(self.port.now())) is not None:
+            while (arrival := port.receive(port.now())) is not None:
                 self._record(arrival.at, arrival.frame, sent=arrival.is_echo)
             raise
-        self._left_port_at = self.port.now()
+        self._left_port_at = port.now()
         if arrival is None:
-            self._note_stall(max(now, until))
+            self._note_stall(max(now, until), self._left_port_at)
             return
         frame, at, is_echo = arrival
         self._record(at, frame, sent=is_echo)
@@ -359,12 +360,13 @@ class BusTester:
     def _send_frame(self, frame: RawFrame) -> None:
         if frame.can_id == self.encoder.to_device and frame.data.startswith(_UPDATE_HEAD):
             self.update_was_sent = True
-        self._note_stall(self._left_port_at)
-        self._left_port_at = self.port.now()
-        self.port.send(frame)
-        self._note_stall(self._left_port_at)
-        self._left_port_at = self.port.now()
-        if self.port.echoes:
+        port = self.port
+        began_at = port.now()
+        self._note_stall(self._left_port_at, began_at)
+        port.send(frame)
+        self._left_port_at = port.now()
+        self._note_stall(began_at, self._left_port_at)
+        if port.echoes:
             self._echoes_due += 1
             return
         wire_s = self.wire_s([frame])
