@@ -264,9 +264,9 @@ class Judge:
         got: str,
         by: Mapping[str, float] | None = None,
     ) -> None:
-        if outcome is CheckOutcome.FAIL and self._tester.stalled_s:
-            if all(check.outcome is not CheckOutcome.FAIL for check in self.checks):
-                self.stall = f"this program stalled for {self._tester.stalled_s * 1000:.0f} ms"
+        is_failure, stalled_s = outcome is CheckOutcome.FAIL, self._tester.stalled_s
+        if is_failure and stalled_s and all(one.outcome is not outcome for one in self.checks):
+            self.stall = f"this program stalled for {stalled_s * 1000:.0f} ms"
         judged_by: dict[str, str | float] = {}
         if outcome in (CheckOutcome.FAIL, CheckOutcome.INCONCLUSIVE):
             judged_by |= {**self._choices, **self._tester.expired} if by is None else by

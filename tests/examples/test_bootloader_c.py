@@ -86,7 +86,7 @@ def test_a_bootloader_that_trusts_its_flash_fails_where_the_flash_does(
     (bug,) = [bug for bug in read_bugs() if bug.name.startswith(number)]
     sources = plant(bug, tmp_path)
     make("host", tmp_path, f"DUT={DUT}", source=sources)
-    subject = ("--subject", tmp_path / "libboot.so", "--profile", PROFILE)
+    subject = ("--subject", tmp_path / "boot", "--profile", PROFILE)
     ran = flasher("conformance", "-t", "bms", *subject, "--case", "PW-04", "--json")
     assert ran.code == 12
     (result,) = ran.document["report"]["results"]
@@ -122,7 +122,7 @@ def test_what_failed_is_a_test_in_c_that_only_the_right_bootloader_passes(
     make("host", tmp_path, f"DUT={DUT}", source=wrong)
     test = tmp_path / "exported.c"
     ran = flasher(
-        *("conformance", *action, "-t", "bms", "--subject", tmp_path / "libboot.so"),
+        *("conformance", *action, "-t", "bms", "--subject", tmp_path / "boot"),
         *("--profile", PROFILE, "--export-test", test),
     )
     assert ran.code == 12
