@@ -8,7 +8,10 @@ line.
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import shlex
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
@@ -150,6 +153,22 @@ def did_you_mean(
     """Suggest the closest known word as a sentence with a trailing space; "" if none is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f"Did you mean {spelled(close[0])}? " if close else ""
+
+
+def install_command(*requirements: str) -> str:
+    """Return the command that installs packages into the running Python, quoted for the shell."""
+    words = [sys.executable, "-m", "pip", "install", *requirements]
+    if os.name == "nt":
+        from subprocess import list2cmdline  # noqa: PLC0415  slow, and for this alone
+
+        return list2cmdline(words)
+    return shlex.join(words)
+
+
+def how_to_install(extra: str) -> str:
+    """Return the remedy for missing packages of an extra of flasher."""
+    command = install_command("-c", ".ci/constraints.txt", f".[{extra}]")
+    return f"In the checkout: {command}"
 
 
 def hide_passwords(text: str) -> str:

@@ -193,6 +193,25 @@ def owner_only(path: str, flags: int) -> int:
     return os.open(path, flags, _OWNER_ONLY)
 
 
+def is_folder(path: str | os.PathLike[str]) -> bool:
+    """True for a folder. Raises UsageError for a name in a folder that may not be entered."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def is_regular(path: str | os.PathLike[str]) -> bool:
+    """True for a regular file. Raises UsageError for one in a folder that may not be entered."""
+    return stat.S_ISREG(_mode(path))
+
+
+def _mode(path: str | os.PathLike[str]) -> int:
+    try:
+        return os.stat(path).st_mode  # noqa: PTH116  a name that is not a path
+    except PermissionError as problem:
+        raise _unreadable(printable(os.fspath(path)), problem, UsageError) from problem
+    except (OSError, ValueError):
+        return 0
+
+
 def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) -> None:
     """Create a file readable only by its owner, to be opened by name. An existing one is emptied,
     unless it `is_appended_to`, and loses the permissions of others. Pipes and devices are not

@@ -25,10 +25,11 @@ from flasher.errors import (
 from flasher.files import make_private
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS
-from flasher.settings.profile import FILE_NAME, find_bus, load_profile
+from flasher.settings.profile import FILE_NAME, find_bus, find_profile, load_profile
 from flasher.trace.recorder import Recorder
 from tests.cli.conftest import SAMPLES, Flasher, flasher
 from tests.loops import each
+from tests.rights import permissions_hold
 
 __all__ = ["flasher"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="rights of another kind")
@@ -394,3 +395,17 @@ def test_the_first_of_these_files_goes_before_the_others(
         path.write_text(f"[default]\nchannel = {number}\n")
     monkeypatch.setattr("can.util.CONFIG_FILES", [str(path) for path in files])
     assert can.util.load_file_config()["channel"] == "1"
+
+
+def test_a_home_that_may_not_be_entered_is_reported_and_not_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It might hold a profile with stricter rules."""
+    home = tmp_path / "home"
+    home.mkdir(mode=0)
+    monkeypatch.setattr(
+        "flasher.settings.profile.user_config_path", lambda *_, **__: home / "flasher"
+    )
+    monkeypatch.chdir(tmp_path)
+    with permissions_hold(), pytest.raises(UsageError, match="Permission denied"):
+        find_profile()

@@ -5,10 +5,13 @@ from __future__ import annotations
 import configparser
 import contextlib
 import errno
+import importlib.util
+import re
+import sys
 from collections.abc import Mapping
 from typing import Any, Final
 
-from flasher.bus.back_ends import causes, error_text
+from flasher.bus.back_ends import SERIAL_PORTS, causes, error_text
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, bus_off_error
 from flasher.bus.inspect_interface import (
@@ -20,11 +23,16 @@ from flasher.bus.inspect_interface import (
     restart_commands,
     start_command,
 )
-from flasher.errors import BusError, ErrorCode, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError, install_command
 from flasher.protocol.text import printable
 from flasher.python_can import can
 
-_CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
+_CHANNELS: Final = {
+    "pcan": "PCAN_USBBUS1",
+    "slcan": "COM3",
+    "socketcan": "can0",
+    "udp_multicast": "239.74.163.2",
+}
 _EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "canalystii": ("canalystii", "canalystii"),
     "cantact": ("cantact", "cantact"),
@@ -38,6 +46,25 @@ _EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "udp_multicast": ("multicast", "msgpack"),
 }
 """python-can extra that an interface needs, and the module it installs."""
+_DRIVERS: Final[Mapping[str, str]] = {
+    "etas": "BOA of ETAS (Windows)",
+    "iscan": "the isCAN driver of Thorsis (Windows)",
+    "ixxat": "the VCI driver of Ixxat (Windows)",
+    "kvaser": "CANlib of Kvaser",
+    "neousys": "the WDT_DIO driver of Neousys",
+    "nican": "NI-CAN of National Instruments (Windows, 32-bit Python)",
+    "nixnet": "NI-XNET of National Instruments (Windows)",
+    "pcan": "PCAN-Basic of PEAK",
+    "systec": "the USB-CANmodul driver of SYS TEC (Windows)",
+    "usb2can": "the USB2CAN CANAL driver of 8devices and the Python package pywin32 (Windows)",
+    "vector": "the XL Driver Library of Vector (Windows)",
+}
+"""Software of the maker that an interface needs."""
+_IN_KERNEL: Final = frozenset({"kvaser", "pcan", "usb2can"})
+"""Interfaces whose USB adapters Linux drives itself, as SocketCAN."""
+_DRIVER_MISSING: Final = re.compile(
+    r"library not found|driver missing|could not (be )?load|only supported", re.IGNORECASE
+)
 _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
     "cantact": {"monitor": True},
     "kvaser": {"driver_mode": False},
@@ -125,9 +152,10 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
     try:
         bus = can.Bus(**config, ignore_config=True)
     except Exception as error:
-        raise BusError(
+        where = f"interface {interface}, channel {channel}"
+        raise _software_missing(interface, where, error) or BusError(
             f"The adapter cannot be opened: {error_text(error)}.",
-            where=f"interface {interface}, channel {channel}",
+            where=where,
             cause=_opening_cause(interface, error),
             remedy=_opening_remedy(interface, channel, config.get("bitrate"), error),
             code=ErrorCode.ADAPTER_NOT_OPENED,
@@ -202,6 +230,39 @@ def _code(error: BaseException) -> int | None:
     return None
 
 
+def _software_missing(interface: str, where: str, error: Exception) -> BusError | None:
+    """Return the error for an interface whose Python package or driver is not installed; None if
+    the back end has failed for another reason.
+    """
+    found = BusError(
+        f"The adapter cannot be opened: software for the interface {interface} is missing.",
+        where=where,
+        code=ErrorCode.ADAPTER_NOT_OPENED,
+    )
+    extra = needed_extra(interface)
+    driver = _DRIVERS.get(interface)
+    if extra is not None and importlib.util.find_spec(extra[1]) is None:
+        found.cause = "the Python package for this interface is not installed"
+        command = install_command(f"python-can[{extra[0]}]")
+        found.remedy = f"Run `{command}`."
+    elif driver is not None and _is_driver_missing(error):
+        found.cause = "the driver library of this interface is not installed"
+        found.remedy = f"Install {driver}; `flasher adapters` lists the adapter then."
+        if sys.platform == "linux" and interface in _IN_KERNEL:
+            found.remedy = (
+                f"Use Linux's own driver, as in `-i socketcan -c can0`, or install {driver}; "
+                "`flasher adapters` lists the adapter then."
+            )
+    else:
+        return None
+    return found
+
+
+def _is_driver_missing(error: Exception) -> bool:
+    wrong_names = (NameError, ImportError, AttributeError, can.CanInterfaceNotImplementedError)
+    return isinstance(error, wrong_names) or _DRIVER_MISSING.search(error_text(error)) is not None
+
+
 def _opening_cause(interface: str, error: Exception) -> str:
     code = _code(error)
     if code == errno.EAFNOSUPPORT:
@@ -212,10 +273,10 @@ def _opening_cause(interface: str, error: Exception) -> str:
         return "another program uses the adapter"
     if interface == "socketcan":
         return "the interface does not exist or is down"
-    if isinstance(error, can.CanInterfaceNotImplementedError | ImportError) and needed_extra(
-        interface
-    ):
-        return "the Python package for this interface is not installed"
+    if interface in SERIAL_PORTS:
+        return "it is not plugged in, its port has another name, or another program uses it"
+    if interface == "udp_multicast":
+        return "the channel is not a multicast address"
     if isinstance(error, NameError | ImportError | AttributeError):
         return "the driver library of this interface is not installed"
     return "the adapter is not plugged in, in use by another program, or its driver is missing"
@@ -247,6 +308,13 @@ def _opening_remedy(interface: str, channel: object, bitrate_bps: object, error:
             f"`ip -details link show {channel}` shows its state; "
             f"`{start_command(channel, bitrate_bps)}` (as root) starts it."
         )
-    extra = needed_extra(interface)
-    package = f" (`pip install 'python-can[{extra[0]}]'`)" if extra else ""
-    return f"Plug it in, close other programs that use it, install its driver{package}."
+    if interface in SERIAL_PORTS:
+        return (
+            "Plug it in, and close other programs that use it; `flasher adapters` lists the serial "
+            "ports."
+        )
+    if interface == "udp_multicast":
+        return f"Name one, as in `-i udp_multicast -c {_CHANNELS[interface]}`."
+    if interface == "socketcand" and isinstance(error, TypeError):
+        return "Name its server with `--bus-kwargs host=HOST --bus-kwargs port=29536`."
+    return "Plug it in, close other programs that use it, install its driver."

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
-import shlex
-import sys
 from typing import Final
 
-from flasher.errors import ErrorCode, UsageError
+from flasher.errors import ErrorCode, UsageError, how_to_install
 
 _PACKAGES: Final = {
     "cluster": ("distributed",),
@@ -27,9 +25,3 @@ def need(what: str, extra: str) -> None:
             remedy=how_to_install(extra),
             code=ErrorCode.PACKAGE_MISSING,
         )
-
-
-def how_to_install(extra: str) -> str:
-    """Return the command that installs the packages of an extra into the running Python."""
-    words = [sys.executable, "-m", "pip", "install", "-c", ".ci/constraints.txt", f".[{extra}]"]
-    return f"In the checkout: {shlex.join(words)}"

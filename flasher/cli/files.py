@@ -30,10 +30,13 @@ def check_writable(
     """
     if path is None:
         return
-    if path.is_dir():
-        raise _not_written(path, option, "it is a folder")
-    if not path.parent.is_dir():
-        raise _not_written(path, option, "its folder does not exist")
+    try:
+        if path.is_dir():
+            raise _not_written(path, option, "it is a folder")
+        if not path.parent.is_dir():
+            raise _not_written(path, option, "its folder does not exist")
+    except PermissionError as error:  # a folder above it may not be entered
+        raise _not_written(path, option, str(error.strerror)) from error
     if not is_appended_to and not _can_be_replaced(path):
         raise _not_written(path, option, "its folder may not be written into")
     check_not_read(path, option, others)
@@ -153,6 +156,6 @@ def _not_written(path: Path, option: str, reason: str) -> UsageError:
     return UsageError(
         f"{printable(str(path))} cannot be written: {reason}.",
         where=option,
-        remedy="Name a file in a folder that exists and has room.",
+        remedy="Name a file in a folder that exists, may be written into, and has room.",
         code=ErrorCode.FILE_NOT_WRITTEN,
     )

@@ -14,8 +14,8 @@ import click
 from flasher.cli.framework import CommandEntry, Program, Session, usage_error
 from flasher.cli.help import STYLE
 from flasher.cli.logs import Logs
-from flasher.cli.output import PRINTED, Output
-from flasher.cli.terminal import prepare_streams
+from flasher.cli.output import CHANGING, PRINTED, Output
+from flasher.cli.terminal import may_colour, prepare_streams, started_as
 from flasher.errors import (
     ExitCode,
     FlasherError,
@@ -132,8 +132,6 @@ examples:
 _COMPLETE: Final = "_FLASHER_COMPLETE"
 """Environment variable set by a shell that completes a command line."""
 _LOG: Final = logging.getLogger("flasher.cli")
-_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station", "ui"})
-"""Commands that change a device."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -144,7 +142,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return shell_complete(flasher, {}, "flasher", _COMPLETE, instruction)
     words = list(sys.argv[1:] if argv is None else argv)
     prepare_streams()
-    output = Output(json_wanted="--json" in words)
+    output = Output(
+        json_wanted="--json" in words, program=started_as(), commands=(*COMMANDS, "--help")
+    )
     with Logs(output) as logs:
         session = Session(output, logs, words)
         code = _guarded(lambda: _run(session, words), output)
@@ -153,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(session: Session, words: list[str]) -> int:
-    colours = None if os.environ.get("NO_COLOR") else "auto"
+    colours = "auto" if may_colour() else None
     style = {**STYLE, "color_system": colours}
     try:
         with flasher.make_context("flasher", words, obj=session, rich_help_config=style) as ctx:
@@ -189,8 +189,10 @@ def _guarded(run: Callable[[], int], output: Output) -> int:
 
 def _unfinished(output: Output) -> str:
     """Describe the device after an immediate end, unless the command only reads."""
-    if output.command not in _CHANGING:
+    if output.command not in CHANGING:
         return ""
+    if not output.has_opened:
+        return "No adapter was opened, and nothing was sent: run the same command again."
     return (
         "If something was being written to a device, it ended in the middle of a message and the "
         "state of the device is not known: run the same command again."

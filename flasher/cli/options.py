@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, BinaryIO, Final
+from typing import Annotated, Any, Final
 
 import click
 
@@ -20,7 +21,8 @@ from flasher.bus.detect import DetectedAdapter
 from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
-from flasher.errors import ErrorCode, ImageError, UsageError
+from flasher.errors import ErrorCode, FlasherError, ImageError, UsageError
+from flasher.files import opened
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
 from flasher.host.waivers import IMPLAUSIBLE, OUTSIDE_VECTOR, WAIVERS
 from flasher.image.image import Image
@@ -98,9 +100,21 @@ class ImageOptions:
         """Read the manifest `given`, else the one beside the image; see `api.find_release`."""
         return None if given is None and self.is_piped else find_release(self.image, given)
 
+    @cached_property
+    def _piped(self) -> io.BytesIO:
+        return _standard_input()
+
+    def file_sha256(self) -> str:
+        """Compute the SHA-256 of the file itself, in hexadecimal. Raises ImageError."""
+        if self.is_piped:
+            return hashlib.sha256(self._piped.getbuffer()).hexdigest()
+        with opened(self.image, None, error=ImageError) as (file, _):
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
     def load(self, *, force: bool = False) -> Image:
         """Load the image. Raises ImageError and UsageError."""
-        return load(self.source, **self.options(force=force))
+        with self.advice():
+            return load(self.source, **self.options(force=force))
 
     @property
     def source(self) -> str:
@@ -114,14 +128,30 @@ class ImageOptions:
         if self.fill_gaps_up_to != DEFAULT_FILL_GAPS_UP_TO:
             given["fill_gaps_up_to"] = self.fill_gaps_up_to
         if self.is_piped:
-            given["stream"] = _standard_input()
+            given["stream"] = self._piped
         return {**given, "allow_outside_vector": self.allow_outside_vector or force}
+
+    @contextlib.contextmanager
+    def advice(self) -> Iterator[None]:
+        """Suggest a base with 0x in an error of the image, if the image starts inside itself
+        there.
+        """
+        try:
+            yield
+        except ImageError as error:
+            digits = str(self.base)
+            if error.code is ErrorCode.IMAGE_OUTSIDE and self.base is not None:
+                with contextlib.suppress(FlasherError):
+                    load(self.source, **{**self.options(), "base": int(digits, 16)})
+                    error.cause = "a base without 0x is a decimal number"
+                    error.remedy = f"Did you mean --base 0x{digits}?"
+            raise
 
 
 image_options: Final = option_set("image", ImageOptions)
 
 
-def _standard_input() -> BinaryIO:
+def _standard_input() -> io.BytesIO:
     """Read standard input to its end. Raises UsageError for a terminal and for too many bytes."""
     if sys.stdin.isatty():
         raise UsageError(
@@ -240,6 +270,15 @@ class Bus:
     found: DetectedAdapter | None = None
     """The only detected adapter, if none is named (`flasher.cli.adapters`)."""
 
+    def __post_init__(self) -> None:
+        named = (self.interface, self.channel, self.bitrate, self.timing, self.bus_kwargs)
+        if self.mock and any(named):
+            raise UsageError(
+                "--mock takes no adapter, and an option names or sets one.",
+                remedy="Leave out --mock to use the adapter, or the options of the adapter (-i, "
+                "-c, -b, --timing, --bus-kwargs) to use the device model.",
+            )
+
     @property
     def dialect(self) -> Dialect:
         """Protocol dialect in use."""
@@ -307,14 +346,12 @@ def holder() -> str:
     return " ".join(click.get_current_context().command_path.split()[:2])
 
 
-def mock_options(
-    what: str, speed: Callable[[str], float] = values.seconds
-) -> tuple[Decorator, ...]:
+def mock_options(what: str) -> tuple[Decorator, ...]:
     """Declare --mock and its speed; `what` describes its use."""
     return (
         option("--mock", is_flag=True, panel="without hardware", brief=True, help=what),
         option(
-            "--mock-speed", type=speed, default=1.0, metavar="X", panel="without hardware",
+            "--mock-speed", type=values.speed, default=1.0, metavar="X", panel="without hardware",
             help="speed relative to a real bus; 0: no delays",
         ),
     )  # fmt: skip
@@ -327,8 +364,7 @@ adapter_options: Final = option_set("bus", Bus)
 def bus_options(
     *,
     mock: str | None = "use a device model in this process",
-    speed: Callable[[str], float] = values.seconds,
 ) -> Decorator:
     """Declare the options of the bus: dialect, adapter, and the mock unless that is None."""
-    in_its_place = () if mock is None else mock_options(mock, speed)
+    in_its_place = () if mock is None else mock_options(mock)
     return option_set("bus", Bus, dialect_option, *in_its_place)

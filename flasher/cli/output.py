@@ -12,6 +12,7 @@ import errno
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TextIO
@@ -35,6 +36,10 @@ PRINTED: Final = {"printed": True}
 """Marks log records of printed output, so that -v does not print it twice."""
 
 
+CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station", "ui"})
+"""Commands that change a device."""
+
+
 class ClosingLine(NamedTuple):
     """Last line of a command; its text is complete without its colour."""
 
@@ -46,19 +51,34 @@ class ClosingLine(NamedTuple):
 class Output:
     """Prints for one command. `verbosity`: 0 normal, 1 and 2 more, -1 only results and errors."""
 
-    def __init__(self, *, verbosity: int = 0, json_wanted: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        verbosity: int = 0,
+        json_wanted: bool = False,
+        program: str = "flasher",
+        commands: Iterable[str] = (),
+    ) -> None:
+        """`program` replaces "flasher" in printed command lines, which begin with one of
+        `commands`, so that they run as printed.
+        """
+        self._program = program
+        self._command_line = re.compile(rf"(?<![\w./-])flasher (?=(?:{'|'.join(commands)})\b)")
         self.verbosity = verbosity
         self.json_wanted = json_wanted
         self.events_wanted = False
         """True if each event is printed as a JSON line."""
         self.command: str | None = None
         """Name of the running command; None before it is known."""
+        self.has_opened = False
+        """True once the command may have opened an adapter."""
         self.shows: Callable[[object], bool] = lambda _event: False
         """True for an event that the command prints itself, so that -v does not log it again."""
         self.ending: Callable[[FlasherError], ClosingLine] | None = None
         """Formats the last line for an error, in a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Writes a text to stderr; replaced while a progress bar is on the screen."""
+        self._is_stdout_lost = False
         # A lost terminal no longer reports that it is one.
         self._terminals = [each for each in (sys.stdout, sys.stderr) if each.isatty()]
 
@@ -70,7 +90,13 @@ class Output:
 
     def say(self, text: str) -> None:
         """Write to stderr, wrapped at the window's width."""
-        self.write_stderr(wrapped(text, sys.stderr))
+        self.write_stderr(self.as_started(wrapped(text, sys.stderr)))
+
+    def as_started(self, text: str) -> str:
+        """Replace the program in command lines by how it was started."""
+        if self._program == "flasher":
+            return text
+        return self._command_line.sub(lambda _: f"{self._program} ", text)
 
     def restore_stderr(self) -> None:
         """Write to stderr directly again."""
@@ -85,7 +111,10 @@ class Output:
         """Print a line of the result; silent with --json."""
         if not self.json_wanted:
             _LOG.info("%s", unpainted(text), extra=PRINTED)
-            _print_stdout(wrapped(text, sys.stdout))
+            if self._is_stdout_lost:
+                self.say(text)
+            else:
+                self._print(self.as_started(wrapped(text, sys.stdout)))
 
     def results(self, lines: Iterable[str]) -> None:
         """Print lines of the result."""
@@ -100,11 +129,11 @@ class Output:
     def text(self, text: str) -> None:
         """Print a whole file as the result, unchanged; silent with --json."""
         if not self.json_wanted:
-            _print_stdout(text.removesuffix("\n"))
+            self._print(text.removesuffix("\n"))
 
     def print_help(self, text: str) -> None:
         """Print help, laid out for the window; also with --json."""
-        _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
+        self._print("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
 
     def document(
         self,
@@ -129,7 +158,32 @@ class Output:
             fields = line if isinstance(line, Mapping) else as_json(line)
             text = json.dumps({"schema": SCHEMA_VERSION, **fields})
             _LOG.debug("%s", text, extra=PRINTED)
-            _print_stdout(text)
+            self._print(text)
+
+    def _print(self, text: str) -> None:
+        """Print to stdout. Where that fails, a command that changes a device continues on stderr,
+        and its exit code reports the device; any other raises UsageError.
+        """
+        try:
+            print(text, flush=True)
+        except BrokenPipeError:
+            _give_up(sys.stdout)
+        except OSError as error:
+            _give_up(sys.stdout)
+            if error.errno == errno.EIO:  # the terminal is gone
+                return
+            lost = UsageError(
+                f"Standard output cannot be written: {error.strerror}.",
+                cause="the disk that it is redirected to is full",
+                remedy="Redirect it elsewhere. All work before this message is complete.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
+            )
+            if self.command not in CHANGING:
+                raise lost from error
+            self._is_stdout_lost = True
+            where = "the document is lost" if self.json_wanted else "the results follow here"
+            self.error_line(f"warning: {lost.what[:-1]}; {where}.")
+            self.result(text)
 
     def event(self, event: object) -> None:
         """Print an event of flasher.events as a JSON line, with --events."""
@@ -168,7 +222,8 @@ class Output:
         self.say(f"{head} {text}")
         if self.ending is not None:
             self.verdict(self.ending(error))
-        failure = document_of(ErrorDocument, error, kind=type(error).__name__)
+        words = {name: self.as_started(getattr(error, name)) for name in ("remedy", "command")}
+        failure = document_of(ErrorDocument, error, kind=type(error).__name__, **words)
         return self.document(known, exit_code=error.exit_code, error=failure)
 
 
@@ -177,23 +232,6 @@ def _plain_stderr(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
     except OSError:
         _give_up(sys.stderr)
-
-
-def _print_stdout(text: str) -> None:
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        _give_up(sys.stdout)
-    except OSError as error:
-        _give_up(sys.stdout)
-        if error.errno == errno.EIO:  # the terminal is gone
-            return
-        raise UsageError(
-            f"Standard output cannot be written: {error.strerror}.",
-            cause="the disk that it is redirected to is full",
-            remedy="Redirect it elsewhere. All work before this message is complete.",
-            code=ErrorCode.FILE_NOT_WRITTEN,
-        ) from error
 
 
 def _give_up(stream: TextIO) -> None:

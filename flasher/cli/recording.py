@@ -24,14 +24,21 @@ from platformdirs import user_state_path
 
 from flasher.api import CallOptions, Connection, Device
 from flasher.cli.adapters import choose_adapter
-from flasher.cli.files import check_not_read
+from flasher.cli.files import check_writable
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
-from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, is_secret
+from flasher.errors import (
+    ErrorCode,
+    ExitCode,
+    FlasherError,
+    InterruptedByUserError,
+    UsageError,
+    is_secret,
+)
 from flasher.events import TwoDevicesSeen
 from flasher.host.event_text import warning_text
 from flasher.protocol.spec import Target
@@ -59,7 +66,8 @@ class RecordingOptions:
 
     trace_file: Annotated[str | None, option(
         "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
-        brief=True, help="record all frames; format by suffix (.asc .blf ...)",
+        brief=True, help="record all frames; format by suffix (.asc .blf ...). A file that exists "
+        "is refused; flash and rescue overwrite it with --force",
     )] = None  # fmt: skip
     bundle_dir: Annotated[Path | None, option(
         "--bundle-dir", metavar="DIR", type=FolderPath(), panel="recording",
@@ -70,6 +78,8 @@ class RecordingOptions:
     no_bundle: Annotated[bool, option(
         "--no-bundle", is_flag=True, panel="recording", help="leave none",
     )] = False  # fmt: skip
+    overwrites: bool = False
+    """True if the trace file may exist already (--force)."""
 
 
 recording_options: Final = option_set("recorded", RecordingOptions)
@@ -154,6 +164,7 @@ def recording(
     }
     try:
         with _trace_file(options, record, output):
+            output.has_opened = True
             yield record
     except KeyboardInterrupt:
         record.failed(InterruptedByUserError("Interrupted at once."))
@@ -213,7 +224,14 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
     if path is None:
         yield
         return
-    check_not_read(path, "--trace-file", typed_values(but="trace_file"))
+    check_writable(Path(path), "--trace-file", typed_values(but="trace_file"))
+    if not options.overwrites and Path(path).is_file() and Path(path).stat().st_size:
+        raise UsageError(
+            f"{printable(path)} exists already.",
+            where="--trace-file",
+            remedy="Name another file, or move this one away.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        )
     from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
 
     with Recorder(path) as recorder:

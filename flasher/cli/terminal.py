@@ -6,6 +6,8 @@ import codecs
 import io
 import os
 import re
+import shlex
+import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -27,8 +29,28 @@ _PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
 _COMMAND: Final = re.compile(r"\s*flasher ")
 """Matches a command line, which is never wrapped, so that it can be copied."""
 _ENDS_WITH_COMMAND: Final = re.compile(r"(.*[:|]) (flasher [a-z-]+ .*)")
+_FROM_PATH: Final = "flasher"
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
 """Matches the beginning of a line to whose width further lines are indented."""
+
+
+def started_as() -> str:
+    """Return the words that start this program again as it was started, quoted for a shell:
+    "flasher", ".venv/bin/flasher", "python3 -m flasher", or a file that contains it whole.
+    """
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    if spec is not None and spec.name == "flasher.__main__":
+        return shlex.join([sys.orig_argv[0], "-m", "flasher"])
+    typed = sys.argv[0] if sys.argv else ""
+    path = Path(typed)
+    if path.stem != "flasher" and path.suffix != ".pyz":
+        return _FROM_PATH  # it is a part of another program
+    on_path = shutil.which(_FROM_PATH)
+    if on_path is not None and path.exists() and Path(on_path).samefile(path):
+        return _FROM_PATH
+    if path.suffix == ".pyz" and not os.access(path, os.X_OK):
+        return shlex.join([sys.orig_argv[0], typed])
+    return shlex.quote(typed if os.sep in typed else f".{os.sep}{typed}")
 
 
 def prepare_streams() -> None:
@@ -89,8 +111,13 @@ def window_width(stream: TextIO) -> int | None:
 
 
 def takes_colour(stream: TextIO) -> bool:
-    """True for a terminal, unless NO_COLOR is set."""
-    return stream.isatty() and not os.environ.get("NO_COLOR")
+    """True for a terminal that is not dumb, unless NO_COLOR is set."""
+    return stream.isatty() and may_colour()
+
+
+def may_colour() -> bool:
+    """False if the environment asks for no colours: NO_COLOR, or TERM=dumb."""
+    return not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def painted(text: str, colour: str) -> str:

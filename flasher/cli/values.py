@@ -25,6 +25,8 @@ SLOWEST: Final = 0.1
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
+_PORT_MAX: Final = 65_535
+_CHANNEL: Final = re.compile(r"v?can\d+")
 _NETWORK: Final = Path("/sys/class/net")
 _LINK_TYPE_CAN: Final = "280"
 """ARPHRD_CAN of Linux."""
@@ -51,18 +53,27 @@ def address_range(text: str) -> tuple[int, int]:
     return number(start), number(end)
 
 
-def seconds(text: str) -> float:
-    """Parse a time in seconds, zero or more."""
+def _from_zero(text: str, what: str) -> float:
     with contextlib.suppress(ValueError):
         value = float(text)
         if 0 <= value < float("inf"):
             return value
-    raise click.BadParameter(f"{text!r} is not a time in seconds")
+    raise click.BadParameter(f"{text!a} is not {what}")
+
+
+def seconds(text: str) -> float:
+    """Parse a time in seconds, zero or more."""
+    return _from_zero(text, "a time in seconds")
+
+
+def percent(text: str) -> float:
+    """Parse a percentage, zero or more."""
+    return _from_zero(text, "a number of percent")
 
 
 def speed(text: str) -> float:
     """Parse a speed relative to a real bus: 0, or at least `SLOWEST`."""
-    value = seconds(text)
+    value = _from_zero(text, "a speed: 1 is that of a real bus, 0 has no delays")
     if value and value < SLOWEST:
         raise click.BadParameter(f"must be 0, or {SLOWEST} and more")
     return value
@@ -74,6 +85,13 @@ def count(text: str) -> int:
     if value < 1:
         raise click.BadParameter("must be 1 or more")
     return value
+
+
+def port(text: str) -> int:
+    """Parse the number of a TCP port; 0 is any that is free."""
+    if not text.isdecimal() or int(text) > _PORT_MAX:
+        raise click.BadParameter(f"{text!a} is not a port: 0 to {_PORT_MAX}")
+    return int(text)
 
 
 def key_value(text: str) -> tuple[str, str]:
@@ -112,6 +130,8 @@ def interface(text: str) -> str:
     known = interface_names()
     if text not in known:
         hint = did_you_mean(text, known)
+        if _CHANNEL.fullmatch(text):
+            hint = f"Did you mean -i socketcan -c {text}? "
         raise click.BadParameter(f"there is no {text!a}. {hint}Known are {', '.join(known)}")
     return text
 

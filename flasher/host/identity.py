@@ -97,6 +97,8 @@ class CheckResult(NamedTuple):
     """Other ways to waive the check; continues the sentence that names the option."""
     is_unchecked: bool = False
     """True if a rule of the manifest could not be checked."""
+    is_certain: bool = False
+    """True if the image is another kind of file: a waiver works, but is not offered."""
 
     @property
     def event(self) -> CheckMade:
@@ -115,8 +117,8 @@ class CheckResult(NamedTuple):
     @property
     def waiver(self) -> str:
         """Name of the refused check if it can be waived, else empty."""
-        is_refused = self.verdict is CheckVerdict.REFUSED
-        return self.check.value if is_refused and self.check in WAIVABLE else ""
+        is_offered = self.verdict is CheckVerdict.REFUSED and not self.is_certain
+        return self.check.value if is_offered and self.check in WAIVABLE else ""
 
     @property
     def detail(self) -> str:
@@ -245,7 +247,8 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
         text += ": the manifest was made for these very bytes"
         yield CheckResult(IdentityCheck.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     else:
-        yield identity.refusal(IdentityCheck.PLAUSIBLE, text, found.other_waivers)
+        refused = identity.refusal(IdentityCheck.PLAUSIBLE, text, found.other_waivers)
+        yield refused._replace(is_certain=found.is_certain)
 
 
 # -- the device -------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from flasher.files import opened
 from flasher.image import elf
 from flasher.image.cortexm import check_starts_inside
 from flasher.image.image import ADDRESS_SPACE, Image
+from flasher.image.plausible import file_type
 from flasher.image.records import read_hex, read_srec
 from flasher.image.segments import SparseBytes, too_large_error
 from flasher.protocol.spec import IMAGE_MAX_SIZE
@@ -160,6 +161,8 @@ def _detect(head: bytes, source: str) -> Format:
     """Detect the format from the first `HEAD_SIZE` bytes."""
     if head.startswith(elf.MAGIC):
         return Format.ELF
+    if file_type(head) is not None:
+        return Format.BIN  # an archive may contain records as they are
     body = head.removeprefix(codecs.BOM_UTF8).lstrip()
     if _is_mostly_text(body):
         for form, start in _STARTS.items():

@@ -103,7 +103,9 @@ def check_plausible(image: Image) -> None:
         raise ImageError(
             f"{image.source} {found.text}: not plausible as firmware.",
             cause="the wrong file" if found.is_certain else LIKELY_CAUSES,
-            remedy="Name the firmware file itself; if these really are the bytes to send, add "
+            remedy="Name the firmware file itself."
+            if found.is_certain
+            else "Name the firmware file itself; if these really are the bytes to send, add "
             "--allow-implausible.",
             code=ErrorCode.IMAGE_IMPLAUSIBLE,
         )
@@ -116,15 +118,20 @@ def _foreign(image: Image) -> str | None:
         return f"a program for another processor ({machine_name(image.elf_machine)})"
     if len(data) > 1 and data.count(data[:1]) == len(data):
         return f"one repeated byte (0x{data[0]:02X})"
-    for magic, name in _MAGICS.items():
-        if data.startswith(magic):
-            return name
+    name = file_type(data)
+    if name is not None:
+        return name
     at, mark = _TAR
     if data[at : at + len(mark)] == mark:
         return "a tar archive"
     if data.startswith(b"MZ") and _is_pe(data):
         return "a Windows program"
     return _text(data)
+
+
+def file_type(head: bytes) -> str | None:
+    """Name a file type by the first bytes of a file; None if they are of no known one."""
+    return next((name for magic, name in _MAGICS.items() if head.startswith(magic)), None)
 
 
 def _is_pe(data: bytes) -> bool:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from platformdirs import user_config_path
 
 from flasher.errors import ErrorCode, Fault, ImageError, UsageError
-from flasher.files import read_toml
+from flasher.files import is_regular, read_toml
 from flasher.host.identity import Identity
 from flasher.host.options import DEFAULT_ATTEMPTS, PACKET_GAP_MAX_S, UpgradeOptions
 from flasher.host.query import Request
@@ -353,7 +353,7 @@ def _profile_paths() -> Iterator[Path]:
         directories.insert(0, Path.cwd())
     for directory in directories:
         path = directory / FILE_NAME
-        if path.is_file():
+        if is_regular(path):
             yield path
 
 

@@ -21,7 +21,7 @@ from flasher.bus.detect import (
 )
 from flasher.bus.inspect_interface import SYSFS
 from flasher.bus.physical import is_physical
-from flasher.errors import BusError, ErrorCode, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError, install_command
 from flasher.image.sample import is_sample, sample_error
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
@@ -157,8 +157,7 @@ def detect(
         except ImportError as error:
             raise UsageError(
                 f"Finding a {interface} adapter by its serial number needs pyserial.",
-                remedy="Install python-can with its serial extra: pip install "
-                "'python-can[serial]'.",
+                remedy=f"Run {install_command('python-can[serial]')}",
                 code=ErrorCode.PACKAGE_MISSING,
             ) from error
     if SOCKETCAN in wanted:

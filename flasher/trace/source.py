@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flasher.errors import FlasherError, UsageError
-from flasher.files import JSON_MAX_SIZE, opened, parse_json, read
+from flasher.files import JSON_MAX_SIZE, is_folder, opened, parse_json, read
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
@@ -30,7 +30,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
     """
     damage: list[str] = []
     trace = trace_file(path)
-    report = _report(path / REPORT) if path.is_dir() else {}
+    report = _report(path / REPORT) if is_folder(path) else {}
     rate_bps = report.get("bitrate_bps")
     if not isinstance(rate_bps, int) or not 0 < rate_bps <= _RATE_MAX_BPS:
         rate_bps = None
@@ -51,7 +51,7 @@ def trace_file(path: Path) -> Path:
     """Return the trace file, for a bundle the one in its folder. Raises UsageError for any other
     folder.
     """
-    if not path.is_dir():
+    if not is_folder(path):
         return path
     for name in (TRACE, OLDER_TRACE):
         if (path / name).is_file():

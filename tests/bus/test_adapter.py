@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import errno
+import sys
 import time
 import uuid
 from collections import deque
@@ -479,7 +480,7 @@ def test_listening_only_is_asked_for_in_the_back_ends_own_words(
     [
         (PermissionError(errno.EACCES, "denied"), "may not use", "dialout"),
         (OSError(errno.EBUSY, "busy"), "another program", "close other programs"),
-        (can.CanInterfaceNotImplementedError("no serial"), "Python package", "python-can[serial]"),
+        (FileNotFoundError(errno.ENOENT, "no file"), "another name", "`flasher adapters`"),
     ],
 )
 def test_why_it_cannot_be_opened_is_found_behind_the_back_ends_own_error(
@@ -497,6 +498,48 @@ def test_why_it_cannot_be_opened_is_found_behind_the_back_ends_own_error(
         open_adapter(250_000, interface="slcan", channel="/dev/ttyACM0")
     assert cause in caught.value.cause
     assert remedy in caught.value.remedy
+    assert "pip install" not in caught.value.remedy
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_a_missing_package_is_installed_into_the_python_that_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(**_config: Any) -> can.BusABC:
+        raise can.CanInterfaceNotImplementedError("no module 'usb'")
+
+    monkeypatch.setattr("can.Bus", fail)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(BusError, match="software for the interface gs_usb is missing") as caught:
+        open_adapter(250_000, interface="gs_usb", channel="0")
+    assert caught.value.remedy.startswith(f"Run `{sys.executable} -m pip install ")
+    assert "python-can[gs-usb]" in caught.value.remedy
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    ("interface", "error", "software"),
+    [
+        ("kvaser", NameError("name 'canGetNumberOfChannels' is not defined"), "CANlib"),
+        ("pcan", can.CanInitializationError("pcanbasic library not found"), "PCAN-Basic"),
+        ("ixxat", ImportError("cannot import name 'HRESULT'"), "VCI"),
+        ("etas", AttributeError("module 'ctypes' has no attribute 'windll'"), "BOA"),
+        ("vector", can.CanInitializationError("only supported on Windows"), "XL Driver Library"),
+        ("neousys", can.CanInitializationError("Neousys WDT_DIO Can driver missing."), "WDT_DIO"),
+        ("iscan", can.CanInitializationError("Could not load isCAN driver"), "isCAN"),
+    ],
+)
+def test_a_back_end_without_its_driver_names_the_software_to_install(
+    monkeypatch: pytest.MonkeyPatch, interface: str, error: Exception, software: str
+) -> None:
+    def fail(**_config: Any) -> can.BusABC:
+        raise error
+
+    monkeypatch.setattr("can.Bus", fail)
+    with pytest.raises(BusError, match=f"software for the interface {interface}") as caught:
+        open_adapter(250_000, interface=interface, channel="0")
+    assert software in caught.value.remedy
+    assert str(error) not in str(caught.value)
 
 
 # -- health ---------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ What is plugged in is a substitute, at the edge where python-can, pyserial and L
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -130,8 +131,8 @@ def test_what_cannot_be_seen_is_said_with_its_reason(
         "kvaser": "no_answer", "vector": "failed", "ixxat": "not_loaded", "nican": "cannot_tell",
     }  # fmt: skip
     assert seen["vector"]["text"] == "OSError: \\x1b no driver"
-    assert seen["gs_usb"]["fix"] == "pip install 'python-can[gs-usb]'"
-    assert seen["slcan"]["fix"] == "pip install 'python-can[serial]'"
+    assert seen["gs_usb"]["fix"] == f"{sys.executable} -m pip install 'python-can[gs-usb]'"
+    assert seen["slcan"]["fix"] == f"{sys.executable} -m pip install 'python-can[serial]'"
     assert seen["socketcand"]["fix"] == "flasher adapters --network"
     assert not {"virtual", "udp_multicast", "socketcan"} & seen.keys()
     assert run.document["serial_ports"] is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -479,7 +480,9 @@ def test_a_missing_package_is_named_with_its_command(
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     run = examine("-i", "gs_usb", "-c", "0")
-    assert one(run, "the package 'gs_usb'")[1] == ["pip install 'python-can[gs-usb]'"]
+    assert one(run, "the package 'gs_usb'")[1] == [
+        f"{sys.executable} -m pip install 'python-can[gs-usb]'"
+    ]
     assert not [what for what in found(examine(*ON_CAN0)) if "the package" in what]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -154,3 +155,25 @@ def test_hostile_names_are_shown_harmlessly(flasher: Flasher, tmp_path: Path) ->
     assert "\x1b" not in run.out + run.err
     missing = flasher("image-info", tmp_path / "\x1b]0;x.bin")
     assert "\x1b" not in missing.err
+
+
+def test_the_hash_of_the_file_and_that_of_the_bytes_to_send_are_both_named(
+    flasher: Flasher, pipe: Callable[[bytes], None]
+) -> None:
+    path = SAMPLES / "wmc.hex"
+    whole = hashlib.sha256(path.read_bytes()).hexdigest()
+    run = flasher("image-info", path)
+    sent = flasher("image-info", path, "--json").document["image"]["sha256"]
+    assert f"{sent} of the bytes to send" in run.out
+    assert f"{whole} of the file itself" in run.out
+    pipe(path.read_bytes())
+    assert flasher("image-info", "-", "--json").document["file_sha256"] == whole
+
+
+@each("more, node", [((), "WMC"), (("-t", "obc", "--allow-implausible"), "OBC")])
+def test_without_a_target_the_plan_is_for_the_one_that_the_image_names(
+    flasher: Flasher, more: tuple[str, ...], node: str
+) -> None:
+    run = flasher("image-info", SAMPLES / "wmc.hex", *more)
+    assert f"  to:      {node} " in run.out
+    assert ("the image names it" in run.out) is (not more)

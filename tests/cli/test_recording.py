@@ -303,3 +303,19 @@ def test_a_silent_device_leaves_a_bundle_that_is_explained(
     assert "reported then: exit code 5" in told.out
     assert "flasher read version-information --mock" in told.out
     assert "The BMS did not answer." in told.out
+
+
+def test_an_existing_trace_file_is_overwritten_only_with_force(
+    flasher: Flasher, short_bms: Path, tmp_path: Path
+) -> None:
+    trace = tmp_path / "kept.asc"
+    trace.write_text("evidence\n")
+    words = ("flash", short_bms, "-t", "bms", "--mock", "--mock-speed", "0", "--trace-file", trace)
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert "exists already" in run.err
+    assert trace.read_text() == "evidence\n"
+    assert flasher(*words, "--force").code == ExitCode.OK
+    assert "evidence" not in trace.read_text()
+    trace.write_text("")
+    assert flasher(*words).code == ExitCode.OK

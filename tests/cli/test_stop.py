@@ -322,3 +322,36 @@ def test_sigterm_to_all_processes_of_a_station_finishes_the_runs_that_go_on(tmp_
     assert units
     assert {unit["outcome"] for unit in units} == {"pass"}
     assert "Ctrl-C again" in err
+
+
+@signals_reach_processes
+def test_ctrl_c_while_the_program_loads_is_one_line_without_a_traceback(tmp_path: Path) -> None:
+    interrupted = """\
+import builtins, os, signal, sys
+real = builtins.__import__
+def load(name, *others):
+    if name == "flasher.cli.main":
+        os.kill(os.getpid(), signal.SIGINT)
+    return real(name, *others)
+builtins.__import__ = load
+import flasher_start
+sys.exit(flasher_start.main())
+"""
+    environment = {**clean_environment(), "PYTHONPATH": str(SAMPLES.parent)}
+    ran = subprocess.run(
+        [sys.executable, "-c", interrupted],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env=environment,
+    )  # fmt: skip
+    assert (ran.returncode, ran.stdout) == (ExitCode.INTERRUPTED, "")
+    assert ran.stderr == "error: Interrupted at once. [E130]\n"
+
+
+@pytest.mark.parametrize("command", ["flash", "rescue"])
+def test_an_end_before_an_adapter_is_opened_leaves_no_doubt_about_the_device(
+    flasher: Flasher, short_bms: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setattr("flasher.cli.upgrade.flash.load_profile", interrupt)
+    run = flasher(command, short_bms, "-t", "bms", "--mock")
+    assert run.code == ExitCode.INTERRUPTED
+    assert "nothing was sent" in run.err
+    assert "not known" not in run.err

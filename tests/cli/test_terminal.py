@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 
 import pytest
 
 from flasher.cli.main import main
-from flasher.cli.terminal import painted, wrap_line
+from flasher.cli.terminal import painted, started_as, takes_colour, wrap_line
 from flasher.errors import ExitCode
 from tests.loops import each
 from tests.trace import traffic
@@ -111,3 +114,66 @@ def test_json_alone_is_answered_in_json(flasher: Flasher) -> None:
     run = flasher("--json")
     assert run.code == ExitCode.USAGE
     assert json.loads(run.out)["error"]["kind"] == "UsageError"
+
+
+# -- how the program was started ------------------------------------------------------------------
+
+
+@each(
+    "orig_argv, module, program",
+    [
+        (["python3", "-m", "flasher"], "flasher.__main__", "python3 -m flasher"),
+        ([".venv/bin/python3", ".venv/bin/flasher"], None, ".venv/bin/flasher"),
+        (["/usr/bin/python3", "my tools/flasher"], None, "'my tools/flasher'"),
+        (
+            ["/usr/bin/python3", "/nowhere/flasher.pyz"],
+            None,
+            "/usr/bin/python3 /nowhere/flasher.pyz",
+        ),
+        (["python3", "-m", "pytest"], "pytest.__main__", "flasher"),
+    ],
+)
+def test_the_words_that_start_the_program_again_are_those_that_started_it(
+    orig_argv: list[str], module: str | None, program: str
+) -> None:
+    spec = None if module is None else ModuleSpec(module, None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys.modules["__main__"], "__spec__", spec)
+        patch.setattr(sys, "orig_argv", orig_argv)
+        patch.setattr(sys, "argv", orig_argv[1:])
+        assert started_as() == program
+
+
+def test_the_program_on_the_path_is_named_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "flasher"
+    program.touch(mode=0o755)
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    monkeypatch.setattr(sys, "argv", [str(program)])
+    assert started_as() == str(program)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert started_as() == "flasher"
+
+
+def test_commands_are_printed_as_the_program_was_started_and_no_other_words(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.cli.main.started_as", lambda: "bin/flasher")
+    run = flasher("help", "E999", "--json")
+    assert "`bin/flasher help codes`" in run.err
+    assert "`bin/flasher help codes`" in run.document["error"]["remedy"]
+    run = flasher("image-info", SAMPLES / "bms.hex")
+    assert "a firmware sample of flasher, refused" in run.out
+
+
+@each("name, value", [("NO_COLOR", "1"), ("TERM", "dumb")])
+def test_a_terminal_without_colours_gets_none(name: str, value: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("NO_COLOR", raising=False)
+        patch.setenv("TERM", "xterm")
+        terminal = io.StringIO()
+        patch.setattr(terminal, "isatty", lambda: True, raising=False)
+        assert takes_colour(terminal)
+        patch.setenv(name, value)
+        assert not takes_colour(terminal)

@@ -197,7 +197,7 @@ def judged(
     "image, identity, verdict, text, detail",
     [
         (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(), REFUSED, "the image is a zip archive",
-         "the image is a zip archive; --allow-implausible waives this"),
+         "the image is a zip archive"),
         (Image.from_bytes(bytes(4) + VECTORS), Identity(), REFUSED, "no Cortex-M vector table",
          "--allow-implausible waives this, as does"),
         (Image.from_bytes(bytes(4) + VECTORS), Identity(cpu=Cpu.OTHER), UNKNOWN,

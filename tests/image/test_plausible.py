@@ -48,7 +48,7 @@ def test_another_kind_of_file_is_named_and_is_certain(data: bytes, words: str) -
     with pytest.raises(ImageError, match=f"is {words}: not plausible as firmware") as caught:
         check_plausible(Image.from_bytes(data, source="it.bin"))
     assert caught.value.exit_code is ExitCode.IMAGE
-    assert "--allow-implausible" in caught.value.remedy
+    assert caught.value.remedy == "Name the firmware file itself."
 
 
 def test_an_elf_of_another_machine_is_no_firmware_whatever_it_begins_with(tmp_path: Path) -> None:

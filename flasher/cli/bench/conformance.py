@@ -557,7 +557,7 @@ def _list(selection: Selection, output: Output) -> int:
 @argument("old", type=values.FilePath("json", gives=Path), metavar="OLD", help="the older report")
 @argument("new", type=values.FilePath("json", gives=Path), metavar="NEW", help="the newer report")
 @option(
-    "--threshold", type=values.seconds, default=THRESHOLD_PERCENT, metavar="PERCENT",
+    "--threshold", type=values.percent, default=THRESHOLD_PERCENT, metavar="PERCENT",
     help="a time is slower when its median or p95 grew by more than this, and by more than its "
     "uncertainty",
 )  # fmt: skip

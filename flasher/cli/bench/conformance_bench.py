@@ -53,6 +53,7 @@ def opened(
     def stopping() -> None:
         output.progress("stopping: the device gets its good image back; press again to end at once")
 
+    output.has_opened = True
     with open_bench(bench) as (subject, profile), stop_on_signal(stopping) as stopped:
         yield subject, profile, stopped
 

@@ -19,7 +19,7 @@ from flasher.cli.adapters import describe_adapter, detect_adapters, interface_of
 from flasher.cli.framework import command, option
 from flasher.cli.output import Output
 from flasher.cli.values import interface_names
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, install_command
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 
@@ -171,5 +171,5 @@ def _list_unseen(
 
 
 def _missing(name: str, extra: str) -> NotSeen:
-    fix = f"pip install 'python-can[{extra}]'"
+    fix = install_command(f"python-can[{extra}]")
     return NotSeen(name, "package_missing", "Python package missing", fix)

@@ -18,6 +18,7 @@ from flasher.cli.recording import bundle_folder
 from flasher.cli.terminal import painted, takes_colour
 from flasher.cli.upgrade.history import describe_progress, repeat_command
 from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.files import is_folder
 from flasher.history import MOCK, Flash, FlashHistory
 from flasher.protocol.text import printable
 from flasher.trace.story import Story
@@ -87,7 +88,7 @@ def explain(
     from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
 
     source = find_source(trace, last=last)
-    in_folder = (TRACE, OLDER_TRACE, REPORT) if source.is_dir() else ()
+    in_folder = (TRACE, OLDER_TRACE, REPORT) if is_folder(source) else ()
     check_writable(html, _HTML, [source, *(source / name for name in in_folder)])
     story = explain_path(source, bitrate_bps=bitrate, everything=everything)
     is_coloured = takes_colour(sys.stdout)

@@ -28,7 +28,7 @@ from flasher.bus.inspect_interface import (
 )
 from flasher.bus.opening import needed_extra
 from flasher.cli.output import counted
-from flasher.errors import BusError, hide_passwords
+from flasher.errors import BusError, hide_passwords, install_command
 from flasher.host.survey import Survey
 from flasher.protocol import contents
 from flasher.protocol.frame import Frame
@@ -103,7 +103,7 @@ def package(interface: str) -> Iterator[Finding]:
     if needed is not None and importlib.util.find_spec(needed[1]) is None:
         extra, module = needed
         what = f"the package {module!r}, which the interface {interface} needs, is not installed"
-        yield _problem("python-can", what, (f"pip install 'python-can[{extra}]'",))
+        yield _problem("python-can", what, (install_command(f"python-can[{extra}]"),))
 
 
 def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:

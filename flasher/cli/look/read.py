@@ -125,7 +125,10 @@ def read(
         return _read_item(item, target, bus, recorded, output)
     first, stop = _range(start, end)
     if target is not BMS:
-        raise UsageError(f"The documents give no way to read memory of the {target.node.name}.")
+        raise UsageError(
+            f"The documents give no way to read memory of the {target.node.name}.",
+            remedy="Use -t bms.",
+        )
     if file is None and format:
         raise UsageError("--format needs --output FILE.")
     check_writable(file, _OUTPUT)

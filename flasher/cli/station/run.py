@@ -83,6 +83,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
         if is_virtual:  # serial numbers that are not in the records yet
             known = partial(store.read.known, recipe.recipe.part)
             first = next_number(recipe.recipe.serial_number, known)
+        output.has_opened = True
         session.station = Station(
             store,
             recipe,

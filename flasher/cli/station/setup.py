@@ -7,11 +7,10 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from flasher.cli.extras import how_to_install
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
-from flasher.errors import ErrorCode, UsageError
+from flasher.errors import ErrorCode, UsageError, how_to_install
 from flasher.station.config import StationConfig
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of

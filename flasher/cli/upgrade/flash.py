@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Final
 
 import click
@@ -202,7 +202,7 @@ _upgrade_options: Final = option_set("choices", UpgradeChoices)
     "--skip-same-version", is_flag=True, panel="upgrade",
     help="leave a device alone that already runs the image's version: exit code 11",
 )  # fmt: skip
-@bus_options(mock="upgrade a device model in this process", speed=values.speed)
+@bus_options(mock="upgrade a device model in this process")
 @recording_options
 def flash(
     output: Output,
@@ -231,7 +231,7 @@ def flash(
     "--wait", type=values.seconds, metavar="S", panel="upgrade", brief=True,
     help=f"seconds to wait for the announcement (default {DEFAULT_POWER_UP_TIMEOUT_S:g})",
 )  # fmt: skip
-@bus_options(mock="upgrade a device model in this process", speed=values.speed)
+@bus_options(mock="upgrade a device model in this process")
 @recording_options
 def rescue(
     output: Output,
@@ -332,20 +332,23 @@ class _Upgrade:
                 "--require-signed and --allow-unsigned contradict each other.",
                 remedy="Leave one of them out.",
             )
-        return api.open_image(
-            self.image.source,
-            self.target,
-            manifest=choices.manifest,
-            require_signed=choices.require_signed,
-            **self.image.options(force=choices.force),
-        )
+        with self.image.advice():
+            return api.open_image(
+                self.image.source,
+                self.target,
+                manifest=choices.manifest,
+                require_signed=choices.require_signed,
+                **self.image.options(force=choices.force),
+            )
 
     def _carry_out(self, job: api.Job) -> int:
         output = self.output
         ctx = click.get_current_context()
         name, replaced = str(ctx.info_name), _image_again(ctx)
-        again = shlex.join(["flasher", *rebuild_command_line(ctx, name, replaced=replaced)])
-        upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
+        words = rebuild_command_line(ctx, name, without=_TRACE_FILE.__eq__, replaced=replaced)
+        again = shlex.join(["flasher", *words])
+        recorded = replace(self.recorded, overwrites=self.choices.force)
+        upgrade_run = UpgradeRun(job, self.bus, recorded, output, self._add_repair, again)
         result = upgrade_run.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
             lambda connection, record: self._watching(upgrade_run.job, connection, record),
@@ -422,7 +425,8 @@ OTHER_IMAGE: Final = "OTHER_IMAGE"
 """Placeholder for another image, after the device refused the one sent."""
 SAME_IMAGE: Final = "IMAGE"
 """Placeholder for an image from standard input, which is read once."""
-_LEFT_OUT: Final = frozenset({"--timeout", "--trace-file", "--skip-same-version"})
+_TRACE_FILE: Final = "--trace-file"
+_LEFT_OUT: Final = frozenset({"--timeout", _TRACE_FILE, "--skip-same-version"})
 """Options that the repair command omits: a deadline for a device that answers at once (a rescue
 waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
 _OF_THE_IMAGE: Final = frozenset(

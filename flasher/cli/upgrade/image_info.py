@@ -40,9 +40,12 @@ class ImageInfoDocument:
     """Contents of an image file, its manifest, and the plan of an upgrade."""
 
     image: ImageDocument
+    file_sha256: str
+    """SHA-256 of the file itself, in hexadecimal."""
     manifest: ManifestBesideDocument
     plan: PlanDocument
-    """Plan for the BMS without a target: others differ only by their ids."""
+    """Plan for the target; without one for the target that the image names, else for the BMS.
+    Targets differ only by their ids."""
 
 
 DOCUMENTS: Final = (ImageInfoDocument,)
@@ -71,17 +74,24 @@ def image_info(
     """
     loaded = image.load()
     table = vector_table(loaded)
+    file_sha256 = image.file_sha256()
+    named = None if len(loaded.named_targets) != 1 else next(iter(loaded.named_targets))
     # Between targets the time differs only by stuff bits: any of them gives the figure.
-    settings = load_profile(profile, target or BMS, api.as_dialect(dialect_name))
+    shown = target or named or BMS
+    settings = load_profile(profile, shown, api.as_dialect(dialect_name))
     plan = api.make_plan(
         loaded, settings.target, settings.dialect, has_upgrade=settings.has_upgrade
     )
     chosen = settings.upgrade_options(frame_gap_s=frame_gap_s, packet_gap_s=packet_gap_s)
     beside = manifest_beside(image, loaded, target)
-    lines = [*text.image_lines(loaded), *text.vector_lines(table), beside_line(beside)]
+    lines = [*text.image_lines(loaded, file_sha256), *text.vector_lines(table), beside_line(beside)]
     output.results((*lines, *text.plan_lines(plan, chosen)))
+    if target is None:
+        why = "the image names it" if named else "-t chooses one; others take as long"
+        output.result(f"           (for the {shown.node.name}: {why})")
     document = ImageInfoDocument(
         image=text.image_document(loaded, table),
+        file_sha256=file_sha256,
         manifest=beside,
         plan=text.plan_document(plan, chosen),
     )

@@ -64,8 +64,8 @@ class DryRunDocument:
 # -- images and plans in words ---------------------------------------------------------------------
 
 
-def image_lines(image: Image) -> list[str]:
-    """Describe an image file."""
+def image_lines(image: Image, file_sha256: str = "") -> list[str]:
+    """Describe an image file, with its own SHA-256 if that is given."""
     lines = [f"{printable(image.source)}: {image.format}, {byte_count(image.size_bytes)} to send"]
     if image.base is None:
         lines.append("  address: unknown (a raw binary has none; --base sets it)")
@@ -77,7 +77,9 @@ def image_lines(image: Image) -> list[str]:
         lines.append(f"  gaps:    {byte_count(image.filled_bytes)} filled with FF")
     lines.append(f"  version: {image.version or 'none found inside'}")
     lines.append(f"  names:   {names_of(image.named_targets) or 'no target found inside'}")
-    lines.append(f"  sha256:  {image.sha256}")
+    lines.append(f"  sha256:  {image.sha256}{' of the bytes to send' if file_sha256 else ''}")
+    if file_sha256:
+        lines.append(f"           {file_sha256} of the file itself")
     if is_sample(image):
         lines.append("  sample:  a firmware sample of flasher, refused on a physical controller")
     return lines

@@ -60,10 +60,10 @@ DOCUMENTS: Final = (UiDocument,)
 )  # fmt: skip
 @option("--no-browser", is_flag=True, panel="page", brief=True, help="print the address only")
 @option(
-    "--port", type=values.number, default="0", metavar="N", panel="page",
+    "--port", type=values.port, default="0", metavar="N", panel="page",
     help="of this computer; 0 is any that is free",
 )  # fmt: skip
-@bus_options(mock="offer virtual bikes, each with a fault or none", speed=values.speed)
+@bus_options(mock="offer virtual bikes, each with a fault or none")
 def ui(output: Output, bus: Bus, *, images: Path | None, no_browser: bool, port: int) -> int:
     """Upgrade a bike in a browser: adapter, bike, image, checks, upgrade, result."""
     need("The page", "web")

@@ -28,7 +28,7 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.pool import StaticPool
 
-from flasher.errors import ErrorCode, UsageError
+from flasher.errors import ErrorCode, UsageError, how_to_install
 from flasher.protocol.text import printable
 from flasher.station.records.errors import (
     NOT_SAVED,
@@ -296,7 +296,7 @@ def _server() -> ModuleType:
         raise UsageError(
             "Records in PostgreSQL need a driver that is not installed.",
             cause=printable(str(error)),
-            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station,postgres]'",
+            remedy=how_to_install("station,postgres"),
             code=ErrorCode.PACKAGE_MISSING,
         ) from error
 

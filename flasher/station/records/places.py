@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
-from flasher.errors import ErrorCode, FlasherError, UsageError
+from flasher.errors import ErrorCode, FlasherError, UsageError, how_to_install
 from flasher.protocol.text import printable
 from flasher.station.records.database import Location, locate
 from flasher.station.records.errors import RecordError
@@ -96,7 +96,7 @@ def place_of(text: str) -> Place:
         raise UsageError(
             "Heads on a PostgreSQL server need a driver that is not installed.",
             cause=printable(str(error)),
-            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station,postgres]'",
+            remedy=how_to_install("station,postgres"),
             code=ErrorCode.PACKAGE_MISSING,
         ) from error
     return ServerPlace(location)

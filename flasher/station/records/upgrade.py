@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, inspect, select, update
 
-from flasher.errors import ErrorCode, UsageError
+from flasher.errors import ErrorCode, UsageError, how_to_install
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail
@@ -88,7 +88,7 @@ def upgrade(
         if importlib.util.find_spec("alembic") is None:
             raise UsageError(
                 "Records of an older flasher need a package that is not installed: alembic.",
-                remedy="In the checkout: pip install -c .ci/constraints.txt '.[station]'",
+                remedy=how_to_install("station"),
                 code=ErrorCode.PACKAGE_MISSING,
             )
         station = choose(begun) if begun else None
