@@ -7,7 +7,6 @@ import contextlib
 import errno
 import importlib.util
 import re
-import sys
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ from flasher.bus.back_ends import SERIAL_PORTS, causes, error_text
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, bus_off_error
 from flasher.bus.inspect_interface import (
+    SYSFS,
     Unseen,
     change_commands,
     find_commands,
@@ -248,7 +248,7 @@ def _software_missing(interface: str, where: str, error: Exception) -> BusError 
     elif driver is not None and _is_driver_missing(error):
         found.cause = "the driver library of this interface is not installed"
         found.remedy = f"Install {driver}; `flasher adapters` lists the adapter then."
-        if sys.platform == "linux" and interface in _IN_KERNEL:
+        if SYSFS.is_dir() and interface in _IN_KERNEL:
             found.remedy = (
                 f"Use Linux's own driver, as in `-i socketcan -c can0`, or install {driver}; "
                 "`flasher adapters` lists the adapter then."
