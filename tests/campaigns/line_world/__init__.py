@@ -5,8 +5,8 @@
 
 The whole station runs: `Station` with its line, supervisor and records, `work_on` of each socket's
 process with its runs, all in greenlets on simulated buses. No real clock is read, so that a seed
-draws the same story, and a story takes the same course, each time and in each process. A campaign
-goes on where another one ended with the `--seed` that its last line names.
+draws the same story, and a story takes the same course, each time and in each process. With
+`--ledger FILE` a campaign goes on with the stories that an earlier one has not played.
 
 # A story
 

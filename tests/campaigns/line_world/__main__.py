@@ -2,40 +2,37 @@
 
 Each story is drawn from a seed and judged; a violation is shrunk to a story of one line, which
 `--replay LINE` plays with all that is shown; - reads it from standard input. The package says what
-a story may hold, and what has to hold in it. `python -m tests.campaigns.line_bugs` plants
-mistakes in the station, to see what this finds.
+a story may hold, and what has to hold in it. Processes and ledger are those of `flasher simulate`.
+`python -m tests.campaigns.line_bugs` plants mistakes in the station, to see what this finds.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
-from collections import Counter
-from collections.abc import Generator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing, suppress
+from contextlib import ExitStack
 from functools import partial
 from math import inf
+from pathlib import Path
 
-from tests.campaigns.line_world.play import Played, draw, play, shrink
+from flasher.cli.stop import Stop, stop_on_signal
+from flasher.errors import FlasherError
+from flasher.simulate.campaign import Batch, Result
+from flasher.simulate.ledger import Ledger
+from flasher.simulate.workers import KILLED, run
+from tests.campaigns.line_world.campaign import STEPS, play_batch, stories_key
+from tests.campaigns.line_world.play import draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 
 ACTS: int = 60
 """Of one story."""
+_PROGRESS_S = 60.0
 
 
 def say(line: str = "") -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
-
-
-def played(seed: int, *, acts: int, shrinks: bool) -> tuple[int, Played, int]:
-    """The seed, the story as it is to be shown, and the steps that were played."""
-    found = draw(seed, acts)
-    steps = len(found.done)
-    return seed, shrink(found) if found.kind and shrinks else found, steps
 
 
 def replay(line: str) -> int:
@@ -45,20 +42,7 @@ def replay(line: str) -> int:
     return int(bool(found.kind))
 
 
-def results(chosen: argparse.Namespace) -> Generator[tuple[int, Played, int], None, None]:
-    work = partial(played, acts=chosen.acts, shrinks=not chosen.no_shrink)
-    seeds = range(chosen.seed, chosen.seed + -(-chosen.steps // chosen.acts))
-    if chosen.jobs == 1:
-        yield from map(work, seeds)
-        return
-    pool = ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10))
-    try:
-        yield from pool.map(work, seeds, chunksize=4)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def main() -> int:
+def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--acts", type=int, default=ACTS, help="steps of one story")
@@ -67,41 +51,78 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=inf, help="end after so long")
     parser.add_argument("--most", type=int, default=5, help="end after so many violations")
     parser.add_argument("--no-shrink", action="store_true")
+    parser.add_argument("--ledger", type=Path, help="save what is done, and go on with the rest")
     parser.add_argument("--replay", metavar="LINE", help="play this story; - reads it from stdin")
-    chosen = parser.parse_args()
+    return parser.parse_args()
+
+
+def summary(total: Result, steps_before: int, took_s: float) -> str:
+    steps = total.endings.get(STEPS, 0)
+    pace, bad = 60 * (steps - steps_before) / took_s, total.violation_count
+    return f"{steps} steps in {total.runs} stories, {pace:,.0f} a minute; {bad} violations"
+
+
+def campaign(chosen: argparse.Namespace, ledger: Ledger | None, stopped: Stop) -> Result:
+    """Play the stories that the ledger lacks, and report each violation; return the sum."""
+    batch = whole(chosen)
+    total = Result(batch.campaign) if ledger is None else ledger.result
+    steps_before = total.endings.get(STEPS, 0)
+    began_s = shown_s = time.perf_counter()
+
+    def is_over() -> bool:
+        is_late = time.perf_counter() - began_s > 60 * chosen.minutes
+        return is_late or total.violation_count >= chosen.most or stopped()
+
+    def add(batch: Batch, result: Result) -> None:
+        nonlocal total, shown_s
+        total += result
+        if ledger is not None:
+            ledger.add(batch, result)
+        for each in result.violations:
+            say(f"{each.kind}: {each.text}\n  seed {each.seed}\n  {each.plan}\n")
+        now_s = time.perf_counter()
+        if now_s - shown_s > _PROGRESS_S:
+            shown_s = now_s
+            say(summary(total, steps_before, now_s - began_s))
+
+    run(
+        [batch] if ledger is None else ledger.left([batch]),
+        chosen.jobs,
+        on_result=add,
+        is_stopped=is_over,
+        run_one=partial(play_batch, acts=chosen.acts),
+    )
+    say(summary(total, steps_before, time.perf_counter() - began_s))
+    return total
+
+
+def whole(chosen: argparse.Namespace) -> Batch:
+    return Batch(stories_key(chosen.acts), chosen.seed, -(-chosen.steps // chosen.acts))
+
+
+def main() -> int:
+    chosen = arguments()
     if chosen.replay is not None:
         return replay(sys.stdin.read() if chosen.replay == "-" else chosen.replay)
-    began = time.perf_counter()
-    steps = bad = stories = 0
-    following = chosen.seed
-    seen: Counter[str] = Counter()
-    kinds: Counter[str] = Counter()
-    with closing(results(chosen)) as found_ones, suppress(KeyboardInterrupt):
-        for seed, found, count in found_ones:
-            steps, stories, following = steps + count, stories + 1, seed + 1
-            seen += found.seen or Counter()
-            if found.kind:
-                bad += 1
-                kinds[found.kind] += 1
-                acts = len(found.story.acts)
-                say(f"{found.text}\n  seed {seed}, {acts} acts\n  {found.story}\n")
-            took_s = time.perf_counter() - began
-            if stories % 100 == 0:
-                pace = 60 * steps / took_s
-                say(f"{steps} steps, {pace:,.0f} a minute, {bad} violations; next seed {following}")
-            if bad >= chosen.most or took_s > 60 * chosen.minutes:
-                break
-    took_s = time.perf_counter() - began
-    say(
-        f"{steps} steps in {stories} stories, {60 * steps / took_s:,.0f} a minute; {bad} violations"
-    )
-    for kind, count in kinds.most_common():
-        say(f"  {count} {kind}")
-    for what, count in seen.most_common():
+    with stop_on_signal(lambda: say("Ending.")) as stopped, ExitStack() as files:
+        ledger = None
+        if chosen.ledger is not None:
+            batch = whole(chosen)
+            opened = Ledger(chosen.ledger, batch.first, batch.count, batch.campaign)
+            ledger = files.enter_context(opened)
+        total = campaign(chosen, ledger, stopped)
+        for each in total.violations:
+            if each.kind != KILLED and not (chosen.no_shrink or stopped()):
+                found = shrink(draw(each.seed, chosen.acts))
+                say(f"seed {each.seed}, {len(found.story.acts)} acts: {found.text}")
+                say(f"  {found.story}\n")
+    for what, count in sorted(total.endings.items(), key=lambda each: -each[1]):
         say(f"{count:8} {what}")
-    say(f"Seeds {chosen.seed} to {following - 1}; --seed {following} goes on.")
-    return int(bad > 0)
+    return int(total.violation_count > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except FlasherError as error:
+        sys.exit(str(error))

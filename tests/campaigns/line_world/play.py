@@ -10,12 +10,15 @@ from itertools import pairwise
 from math import inf
 from typing import Final
 
+from flasher.conformance.shrink import shrink as shrink_items
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.draw import Teller, setup_of
 from tests.campaigns.line_world.promises import Violation
 from tests.campaigns.line_world.stories import Story, time_of
 from tests.campaigns.line_world.world import STUCK, World
 
+TRIES: Final = 400
+"""Maximum number of stories that are played to shrink one."""
 _GRID_S: Final = (1.0, 0.5, 0.1, 0.01, 0.001)
 
 
@@ -88,7 +91,7 @@ def _played(
 
 
 def shrink(
-    found: Played, accepts: Callable[[Story], bool] = lambda _story: True, most: int = 400
+    found: Played, accepts: Callable[[Story], bool] = lambda _story: True, most: int = TRIES
 ) -> Played:
     """A shorter story with a violation of the same kind, one that is accepted."""
     tries = 0
@@ -113,18 +116,14 @@ def shrink(
 
 
 def _without_acts(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
-    size = max(1, len(best.story.acts) // 2)
-    while True:
-        start = max(0, len(best.story.acts) - size)
-        while start >= 0 and best.story.acts:
-            acts = best.story.acts
-            shorter = [*acts[:start], *acts[start + size :]]
-            found = is_bad(replace(best.story, acts=shorter)) if len(shorter) < len(acts) else None
-            best = found or best
-            start = start - size if start >= size or start == 0 else 0
-        if size == 1:
-            return best
-        size //= 2
+    def attempt(acts: Sequence[stories.Act]) -> Sequence[stories.Act] | None:
+        nonlocal best
+        found = is_bad(replace(best.story, acts=acts))
+        best = found or best
+        return None if found is None else best.story.acts
+
+    shrink_items(best.story.acts, attempt, tries=TRIES)
+    return best
 
 
 def _simpler_setup(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
