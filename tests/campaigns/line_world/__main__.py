@@ -21,7 +21,7 @@ from flasher.errors import FlasherError
 from flasher.simulate.campaign import Batch, Result
 from flasher.simulate.ledger import Ledger
 from flasher.simulate.workers import KILLED, run
-from tests.campaigns.line_world.campaign import STEPS, play_batch, stories_key
+from tests.campaigns.line_world.campaign import STEPS, Stories, play_batch, stories_key
 from tests.campaigns.line_world.play import draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 
@@ -97,7 +97,7 @@ def campaign(chosen: argparse.Namespace, ledger: Ledger | None, stopped: Stop) -
 
 
 def whole(chosen: argparse.Namespace) -> Batch:
-    return Batch(stories_key(chosen.acts), chosen.seed, -(-chosen.steps // chosen.acts))
+    return Stories(stories_key(chosen.acts), chosen.seed, -(-chosen.steps // chosen.acts))
 
 
 def main() -> int:

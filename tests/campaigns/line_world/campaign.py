@@ -10,11 +10,20 @@ from pathlib import Path
 from typing import Final
 
 from flasher.simulate.campaign import Batch, Found, Result, campaign_key
+from flasher.simulate.plan import Plan
 from tests.campaigns.line_world.play import draw
 
 STEPS: Final = "steps"
 """Key of the number of acts that were done, among the endings of a result."""
 _TESTS: Final = Path(__file__).parents[2]
+
+
+class Stories(Batch):
+    """Stories, each drawn from its seed."""
+
+    def plan_of(self, number: int) -> Plan:
+        """A story is drawn while it is played, so one that ends its process is its seed alone."""
+        return Plan(())
 
 
 def stories_key(acts: int) -> str:
