@@ -73,7 +73,10 @@ _what = partial(option, panel="what is run, and how")
     "--for", "for_s", type=values.seconds, metavar="SECONDS", brief=True,
     help="end after the walk in which this time is over",
 )  # fmt: skip
-@_what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk")
+@_what(
+    "--seed", default="1", metavar="SEED", brief=True,
+    help="decides every walk; another seed takes others",
+)  # fmt: skip
 @_what("--replay", metavar="STEPS", help="take these steps instead, as printed with a finding")
 @_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
 @option(
