@@ -83,12 +83,12 @@ class Echoes:
         if frame[0] not in self.ids:
             return frame
         if self._flagged is Sender.THIS_HANDLE:
-            return frame if is_rx else frame._replace(is_echo=True)
+            return frame if is_rx else frame.as_echo()
         if is_rx and self._flagged is Sender.THIS_COMPUTER:
             return frame
         echoed_s = self._echoed.get(frame)
         if echoed_s is not None and abs(stamp_s - echoed_s) <= DOUBLE_LIMIT_S:
-            return frame._replace(is_echo=True)
+            return frame.as_echo()
         expected = self._expected
         for index, own in enumerate(expected):
             if own == frame:
@@ -99,5 +99,5 @@ class Echoes:
                 self._echoed[frame] = stamp_s
                 if len(self._echoed) > REORDER_FRAMES:
                     del self._echoed[next(iter(self._echoed))]
-                return frame._replace(is_echo=True)
+                return frame.as_echo()
         return frame

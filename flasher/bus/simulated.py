@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from typing import Final
 
 from flasher.bus.health import (
@@ -160,29 +161,36 @@ class SimulatedBus:
 
     def advance(self, limit: float) -> None:
         """Advance to the next event on the bus, at latest to `limit`."""
-        clock, faults = self.clock, self.faults
-        now = clock.now()
-        if faults.due_at <= now:
-            self._report_faults(now)
-        delivered_at, self._delivered_at = self._delivered_at, None
-        self._serve_devices(now if delivered_at is None else delivered_at)
+        faults = self.faults
+        if faults.due_at < inf:
+            self._report_faults()
+        now = self._delivered_at
+        if now is None:
+            now = self.clock.now()
+        else:
+            self._delivered_at = None
+        self._serve_devices(now)
         if self._sending is None:
             self._arbitrate()
-        moment = min(limit, faults.due_at)
-        if self._sending is not None and self._sending_ends_at < moment:
+        moment = limit if limit < faults.due_at else faults.due_at
+        sending = self._sending
+        if sending is not None and self._sending_ends_at < moment:
             moment = self._sending_ends_at
         for device in self._devices:
             wanted = device.deadline
             if wanted is not None and wanted < moment and not device.outbox:
                 moment = wanted
-        clock.wait_until(moment)
-        if self._sending is not None and self._sending_ends_at <= moment:
-            self._deliver(*self._sending)
-        now = clock.now()
-        if faults.due_at <= now:
-            self._report_faults(now)
+        self.clock.wait_until(moment)
+        if sending is not None and self._sending_ends_at <= moment:
+            self._deliver(*sending)
+        if faults.due_at < inf:
+            self._report_faults()
 
-    def _report_faults(self, now: float) -> None:
+    def _report_faults(self) -> None:
+        """Report the faults of the adapter that are due."""
+        now = self.clock.now()
+        if self.faults.due_at > now:
+            return
         for report in self.faults.tick(now):
             for host in self._hosts:
                 host.inbox.append(report)
@@ -199,8 +207,8 @@ class SimulatedBus:
         anything_happened = False
         for device in self._devices:
             engine = device.engine
-            device.deadline = engine.deadline()
-            if device.deadline is not None and device.deadline <= now:
+            wanted = device.deadline = engine.deadline()
+            if wanted is not None and wanted <= now:
                 anything_happened = True
                 engine.tick(now)
             if not device.outbox and (frame := engine.next_frame(now)) is not None:
@@ -216,18 +224,15 @@ class SimulatedBus:
                 device.deadline = device.engine.deadline()
 
     def _arbitrate(self) -> None:
-        waiting = [node for node in self._nodes if node.outbox]
-        if waiting and not self.faults.takes_part:
-            self._send_unacknowledged(host for host in self._hosts if host.outbox)
-            waiting = [device for device in self._devices if device.outbox]
+        waiting: Sequence[_Node] = [node for node in self._nodes if node.outbox]
         if not waiting:
             return
-        winners: Sequence[_Node] = waiting
-        if len(waiting) > 1:
-            lowest = min(node.outbox[0][1].can_id for node in waiting)
-            winners = [node for node in waiting if node.outbox[0][1].can_id == lowest]
-            if len(winners) > 1:
-                winners = self._contend(winners) if self._collides else winners[:1]
+        if not self.faults.takes_part:
+            self._send_unacknowledged(host for host in self._hosts if host.outbox)
+            waiting = [device for device in self._devices if device.outbox]
+            if not waiting:
+                return
+        winners = waiting if len(waiting) == 1 else self._winners(waiting)
         queued_at, frame = winners[0].outbox[0]
         collides = False
         if len(winners) > 1:
@@ -247,6 +252,14 @@ class SimulatedBus:
         taken_s = bits / self._bitrate_bps
         self._sending_ends_at = begins_at + taken_s
         self.busy_s += taken_s
+
+    def _winners(self, waiting: Sequence[_Node]) -> Sequence[_Node]:
+        """Select the senders of the frame that has priority, several if they send one id."""
+        lowest = min(node.outbox[0][1].can_id for node in waiting)
+        winners = [node for node in waiting if node.outbox[0][1].can_id == lowest]
+        if len(winners) == 1:
+            return winners
+        return self._contend(winners) if self._collides else winners[:1]
 
     def _contend(self, rivals: Sequence[_Node]) -> Sequence[_Node]:
         """Select among senders of one id those of the frame with the first dominant bit, and any
@@ -322,7 +335,7 @@ class SimulatedLink:
         """Queue a frame; wait up to `SEND_LIMIT_S` for room. Raises TransmitBlockedError."""
         clock = self._bus.clock
         give_up_at = clock.now() + SEND_LIMIT_S
-        self._check("sending")
+        self._check_sending()
         while len(self._host.outbox) >= self._queue_frames:
             if clock.now() >= give_up_at:
                 self._health.is_blocked = True
@@ -333,7 +346,7 @@ class SimulatedLink:
                     else "other traffic takes the whole bus",
                 )
             self._bus.advance(give_up_at)
-            self._check("sending")
+            self._check_sending()
         self._health.sent += 1
         if not self._bus.faults.is_off:  # as drivers do until they report it
             self._host.outbox.append((clock.now(), frame))
@@ -341,15 +354,17 @@ class SimulatedLink:
     def receive(self, deadline: float) -> Frame | None:
         """Advance the bus until a frame arrives or the deadline comes."""
         bus, inbox = self._bus, self._host.inbox
-        self._check_plugged("receiving")
-        while not inbox:
+        faults = bus.faults
+        while True:
+            if self._opened_at != faults.times_unplugged:
+                raise self._unplugged("receiving")
+            if inbox:
+                frame = inbox.popleft()
+                self._health.count_frame(frame)
+                return frame
             if bus.clock.now() >= deadline:
                 return None
             bus.advance(deadline)
-            self._check_plugged("receiving")
-        frame = inbox.popleft()
-        self._health.count_frame(frame)
-        return frame
 
     def drain(self) -> int:
         """Discard received frames, but count error frames."""
@@ -401,17 +416,17 @@ class SimulatedLink:
             return self._health.health(ControllerState.ACTIVE)
         return self._health.health()
 
-    def _check(self, doing: str) -> None:
-        self._check_plugged(doing)
-        if self.is_off:
-            raise bus_off_error(str(self), f"The adapter failed while {doing}: it is bus-off.")
-
-    def _check_plugged(self, doing: str) -> None:
+    def _check_sending(self) -> None:
         if self._opened_at != self._bus.faults.times_unplugged:
-            raise BusError(
-                f"The adapter failed while {doing}: no such device.",
-                where=str(self),
-                cause="it was unplugged",
-                remedy="Plug it in, then run the same command again.",
-                code=ErrorCode.ADAPTER_LOST,
-            )
+            raise self._unplugged("sending")
+        if self.is_off:
+            raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
+
+    def _unplugged(self, doing: str) -> BusError:
+        return BusError(
+            f"The adapter failed while {doing}: no such device.",
+            where=str(self),
+            cause="it was unplugged",
+            remedy="Plug it in, then run the same command again.",
+            code=ErrorCode.ADAPTER_LOST,
+        )

@@ -37,6 +37,8 @@ class AdapterFaults:
         self.is_off = False
         self.is_isolated = False
         """True while no node acknowledges its frames."""
+        self.takes_part = True
+        """The adapter sends and receives frames. An attribute, as the bus asks with each frame."""
         self.times_unplugged = 0
         """A link that was opened before the last unplugging must be reopened."""
         self.due_at = inf
@@ -44,11 +46,6 @@ class AdapterFaults:
         self._back_at: float | None = None
         self._reports: list[tuple[float, Frame]] = []
         self._has_reported = False
-
-    @property
-    def takes_part(self) -> bool:
-        """True if the adapter sends and receives frames."""
-        return self.is_plugged and not self.is_off and not self.is_isolated
 
     def unplug(self, back_at: float | None) -> None:
         """Unplug the adapter until `back_at`, or until `restore`."""
@@ -100,5 +97,6 @@ class AdapterFaults:
         return due
 
     def _look_ahead(self) -> None:
+        self.takes_part = self.is_plugged and not self.is_off and not self.is_isolated
         times = [at for at, _ in self._reports]
         self.due_at = min(times if self._back_at is None else [*times, self._back_at], default=inf)

@@ -5,7 +5,7 @@ bits. These are stuffed: after five equal bits the complement is inserted, and c
 run. CRC delimiter, ACK slot, ACK delimiter, 7 bits of EOF and 3 bits of interframe space follow
 unstuffed.
 
-Tables process a nibble at a time: one frame in a loop, or many frames at once. For many frames, a
+Tables process one frame a byte at a time, or many frames at once a nibble at a time. For many, a
 column of bytes (one byte per frame) goes through the same tables by `bytes.translate`, and columns
 are combined as big integers, so that the C library does the work for a whole image.
 """
@@ -44,6 +44,12 @@ def _stuff(state: int, bits: int, width: int) -> tuple[int, int]:
 _STATES: Final = [_stuff(index >> 4, index & 15, 4) for index in range(256)]
 _NEXT_STATE: Final = bytes(state & 15 for state, _ in _STATES)
 _INSERTED: Final = bytes(inserted for _, inserted in _STATES)
+# State and next byte, for a frame in a loop: the high nibble leads to the index of the low one.
+_LOW_INDEX: Final = [_NEXT_STATE[index >> 4] << 4 | index & 15 for index in range(4096)]
+_BYTE_NEXT_STATE: Final = bytes(_NEXT_STATE[low] for low in _LOW_INDEX)
+_BYTE_INSERTED: Final = bytes(
+    _INSERTED[index >> 4] + _INSERTED[low] for index, low in enumerate(_LOW_INDEX)
+)
 
 
 def _crc_steps(register: int, steps: int) -> int:
@@ -92,20 +98,21 @@ def frame_bits(frame: Frame) -> int:
     can_id, data = frame[0], frame[1]
     state, inserted, crc = _head(can_id, len(data))
     for byte in data:
-        index = state << 4 | byte >> 4
-        inserted += _INSERTED[index]
-        index = _NEXT_STATE[index] << 4 | byte & 15
-        inserted += _INSERTED[index]
-        state = _NEXT_STATE[index]
+        index = state << 8 | byte
+        inserted += _BYTE_INSERTED[index]
+        state = _BYTE_NEXT_STATE[index]
         crc = (crc << 8 & 0x7FFF) ^ _CRC_BYTE[crc >> 7 ^ byte]
     index = state << 3 | crc >> 12
     inserted += _TOP_INSERTED[index]
-    state = _TOP_NEXT_STATE[index]
-    for shift in (8, 4, 0):
-        index = state << 4 | crc >> shift & 15
-        inserted += _INSERTED[index]
-        state = _NEXT_STATE[index]
-    return fixed_bits(len(data)) + inserted + _FULL_RUN[state]
+    index = _TOP_NEXT_STATE[index] << 4 | crc >> 8 & 15
+    inserted += _INSERTED[index]
+    index = _NEXT_STATE[index] << 8 | crc & 0xFF
+    return (
+        fixed_bits(len(data))
+        + inserted
+        + _BYTE_INSERTED[index]
+        + _FULL_RUN[_BYTE_NEXT_STATE[index]]
+    )
 
 
 def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:

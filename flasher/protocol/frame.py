@@ -22,6 +22,10 @@ class Frame(NamedTuple):
     is_echo: bool = False
     """Own frame that the adapter returned after sending it; marked by the link."""
 
+    def as_echo(self) -> Frame:
+        """Return this frame marked as an echo; `_replace` takes three times as long."""
+        return Frame(self[0], self[1], self[2], self[3], self[4], is_echo=True)
+
     @property
     def is_payload(self) -> bool:
         """True for a classic data frame with at least one byte; only these carry the protocol."""

@@ -294,9 +294,11 @@ class HostClock:
     is away, for example.
     """
 
-    speed: Final = 1.0
-
-    def __init__(self, bus: SimulatedBus) -> None:
+    def __init__(self, bus: SimulatedBus, *, is_disturbed: bool) -> None:
+        self.speed = 1.0 if is_disturbed else inf
+        """A host on its own looks up ten times a second of real time, of which none passes here,
+        for what ends or pauses it; only where the plan does so (`is_disturbed`) the time counts.
+        """
         self._bus = bus
         self.now = bus.clock.now
 

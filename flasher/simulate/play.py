@@ -71,6 +71,8 @@ OVERDUE_S: Final = 60.0
 """A run that is so much later than its announced deadline has not ended."""
 _VECTORS: Final = struct.pack("<4I", 0x2000_5000, 0x0800_4101, 0, 0)
 """Vector table of a Cortex-M: stack pointer, reset vector, no NMI and no hard fault handler."""
+_ON_HOST: Final = (plans.Stall, plans.Kill, plans.Interrupt, plans.Unplug, plans.BusOff)
+"""Clauses that the host notices at the end of a wait."""
 _STEP_S: Final = 0.05
 _OPERATOR_S: Final = 8.0
 """Time in which the operator of the recovery follows a prompt; the supply is then off so long."""
@@ -159,6 +161,7 @@ class Player:
         self._has_running_information = self._is_silence_answered = False
         self._again_after_s = 0.0
         """Time from the kill of the host's process until the same command runs again."""
+        self._disturbs_host = any(isinstance(each, _ON_HOST) for each in plan.clauses)
         self._phase = "idle"
         """Last message that the host began."""
         self._reached: set[str] = set()
@@ -528,9 +531,8 @@ class Player:
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
         link.on_update = self._facts.rules.update_handed_over
         self._interrupted_at = None
-        device = api.Connection(link, HostClock(self.bus), "the bus of the plan").device(
-            self.target
-        )
+        clock = HostClock(self.bus, is_disturbed=self._disturbs_host and self._is_running)
+        device = api.Connection(link, clock, "the bus of the plan").device(self.target)
         try:
             result = device.upgrade(
                 self.image_plan,
