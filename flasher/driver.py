@@ -49,6 +49,10 @@ def drive(
     message boundary. Raises BusError if the link fails.
     """
     link.drain()
+    # Called for each frame, thousands of times in a simulation.
+    now_of, send, receive = clock.now, link.send, link.receive
+    deadline_of, next_frame, frame_sent = engine.deadline, engine.next_frame, engine.frame_sent
+    max_wait_s = MAX_WAIT_S * clock.speed
     cancel_seen = False
     came = None
     late_s = 0.0
@@ -58,16 +62,16 @@ def drive(
         sending_s = 0.0
         if cancelled is not None and not cancel_seen and cancelled():
             cancel_seen = True
-            engine.cancel(clock.now())
-        wanted = engine.deadline()
+            engine.cancel(now_of())
+        wanted = deadline_of()
         if wanted is not None and received_until >= wanted:
             engine.tick(received_until)
-        now = clock.now()
-        while (frame := engine.next_frame(now)) is not None:
-            link.send(frame)
-            asked_at, now = now, clock.now()
+        now = now_of()
+        while (frame := next_frame(now)) is not None:
+            send(frame)
+            asked_at, now = now, now_of()
             sending_s += now - asked_at
-            engine.frame_sent(now)
+            frame_sent(now)
             for tap in taps:
                 tap(frame, sent=True, now=now)
         stalled_s = (late_s + now - received_until - sending_s) / clock.speed
@@ -78,13 +82,13 @@ def drive(
                 on_event(event)
         if engine.done:
             return
-        rests_at = clock.now()
-        wanted = engine.deadline()
-        until = rests_at + MAX_WAIT_S * clock.speed
-        if wanted is not None:
-            until = min(until, wanted)
-        came = link.receive(until)
-        late_s = rests_at - now + max(0.0, clock.now() - max(until, rests_at))
+        rests_at = now_of()
+        wanted = deadline_of()
+        until = rests_at + max_wait_s
+        if wanted is not None and wanted < until:
+            until = wanted
+        came = receive(until)
+        late_s = rests_at - now + max(0.0, now_of() - max(until, rests_at))
 
 
 def _receive_waiting(

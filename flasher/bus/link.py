@@ -181,4 +181,5 @@ class VirtualClock:
 
     def wait_until(self, moment: float) -> None:
         """Advance to `moment`."""
-        self._now = max(self._now, moment)
+        if moment > self._now:
+            self._now = moment

@@ -333,9 +333,17 @@ class SimulatedLink:
 
     def send(self, frame: Frame) -> None:
         """Queue a frame; wait up to `SEND_LIMIT_S` for room. Raises TransmitBlockedError."""
+        bus, outbox = self._bus, self._host.outbox
+        self._check_sending()
+        if len(outbox) >= self._queue_frames:
+            self._await_room()
+        self._health.sent += 1
+        if not bus.faults.is_off:  # as drivers do until they report it
+            outbox.append((bus.clock.now(), frame))
+
+    def _await_room(self) -> None:
         clock = self._bus.clock
         give_up_at = clock.now() + SEND_LIMIT_S
-        self._check_sending()
         while len(self._host.outbox) >= self._queue_frames:
             if clock.now() >= give_up_at:
                 self._health.is_blocked = True
@@ -347,9 +355,6 @@ class SimulatedLink:
                 )
             self._bus.advance(give_up_at)
             self._check_sending()
-        self._health.sent += 1
-        if not self._bus.faults.is_off:  # as drivers do until they report it
-            self._host.outbox.append((clock.now(), frame))
 
     def receive(self, deadline: float) -> Frame | None:
         """Advance the bus until a frame arrives or the deadline comes."""

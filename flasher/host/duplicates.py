@@ -56,6 +56,7 @@ _STORED_MAX: Final = 8
 """Maximum number of stored packets, and of different answers to one query."""
 _TRANSFER_ANSWERS: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
 _SENDER_MASK, _RECEIVER_MASK = 0x7F0, 0x00F
+_TOOL: Final = Node.CDL.value
 
 Key = tuple[int, int]
 """CAN id and command of an answer."""
@@ -264,8 +265,8 @@ class DuplicateDetector:
 
     def frame_received(self, frame: Frame, now: float) -> None:
         """Record a frame of any node: only applications send to other nodes than the tool."""
-        if self._announced and frame.is_payload and frame.can_id & _RECEIVER_MASK != Node.CDL.value:
-            self._application_at[frame.can_id & _SENDER_MASK] = now
+        if self._announced and frame[0] & _RECEIVER_MASK != _TOOL and frame.is_payload:
+            self._application_at[frame[0] & _SENDER_MASK] = now
 
     def received(self, incoming: Message | Damage, now: float) -> None:
         """Process a received message or damaged bytes."""

@@ -175,9 +175,15 @@ class Runner(Generic[T]):
     def deadline(self) -> float | None:
         if self.done:
             return None
-        due_at = min(self._wake_at, self.tx.due_at, self.limit_at)
+        # Asked after every frame: calls of `min` take most of its time.
+        due_at = self._wake_at
+        if self.tx.due_at < due_at:
+            due_at = self.tx.due_at
+        if self.limit_at < due_at:
+            due_at = self.limit_at
         for reassembler in self._listening.values():
-            due_at = min(due_at, reassembler.due_at)
+            if reassembler.due_at < due_at:  # noqa: PLR1730
+                due_at = reassembler.due_at
         return None if due_at == inf else due_at
 
     def _message_left(self, now: float) -> None:

@@ -349,23 +349,24 @@ class PlanBus(SimulatedBus):
         sender, ends_at = senders[0], self._sending_ends_at
         self._delivered_at = ends_at
         self.frames_carried += 1
+        host = self.host
         word: plans.Sender | None = "device"
         if sender in self._hosts:
             word = "host"  # a killed process may have left frames in its adapter
-        elif getattr(sender, "engine", None) is self.agenda:
+        elif sender is self._agenda_node:
             word = None
         self._watch(frame, word, ends_at)
         takes_part = self.faults.takes_part
-        frames: Iterable[Frame] = (frame,)
         if self.frame_faults and word is not None:
-            frames = self._disturbed(frame, word, sender, ends_at)
-        for carried in frames:
-            self._carry(carried, senders, ends_at)
-        if self.is_garbled and self.host is not None:
-            self.host.node.inbox.append(ERROR_FRAME)
+            for carried in self._disturbed(frame, word, sender, ends_at):
+                self._carry(carried, senders, ends_at)
+        else:
+            self._carry(frame, senders, ends_at)
+        if self.is_garbled and host is not None:
+            host.node.inbox.append(ERROR_FRAME)
         if word == "host":
-            if self.host is not None and sender is self.host.node:
-                self.host.echo(frame, ends_at)
+            if host is not None and sender is host.node:
+                host.echo(frame, ends_at)
         elif takes_part and len(senders) == 1 and word is not None:
             self._hear(sender, frame.data, ends_at)
 
@@ -380,9 +381,10 @@ class PlanBus(SimulatedBus):
             self.heard.add(sender.engine)
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
-        for device in self._devices:
-            if device not in senders and device is not self._agenda_node and not frame.is_error:
-                device.engine.receive(frame, now)
+        if not frame.is_error:
+            for device in self._devices:
+                if device not in senders and device is not self._agenda_node:
+                    device.engine.receive(frame, now)
         if self.faults.takes_part:
             for host in self._hosts:
                 if host not in senders:
@@ -545,8 +547,11 @@ class PlanLink(SimulatedLink):
 
     def echo(self, frame: Frame, now: float) -> None:
         """Return a frame that has left."""
-        adapter, draw = self._adapter, self._random.random
-        if not adapter.echoes or draw() < adapter.lost:
+        adapter = self._adapter
+        if not adapter.echoes:
+            return
+        draw = self._random.random
+        if draw() < adapter.lost:
             return
         for _ in range(2 if draw() < adapter.doubled else 1):
             due_at = now + adapter.delay + adapter.jitter * draw()

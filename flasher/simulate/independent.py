@@ -40,7 +40,8 @@ _VERSION_TEXT: Final = re.compile(rb"V\dr\dr\d_\d{8}")
 def crc_of(can_id: int, head_and_data: bytes) -> bytes:
     """The checksum of a message (section 3), by zlib and reversed bits."""
     covered = b"\x55\xaa" + can_id.to_bytes(2, "big") + head_and_data
-    widened = b"".join(b"\0\0\0" + _REVERSED[byte : byte + 1] for byte in covered)
+    widened = bytearray(4 * len(covered))
+    widened[3::4] = covered.translate(_REVERSED)
     value = zlib.crc32(widened) ^ 0xFFFFFFFF
     return int(f"{value:032b}"[::-1], 2).to_bytes(4, "big")
 
@@ -156,8 +157,10 @@ class Flash:
             self._write(at, data[: len(data) // 2])
 
     def _write(self, at: int, data: bytes) -> None:
-        for index, byte in enumerate(data[: max(0, len(self.cells) - at)]):
-            self.cells[at + index] &= byte
+        cells = self.cells[at : at + len(data)]
+        size = len(cells)
+        programmed = int.from_bytes(cells, "big") & int.from_bytes(data[:size], "big")
+        self.cells[at : at + size] = programmed.to_bytes(size, "big")
 
     def _fails(self) -> bool:
         if not self.failures_left:

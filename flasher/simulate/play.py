@@ -150,7 +150,8 @@ class Player:
         self._tap = tap
         self._link: PlanLink | None = None
         self._frames = 0
-        self._digest = hashlib.sha256()
+        self._trace: list[bytes] = []
+        """Each frame with its time, for the digest."""
         self._waiting: dict[tuple[str, int], list[plans.Clause]] = {}
         self._is_running = True
         self._interrupted_at: float | None = None
@@ -277,7 +278,7 @@ class Player:
 
     def _seen(self, frame: Frame, sender: plans.Sender | None, now: float) -> None:
         self._frames += 1
-        self._digest.update(b"%d %s %.9f;" % (frame.can_id, frame.data, now))
+        self._trace.append(b"%d %s %.9f;" % (frame[0], frame[1], now))
         if self._tap is not None:
             self._tap(frame, sender, now)
         if self._log is not None:
@@ -285,10 +286,11 @@ class Player:
             self._log(f"{now:.6f} {name} {frame.can_id:03X} {frame.data.hex(' ')}")
         if self._waiting:
             self._begins("frame", self._frames, now)
+        facts = self._facts
         if sender == "host":
-            self._facts.host_ids.add(frame.can_id)
-            begun = self._facts.rules.host_sends(frame, now)
-            self._facts.may_have_erased |= self._facts.rules.has_update
+            facts.host_ids.add(frame[0])
+            begun = facts.rules.host_sends(frame, now)
+            facts.may_have_erased |= facts.rules.has_update
             if begun is not None:
                 what, number = begun
                 self._phase = what
@@ -303,7 +305,7 @@ class Player:
                     self.bus.burst_ends_at = min(self.bus.burst_ends_at, ends_at)
                 self._begins(what, number, now)
         else:
-            self._facts.rules.others_send(frame, now)
+            facts.rules.others_send(frame, now)
 
     def _begins(self, what: str, number: int, now: float) -> None:
         if not self._waiting:
@@ -441,8 +443,7 @@ class Player:
             return self._play()
         except SubjectFailedError as error:
             failed = _failed(self.plan, "subject failed", Violation("SUBJECT", str(error)))
-            wire = self._digest.hexdigest()[:16]
-            return replace(failed, took_s=self.clock.now(), wire=wire)
+            return replace(failed, took_s=self.clock.now(), wire=self._wire())
         finally:
             self._bench.end_device()
 
@@ -507,9 +508,12 @@ class Player:
             recovered=recovered,
             runs=runs,
             reached=frozenset(self._reached),
-            wire=self._digest.hexdigest()[:16],
+            wire=self._wire(),
             where=claim.where,
         )
+
+    def _wire(self) -> str:
+        return hashlib.sha256(b"".join(self._trace)).hexdigest()[:16]
 
     def _readings(self) -> Iterator[str]:
         """Yield the readings of the documents that a good run shows by itself."""
