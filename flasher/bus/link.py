@@ -181,5 +181,5 @@ class VirtualClock:
 
     def wait_until(self, moment: float) -> None:
         """Advance to `moment`."""
-        if moment > self._now:
+        if moment > self._now:  # noqa: PLR1730  called for each frame of a simulation
             self._now = moment

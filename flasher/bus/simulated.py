@@ -172,7 +172,7 @@ class SimulatedBus:
         self._serve_devices(now)
         if self._sending is None:
             self._arbitrate()
-        moment = limit if limit < faults.due_at else faults.due_at
+        moment = min(limit, faults.due_at)
         sending = self._sending
         if sending is not None and self._sending_ends_at < moment:
             moment = self._sending_ends_at

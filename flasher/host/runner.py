@@ -177,9 +177,9 @@ class Runner(Generic[T]):
             return None
         # Asked after every frame: calls of `min` take most of its time.
         due_at = self._wake_at
-        if self.tx.due_at < due_at:
+        if self.tx.due_at < due_at:  # noqa: PLR1730
             due_at = self.tx.due_at
-        if self.limit_at < due_at:
+        if self.limit_at < due_at:  # noqa: PLR1730
             due_at = self.limit_at
         for reassembler in self._listening.values():
             if reassembler.due_at < due_at:  # noqa: PLR1730
