@@ -274,18 +274,20 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
         if run.now >= max(give_up_at, announced.judged_at):
             verdict = Verdict.IN_BOOTLOADER if announced.go_on else Verdict.NO_ANSWER
             return Verification(Level.VERSION, verdict)
-    again = yield from ask(run, Query(request, quiet=True))
-    yield from count_answers(run, [again])
+    if not run.is_cancelled:
+        again = yield from ask(run, Query(request, quiet=True))
+        yield from count_answers(run, [again])
     version = firmware_version(query.answer)
     if run.duplicates.evidence:
         return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
     expected = plan.image.version
-    if expected is None:
-        return Verification(Level.VERSION, Verdict.VERSION_UNJUDGED, version)
-    if version == expected:
-        return Verification(Level.VERSION, Verdict.VERSION_RIGHT, version)
-    detail = f"{version} instead of {expected}"
-    return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, detail)
+    if expected is not None and version != expected:
+        detail = f"{version} instead of {expected}"
+        return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, detail)
+    if run.is_cancelled:  # no second device could answer
+        return Verification(Level.VERSION, Verdict.INTERRUPTED, version)
+    verdict = Verdict.VERSION_UNJUDGED if expected is None else Verdict.VERSION_RIGHT
+    return Verification(Level.VERSION, verdict, version)
 
 
 class _Announcements:

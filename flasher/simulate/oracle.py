@@ -30,6 +30,8 @@ _ATTEMPTS: Final = 3
 """Attempts of an upgrade, unless the plan has another number (docs/explanation/upgrade.md)."""
 _BEGIN_S: Final = TIMES.boot_version_timeout_s + TIMES.request_transfer_timeout_s
 """Longest time in which a device begins an attempt (R12)."""
+_BOOT_VERSION_S: Final = 0.002
+"""Longer than a boot version is on the bus after the message before it."""
 _COMPLETE_S: Final = TIMES.complete_timeout_s * TIMES.end_tries
 _INTERRUPTED_S: Final = TIMES.command_timeout_s + 0.5
 """Longest time from Ctrl-C to the end: a message that has begun is finished."""
@@ -214,6 +216,16 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("ACCUSED", "two devices are reported, and there is one")
 
 
+def _restart_s(device: plans.Device) -> float:
+    """Time from a reset to the first boot version, which is the device's choice."""
+    match device:
+        case plans.Independent():
+            return device.chosen().restart
+        case plans.Mock():
+            return device.chosen().reset_delay_s
+    return 0.0
+
+
 def _judge_failure(facts: Facts, claim: Claim) -> Iterator[Violation]:
     """Check that a run without success had a reason, and enough time."""
     plan, job = facts.plan, facts.plan.job
@@ -227,6 +239,7 @@ def _judge_failure(facts: Facts, claim: Claim) -> Iterator[Violation]:
     (device, *twins) = plan.devices
     is_ready = device.begins == "application" and device.application == "old"
     is_ready &= not any(each in device.choices for each in _CANNOT_SUCCEED)
+    is_ready &= _restart_s(device) < TIMES.boot_version_timeout_s - _BOOT_VERSION_S
     if is_ready and not twins and not [*plan.events]:
         yield Violation("FAILED", "no success, and nothing was disturbed")
 

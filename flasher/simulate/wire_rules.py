@@ -167,14 +167,16 @@ class WireRules:
         if now - self._heads.get(data, float("-inf")) <= _ECHOED_S:
             self._sent_twice.add(data)
         self._heads[data] = now
-        self._kind, self._had_gap = name, False
-        self._number = data[7] if name == "packet" and len(data) > 7 else 0
+        number = data[7] if name == "packet" and len(data) > 7 else 0
+        # A pause cut it: what came meanwhile answers it as well.
+        is_begun_again = self._left > 0 and (name, number) == (self._kind, self._number)
+        self._kind, self._number, self._had_gap = name, number, False
         self._left = data[3] + OVERHEAD_SIZE - len(data)
-        self._check_begin(name, self._number, now)
+        self._check_begin(name, number, now, is_begun_again=is_begun_again)
         self._end_message(now)
-        return Begun(name, self._number)
+        return Begun(name, number)
 
-    def _check_begin(self, name: str, number: int, now: float) -> None:
+    def _check_begin(self, name: str, number: int, now: float, *, is_begun_again: bool) -> None:
         is_beside_tool = REPEAT_MARGIN_S < now - self._tool_at < _TOOL_QUIET_S - REPEAT_MARGIN_S
         if is_beside_tool and self._checks_times:
             self._break("a message begins while another tool writes")
@@ -193,6 +195,8 @@ class WireRules:
             if number != 1:
                 self._check_acknowledged((number - 1) % 256)
             self._check_repetition(number, now)
+            if not is_begun_again:
+                self._packet_begun_at = now
 
     def _check_update(self, now: float) -> None:
         announcing_s = self._announced_at - self._announcing_since
@@ -223,7 +227,6 @@ class WireRules:
             is_answered = self._heard_at > self._packet_begun_at - REPEAT_MARGIN_S
             if is_early and self._checks_times and not is_answered:
                 self._break("a packet is sent again before its answer is late")
-        self._packet_begun_at = now
 
     def _end_message(self, now: float) -> None:
         if self._left > 0:

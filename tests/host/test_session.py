@@ -400,6 +400,23 @@ def test_an_application_that_starts_after_the_bootloader_announced_itself_late_i
     assert check.result.verdict is Verdict.VERSION_RIGHT
 
 
+@each("version, verdict", [(NEW, Verdict.INTERRUPTED), ("V1r0r0_20200101", Verdict.VERSION_OTHER)])
+def test_a_version_check_that_is_cancelled_after_an_answer_asks_no_more(
+    version: str, verdict: Verdict
+) -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    assert application.next_question() is not None
+    texts = [WireText(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", version)]
+    application.answer(VERSION, VersionInformation(*texts))
+    assert application.next_question() is not None
+    check.cancel(application.now)
+    assert application.next_question() is None
+    assert check.done
+    assert check.result.verdict is verdict
+    assert check.result.running_version == version
+
+
 @each("asked", [True, False])
 def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -> None:
     check = version_check(planned(), UpgradeOptions())

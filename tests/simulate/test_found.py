@@ -14,6 +14,9 @@ from tests.loops import each
         "job packets=4 timeout=0.683832 ; independent",
         "job packets=4 timeout=0.334824 ; mock",
         "job packets=4 timeout=0.335 ; mock ; @end+0.01 hang seconds=20",
+        # In the first answer of the version check, and in the wait for a second one's.
+        "job packets=4 timeout=0.8618 ; mock start_delay_s=0.5",
+        "job packets=4 timeout=0.95 ; mock start_delay_s=0.5",
     ],
 )
 def test_the_deadline_counts_while_a_second_device_is_waited_for(line: str) -> None:
@@ -70,3 +73,25 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         )
     )
     assert verdict.violations == ()
+
+
+@each(
+    "line",
+    [
+        # A pause cuts packet 1, and the answer to a second update command comes meanwhile.
+        """
+        job packets=3 gap=0.037 ; independent restart=0.02 erase=0.07 update_again=erases store=0.25
+        @packet1 stall
+        """,
+        # A device that restarts more slowly than the tool waits.
+        "job packets=4 ; independent restart=4.999772",
+        "job packets=4 ; mock reset_delay_s=5.00062",
+    ],
+)
+def test_what_only_looks_like_a_fault_is_none(line: str) -> None:
+    assert play(Plan.parse(line)).violations == ()
+
+
+def test_a_device_that_restarts_in_time_is_upgraded() -> None:
+    verdict = play(Plan.parse("job packets=4 ; independent restart=4.997"))
+    assert (verdict.ending, verdict.violations) == ("completed", ())
