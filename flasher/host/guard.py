@@ -6,7 +6,6 @@ messages, because they write nothing. SHUTDOWN switches off the supply of every 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from flasher import events
@@ -74,9 +73,7 @@ class Guard:
                     self._note(found)
         return None
 
-    def take_events(self) -> Sequence[object]:
-        if not self._events:
-            return ()
+    def take_events(self) -> list[object]:
         taken, self._events = self._events, []
         return taken
 
