@@ -64,6 +64,7 @@ __all__ = [
     "prepare",
     "find_release",
     "open_image",
+    "check_signatures",
     "as_dialect",
     "as_level",
     "as_target",
@@ -697,25 +698,43 @@ def _signed(
     allow_outside_vector: bool,
 ) -> OpenedImage | None:
     """Open a release, or the image that one lies beside; None for any other file."""
-    from flasher.release.places import detached_path, is_container  # noqa: PLC0415
+    from flasher.release.places import release_path  # noqa: PLC0415
 
-    beside = None
-    if not is_container(path):
-        beside = detached_path(path)
-        if not os.path.lexists(beside):
-            return None
+    found = release_path(path)
+    if found is None:
+        return None
     from flasher.release import verify  # noqa: PLC0415  for releases alone
 
-    package = verify.open_package(beside or path)
-    today = datetime.datetime.now(datetime.UTC).date()
-    provenance = verify.provenance_of(package, target, today, is_required=require_signed)
+    package = verify.open_package(found)
+    provenance = verify.provenance_of(package, target, _today(), is_required=require_signed)
     image, release = verify.image_of(
         package,
         target,
-        beside=path if beside else None,
+        beside=path if os.fspath(found) != os.fspath(path) else None,
         allow_outside_vector=allow_outside_vector,
     )
     return OpenedImage(with_release(image, release), release, provenance)
+
+
+def check_signatures(
+    path: str | os.PathLike[str], target: Target, *, require_signed: bool = False
+) -> Provenance | None:
+    """Check the signatures of a firmware file or release again, as `open_image` does, without
+    loading the image. Raises ImageError and UsageError for a release that cannot be used.
+    """
+    from flasher.release.places import release_path  # noqa: PLC0415
+
+    found = release_path(path)
+    if found is None:
+        return _unsigned(path, require_signed=require_signed)
+    from flasher.release import verify  # noqa: PLC0415  for releases alone
+
+    package = verify.open_package(found)
+    return verify.provenance_of(package, target, _today(), is_required=require_signed)
+
+
+def _today() -> datetime.date:
+    return datetime.datetime.now(datetime.UTC).date()
 
 
 def _unsigned(path: str | os.PathLike[str], *, require_signed: bool = False) -> Provenance | None:

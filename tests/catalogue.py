@@ -37,7 +37,10 @@ from flasher.station.records.errors import NOT_SAVED
 from flasher.station.records.model import (
     AFTER_RESTART,
     BY_POWER,
+    COUNTER,
     POWER_CYCLES,
+    PRODUCT,
+    SIGNATURE,
     RunKind,
     StepName,
     StepState,
@@ -103,6 +106,7 @@ def sentences() -> Iterator[str]:
     yield from _SYSTEM
     named = ("model", "serial number", "hardware version", "firmware version")
     yield from (f"{{target}} {word}" for word in (*named, *(each.value for each in IdentityCheck)))
+    yield from (f"{{target}} {word}" for word in (SIGNATURE, COUNTER, PRODUCT))
     layouts = (BootVersion.LAYOUT, Packet.LAYOUT, UpdateCommand.LAYOUT)
     yield from (label(*each) for layout in layouts for each in layout)
     explained = [

@@ -175,6 +175,8 @@ class Provenance:
     """Refusal; None if the image may be sent."""
     signers: tuple[str, ...] = ()
     """Ids of the trusted keys that signed the image; empty if no signature was checked."""
+    threshold: int = 0
+    """Number of signatures that the trust file asks for; 0 if none was checked."""
     trust_version: int | None = None
     """Version of the trust file; None without one."""
     warnings: tuple[str, ...] = ()

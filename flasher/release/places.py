@@ -49,3 +49,15 @@ def detached_path(image: str | os.PathLike[str]) -> Path:
     """Path of the release that lies beside its image: the image's path with `.wfw` appended."""
     path = Path(image)
     return path.with_name(path.name + SUFFIX)
+
+
+def release_path(path: str | os.PathLike[str]) -> Path | None:
+    """Path of the release that a file is, or else that lies beside it; None without one.
+
+    Raises UsageError and ImageError.
+    """
+    if is_container(path):
+        return Path(path)
+    beside = detached_path(path)
+    # A dangling link counts as existing, so that it is an error.
+    return beside if os.path.lexists(beside) else None

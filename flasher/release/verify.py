@@ -221,15 +221,21 @@ def provenance_of(
     log = package.log.entries if package.log and known.trust.log else ()
     known = _learned(store, known, known.chain, date, log, warnings)
     names = ", ".join(map(known.trust.shown, sorted(signers)))
+    role = known.trust.role(target.name)
+    threshold = role.threshold if role else 0
     release = package.statement.release_for(target)
     return Provenance(
         text=text(
-            "signed by {names}, trust file version {version}, counter {counter}",
+            "signed by {names} ({count} of {threshold} keys), trust file version {version}, "
+            "counter {counter}",
             names=names,
+            count=len(signers),
+            threshold=threshold,
             version=known.trust.version,
             counter=release.counter,
         ),
         signers=tuple(sorted(signers)),
+        threshold=threshold,
         trust_version=known.trust.version,
         warnings=(*dict.fromkeys(warnings), *warnings_of(known, today)),
         highest_counters=_counters_seen(target, release.product or ""),

@@ -65,6 +65,12 @@ OLD_VERSION: Final = _fail(
     text("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
+OLD_RELEASE: Final = _fail(
+    "OLD_RELEASE",
+    text("the unit has received a newer release than this one"),
+    text("Put the unit aside: it needs a recipe with the newest release."),
+    may_retry=False,
+)
 IN_USE: Final = _fail(
     "IN_USE", text("the battery supplies current"), text("Switch its loads off, then scan again.")
 )
@@ -154,6 +160,9 @@ CANNOT_VERIFY: Final = _error(
     text("a target has no version query: only a new flash can verify it"),
 )
 RECIPE: Final = _error("RECIPE", text("the recipe does not fit its own images or this unit"))
+NOT_TRUSTED: Final = _error(
+    "NOT_TRUSTED", text("the trust file of this computer does not allow the image")
+)
 RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", text("the records could not be written"))
 TRACE_NOT_SAVED: Final = _error(
     "TRACE_NOT_SAVED", text("the trace of the bus could not be written")
@@ -186,7 +195,7 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
     Ending.WRONG_DEVICE: NOT_FOR_DEVICE,
     Ending.BOOT_TOO_OLD: NOT_FOR_DEVICE,
     Ending.NOT_FOR_DEVICE: NOT_FOR_DEVICE,
-    Ending.NOT_TRUSTED: NOT_FOR_DEVICE,
+    Ending.NOT_TRUSTED: NOT_TRUSTED,
     Ending.IMPLAUSIBLE: NOT_FOR_DEVICE,
     Ending.TWO_DEVICES: TWO_DEVICES,
     Ending.IN_USE: IN_USE,

@@ -151,13 +151,25 @@ class Verify(StrEnum):
         return Verified[self.name]
 
 
+class SignatureRule(StrEnum):
+    """Whether an image must be signed."""
+
+    CHECKED = "checked"
+    REQUIRED = "required"
+    WAIVED = "waived"
+
+
 class Firmware(TargetTable):
     """A target and its image. Targets are flashed in the order of the recipe."""
 
     image: str = Field(min_length=1)
-    """The image: a file in the recipe's folder."""
+    """The image, or the release (`*.wfw`) with it: a file in the recipe's folder."""
     manifest: str = ""
-    """The release manifest of the image; empty: `IMAGE.toml` beside the image."""
+    """The release manifest of the image; empty: `IMAGE.toml` beside the image. A release contains
+    its own."""
+    signature: SignatureRule = SignatureRule.CHECKED
+    """checked: trusted keys must have signed the image if this computer has a trust file;
+    required: in any case; waived: it need not be signed, which the records state."""
     sha256: Sha256
     """SHA-256 of the bytes to be sent, as in the manifest."""
     base: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)

@@ -8,24 +8,26 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final
 
-from flasher.api import prepare
-from flasher.errors import Fault, FlasherError, UsageError
+from flasher.api import check_signatures, open_image, prepare
+from flasher.errors import ErrorCode, Fault, FlasherError, UsageError
 from flasher.files import TOML_MAX_SIZE, opened, read
-from flasher.host.identity import IdentityCheck
+from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.items import Readable, find_item, meaningful_fields, readable
 from flasher.host.query import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
+from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
-from flasher.image.release import Release
+from flasher.image.release import Provenance, Release
 from flasher.protocol.fields import Codec, NumberField
 from flasher.protocol.spec import Target
+from flasher.release.places import release_path
 from flasher.settings.manifest import manifest_path, read_release
 from flasher.settings.profile import Profile, load_profile
 from flasher.station.recipe import (
@@ -34,13 +36,14 @@ from flasher.station.recipe import (
     Limit,
     Recipe,
     Scan,
+    SignatureRule,
     Unchanged,
     Write,
     check_template,
     fill,
     uses_lot,
 )
-from flasher.station.records.model import Verified
+from flasher.station.records.model import Signature, Verified
 
 _SAMPLE_LOT: Final = "LOT1"
 
@@ -50,11 +53,15 @@ class LoadedTarget:
     """A target of a recipe with its loaded image, manifest and profile."""
 
     firmware: Firmware
+    path: Path
+    """The image, or the release with it."""
     image: Image = field(repr=False)
     release: Release
     profile: Profile
     required: Verified
     """Verification level that a PASS requires."""
+    provenance: Provenance | None = None
+    """Result of checking signatures when the recipe was loaded; None if nothing asks for any."""
 
     @property
     def target(self) -> Target:
@@ -68,6 +75,51 @@ class LoadedTarget:
     def version(self) -> str:
         """Version in the image, or else in the manifest; "" without one."""
         return self.image.version or self.release.firmware_version or ""
+
+    def check_signatures(self) -> Provenance | None:
+        """Check the signatures against the trust file as it is now. None if nothing asks for any.
+
+        Raises UsageError for a refusal that the recipe does not waive.
+        """
+        rule = self.firmware.signature
+        is_required = rule is SignatureRule.REQUIRED
+        found = check_signatures(self.path, self.target, require_signed=is_required)
+        problem = None if found is None else found.problem
+        if problem is None or rule is SignatureRule.WAIVED:
+            return found
+        sentence = problem.what
+        if problem.cause:
+            sentence = text("{what} Cause: {cause}.", what=problem.what, cause=problem.cause)
+        remedy = problem.remedy
+        if problem.code is ErrorCode.RELEASE_UNSIGNED and release_path(self.path) is None:
+            remedy = text(
+                "Take the release (*.wfw) of its maker, or waive it in the recipe:"
+                " signature = 'waived'."
+            )
+        raise UsageError(sentence, remedy=remedy, code=problem.code)
+
+    def signature(self) -> Signature | None:
+        """Check the signatures for the records. Raises UsageError like `check_signatures`."""
+        found = self.check_signatures()
+        if self.firmware.signature is SignatureRule.WAIVED and (found is None or found.problem):
+            why = text("the image is not signed") if found is None else found.text
+            return Signature(text("waived by the recipe: {why}", why=why))
+        if found is None:
+            return None
+        if not found.signers:
+            return Signature(found.text)
+        return Signature(found.text, self.release.product or "", self.release.counter)
+
+    @property
+    def identity(self) -> Identity:
+        """Settings of the identity checks."""
+        is_waived = self.firmware.signature is SignatureRule.WAIVED
+        return self.profile.identity(
+            release=self.release,
+            provenance=self.provenance,
+            waived=frozenset({IdentityCheck.UNSIGNED} if is_waived else ()),
+            reports_unchecked=True,
+        )
 
 
 @dataclass(frozen=True)
@@ -200,21 +252,36 @@ def _load_target(
     image_path = inside(path, firmware.image)
     manifest = inside(path, firmware.manifest or str(manifest_path(firmware.image)))
     profile_path = inside(path, recipe.profile) if recipe.profile else None
+    signed = release_path(image_path)
+    if signed is not None:
+        manifest = inside(path, os.path.relpath(signed, path.parent.resolve()))
+        if firmware.manifest or firmware.base is not None:
+            raise UsageError(
+                f"{firmware.image!a:.80} is signed with its manifest, as a whole file.",
+                remedy="Remove manifest and base: the release contains both.",
+            )
     files = [image_path, manifest, *([profile_path] if profile_path else [])]
     # Hashed before and after loading: the hashes are those of the loaded bytes.
     hashes = {file: _sha256(file) for file in files}
-    image = load(image_path, base=firmware.base)
-    release = read_release(manifest)
+    if signed is None:
+        image, release = load(image_path, base=firmware.base), read_release(manifest)
+    else:
+        opened = open_image(image_path, firmware.device)
+        if opened.release is None:
+            raise UsageError("a file changed while it was read.", remedy="Try again.")
+        image, release = opened.image, opened.release
     # os.devnull as profile: one of the user must not change the recipe.
     profile = load_profile(profile_path or os.devnull, firmware.device)
-    if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
-        raise UsageError("a file changed while it was read.", remedy="Try again.")
     if firmware.verify is not None:
         required = firmware.verify.level
     else:
         can_ask = profile.version_query is not None
         required = Verified.VERSION if can_ask else Verified.COMPLETED
-    return LoadedTarget(firmware, image, release, profile, required), hashes
+    target = LoadedTarget(firmware, image_path, image, release, profile, required)
+    target = replace(target, provenance=target.check_signatures())
+    if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
+        raise UsageError("a file changed while it was read.", remedy="Try again.")
+    return target, hashes
 
 
 # -- checks ---------------------------------------------------------------------------------------
@@ -233,8 +300,7 @@ def _check_target(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Ite
             "Take the image that the recipe was released with, or release a new recipe.",
         )
     try:
-        identity = target.profile.identity(release=target.release)
-        for check in prepare(target.image, target.profile, identity=identity).checks:
+        for check in prepare(target.image, target.profile, identity=target.identity).checks:
             if check.ending is not None:
                 yield Fault(where, f"{check.text}.", _REMEDIES.get(check.check, ""))
     except FlasherError as error:

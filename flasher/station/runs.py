@@ -16,7 +16,9 @@ from flasher.station.messages import RunResult, flash_value, packed, write_key
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
+    COUNTER,
     FLASH,
+    PRODUCT,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -126,16 +128,17 @@ _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED
 
 
 def with_history(
-    claim: Claim, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
+    claim: Claim, lives: Sequence[UnitLife], recipe: LoadedRecipe, *, is_reworked: bool = False
 ) -> Claim:
-    """Add results of the unit's earlier runs to a claim.
+    """Add results of the unit's earlier runs to a claim. `lives` are the units with this serial
+    number; counters hold for all of them, anything else for the one of the recipe's part.
 
     Flashes count since the last PASS or FAIL, and since the last run in which the unit may have
     been exchanged. Values that must not change are those since the last PASS, since a run that
     failed after its first write may have changed them; with `is_reworked`, those since the last
     verdict, so that the run reads them again.
     """
-    runs = [] if life is None else list(life.runs)
+    runs = [run for life in lives if life.part == recipe.recipe.part for run in life.runs]
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
     unfinished = _after(runs, lambda run: run.run.state is RunState.PASS)
     of_this_unit = _after(still_open, lambda run: run.run.code in codes.OF_ANOTHER)
@@ -150,7 +153,29 @@ def with_history(
             for write in written
             if write.what != FLASH
         },
+        counters_before=_counters(claim, lives),
     )
+
+
+def _counters(claim: Claim, lives: Sequence[UnitLife]) -> dict[str, int]:
+    """Highest counter of a release of the same product that a device confirmed, by target."""
+    highest: dict[str, int] = {}
+    for run in (run for life in lives for run in life.runs):
+        measured = {each.name: each for step in run.steps for each in step.measurements}
+        for write in run.writes:
+            counter = measured.get(f"{write.target} {COUNTER}")
+            product = measured.get(f"{write.target} {PRODUCT}")
+            signature = claim.signatures.get(write.target)
+            if (
+                write.what == FLASH
+                and write.verified_at is not None
+                and signature is not None
+                and counter is not None
+                and (product.text if product else "") == signature.product
+            ):
+                found = int(counter.value or 0)
+                highest[write.target] = max(found, highest.get(write.target, 0))
+    return highest
 
 
 def _after(runs: list[RunDetails], ends: Callable[[RunDetails], bool]) -> list[RunDetails]:

@@ -420,14 +420,14 @@ class Station:
     def _claim(self, order: Order) -> line.SocketInput:
         socket = order.socket
         try:
-            life = self._life(order.serial)
+            lives = self.store.read.units(order.serial)
             claim = self.store.claim(order, self.recipe)
         except ClaimRefusedError as error:
-            is_changed = error.refusal is Refusal.RECIPE_CHANGED
-            return line.NotClaimed(error.refusal.value, error.what, error.remedy, is_changed)
+            stops_line = error.refusal in (Refusal.RECIPE_CHANGED, Refusal.RECIPE_NOT_TRUSTED)
+            return line.NotClaimed(error.refusal.value, error.what, error.remedy, stops_line)
         except RecordError as error:
             return self._not_saved(socket, order.serial, None, error)
-        claim = with_history(claim, life, self.recipe, is_reworked=bool(order.reason))
+        claim = with_history(claim, lives, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
         at = self.line.sockets[socket]
         claim = replace(claim, trace=trace, presence=at.presence_number, has_card=at.has_card)

@@ -15,7 +15,15 @@ from flasher.station.codes import Code
 from flasher.station.messages import write_key
 from flasher.station.recipe import Limit, Scan, fill
 from flasher.station.recipe_file import LoadedRecipe, codec_of, readable_of
-from flasher.station.records.model import Claim, Measurement, RunKind, StepName
+from flasher.station.records.model import (
+    COUNTER,
+    PRODUCT,
+    SIGNATURE,
+    Claim,
+    Measurement,
+    RunKind,
+    StepName,
+)
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 NOT_IDENTIFIED: Final = "not identified before flashing"
@@ -27,6 +35,7 @@ OF_CHECK: Final = {
     IdentityCheck.PREVIOUS: codes.OLD_VERSION,
     IdentityCheck.IN_USE: codes.IN_USE,
     IdentityCheck.CHARGE: codes.LOW_CHARGE,
+    IdentityCheck.UNSIGNED: codes.OLD_RELEASE,
 }
 """Codes of failed checks; NOT_FOR_DEVICE for all others."""
 
@@ -71,6 +80,18 @@ def identity_measurements(target: UnitTarget, identified: Identified) -> list[Me
         for word, text in texts.items()
         if text is not None
     ]
+
+
+def signature_measurements(target: str, claim: Claim) -> Iterator[Measurement]:
+    """What was found about the signatures of an image, as measurements without limits."""
+    found = claim.signatures.get(target)
+    if found is None:
+        return
+    yield Measurement(f"{target} {SIGNATURE}", text=found.text)
+    if found.counter is not None:
+        yield Measurement(f"{target} {COUNTER}", float(found.counter))
+    if found.product:
+        yield Measurement(f"{target} {PRODUCT}", text=found.product)
 
 
 def state_text(target: UnitTarget, identified: Identified) -> str:

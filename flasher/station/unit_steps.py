@@ -14,7 +14,7 @@ from typing import Final
 
 from flasher import events
 from flasher.errors import BusError, InterruptedByUserError, NoAnswerError, VerificationError
-from flasher.host.identity import CheckResult, judge_device
+from flasher.host.identity import CheckResult, IdentityCheck, judge_device
 from flasher.host.options import firmware_version
 from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
@@ -37,6 +37,7 @@ from flasher.station.records.model import (
     Claim,
     Measurement,
     RunKind,
+    Signature,
     StepName,
     Verified,
 )
@@ -46,6 +47,7 @@ from flasher.station.unit_checks import (
     check_measured,
     check_texts,
     identity_measurements,
+    signature_measurements,
     state_text,
     wanted_text,
 )
@@ -218,7 +220,18 @@ class UnitSteps:
         """Check the rules of manifest and recipe. Raises StepFailedError."""
         loaded, seen = target.loaded, self._identified[target.name].seen
         image, identity = target.job.plan.image, target.job.identity
+        measured += signature_measurements(target.name, self._claim)
         findings = list(judge_device(image, loaded.target, identity, seen))
+        signature = self._claim.signatures.get(target.name, Signature(""))
+        highest = self._claim.counters_before.get(target.name, 0)
+        if signature.counter is not None and signature.counter < highest:
+            sentence = text(
+                "the counter of the release is {counter}; the records have {highest} for this"
+                " serial number",
+                counter=signature.counter,
+                highest=highest,
+            )
+            findings.append(identity.refusal(IdentityCheck.UNSIGNED, sentence))
         for finding in findings:
             name = f"{target.name} {finding.check.value}"
             measured.append(Measurement(name, text=finding.verdict.value))

@@ -103,7 +103,7 @@ class UnitTarget:
                 single_session=not may_restart,
             ),
             # Units without an application are flashed too.
-            identity=loaded.profile.identity(release=loaded.release, reports_unchecked=True),
+            identity=loaded.identity,
         )
         self.version_request = self.job.options.version_request_for(loaded.target)
         """Version request for this target; None if unknown."""

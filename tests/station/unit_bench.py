@@ -22,6 +22,7 @@ from flasher.station.records.model import (
     Measurement,
     RunId,
     RunKind,
+    Signature,
     StepName,
     StepState,
     WriteId,
@@ -124,6 +125,8 @@ class UnitBench:
         flashed_before: frozenset[str] = frozenset(),
         written_before: Mapping[str, str] | None = None,
         has_card: bool = True,
+        signatures: Mapping[str, Signature] | None = None,
+        counters_before: Mapping[str, int] | None = None,
     ) -> RunResult:
         claim = Claim(
             RunId(1),
@@ -135,6 +138,8 @@ class UnitBench:
             flashed_before,
             written_before or {},
             has_card=has_card,
+            signatures=signatures or {},
+            counters_before=counters_before or {},
         )
         self.unit_run = UnitRun(
             claim,

@@ -40,6 +40,9 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
         ]
         return output.failure(error, FindingsDocument(findings=findings))
     output.results(_lines(recipe, day))
+    for target in recipe.targets:
+        for warning in target.provenance.warnings if target.provenance else ():
+            output.error_line(f"warning: {warning}")
     sockets: dict[str, str] = {}
     if station_file is not None:
         config = load_config(station_file)
@@ -87,6 +90,8 @@ def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
             f"  flash:    {target.name.upper()}: {target.firmware.image}, {version}, "
             f"{byte_count(target.image.size_bytes)}; {target.required.words}"
         )
+        if (signature := target.signature()) is not None:
+            yield printable(f"  origin:   {target.name.upper()}: {signature.text}")
     yield printable(f"  example:  {rules.serial_number.example}")
     scan = recipe.scan(rules.serial_number.example, day)
     for write in rules.write:

@@ -233,6 +233,8 @@ def _run_lines(details: RunDetails) -> Iterator[str]:
         reached = "not verified" if target.reached is None else target.reached.words
         version = target.version or "no version named"
         yield printable(f"  {target.target.upper() + ':':<9} {target.image}, {version}: {reached}")
+        if target.signature is not None:
+            yield printable(f"  {'':<9} {target.signature}")
     for write in details.writes:
         yield _write_line(write)
     for step in details.steps:

@@ -4,6 +4,7 @@ sockets cannot both take the last place of a lot.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import PurePath
@@ -11,7 +12,7 @@ from typing import Any, Final
 
 from sqlalchemy import func, select
 
-from flasher.errors import UsageError
+from flasher.errors import FlasherError, UsageError
 from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.recipe import Duplicate, Golden
@@ -25,6 +26,7 @@ from flasher.station.records.model import (
     RunId,
     RunKind,
     RunState,
+    Signature,
     UnitState,
     utc_moment,
     utc_text,
@@ -61,11 +63,34 @@ def check_order(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
     return replace(order, lot=scan.lot)
 
 
+def check_signatures(loaded: LoadedRecipe) -> Mapping[str, Signature]:
+    """Check the signatures of the recipe's images against the trust file as it is now. Raises
+    ClaimRefusedError.
+    """
+    try:
+        found = {target.name: target.signature() for target in loaded.targets}
+    except FlasherError as error:
+        raise ClaimRefusedError(
+            Refusal.RECIPE_NOT_TRUSTED,
+            text("The recipe may not be run any more: {why}", why=error.what),
+            remedy=error.remedy,
+        ) from error
+    return {name: signature for name, signature in found.items() if signature is not None}
+
+
 class Claiming:
     """Claims a unit for one run, in the transaction of `trail`."""
 
-    def __init__(self, trail: Trail, order: Order, loaded: LoadedRecipe, now: datetime) -> None:
+    def __init__(
+        self,
+        trail: Trail,
+        order: Order,
+        loaded: LoadedRecipe,
+        signatures: Mapping[str, Signature],
+        now: datetime,
+    ) -> None:
         """Raises ClaimRefusedError if the clock is earlier than the records."""
+        self._signatures = signatures
         self._trail, self._order, self._loaded, self._now = trail, order, loaded, now
         self._part = loaded.recipe.part
         self._connection = connection = trail.connection
@@ -135,7 +160,8 @@ class Claiming:
         digests = digests_of(connection, [run_id])[run_id]
         data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
         self._trail.append(self._now, chain.CLAIMED, data, run_id)
-        return Claim(RunId(run_id), kind, order.serial, self._now.astimezone().date(), order.lot)
+        day = self._now.astimezone().date()
+        return Claim(RunId(run_id), kind, order.serial, day, order.lot, signatures=self._signatures)
 
     def _recipe_id(self) -> int:
         """Row id of the recipe. The row holds the whole text, readable years later."""

@@ -119,6 +119,8 @@ class Refusal(StrEnum):
     """A real unit whose serial number is recorded as virtual, or the reverse."""
     WRONG_SERIAL = "WRONG_SERIAL"
     RECIPE_CHANGED = "RECIPE_CHANGED"
+    RECIPE_NOT_TRUSTED = "RECIPE_NOT_TRUSTED"
+    """The trust file no longer allows an image of the recipe."""
     CLOCK = "CLOCK"
     """The computer's clock is earlier than the last record of this station."""
 

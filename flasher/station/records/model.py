@@ -170,6 +170,25 @@ class Order:
     is_virtual: bool = False
 
 
+SIGNATURE: Final = "signature"
+"""Measurement of a target: what was found about the signatures of its image."""
+COUNTER: Final = "release counter"
+"""Measurement of a target: counter of its signed release."""
+PRODUCT: Final = "release product"
+"""Measurement of a target: product whose releases share the counter."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Result of checking the signatures of an image before a run."""
+
+    text: str
+    """The result as a sentence."""
+    product: str = ""
+    counter: int | None = None
+    """Counter of the release; None if no trusted key signed it."""
+
+
 @dataclass(frozen=True)
 class Claim:
     """A started run, on disk; it is sent to the process of its socket."""
@@ -186,6 +205,9 @@ class Claim:
     """Targets whose last flash wrote this same image and was read back."""
     written_before: Mapping[str, str] = field(default_factory=dict)
     """Values that the unit's last PASS wrote, by target and item ("bms serial-number")."""
+    counters_before: Mapping[str, int] = field(default_factory=dict)
+    """Highest counter of a release of the same product that the records have for this serial
+    number, by target."""
     trace: Path = Path()
     """File in which the bus trace is recorded."""
     presence: int = 0
@@ -193,6 +215,9 @@ class Claim:
     has_card: bool = True
     """The socket's card was scanned with the label, or the unit is virtual. Only then a unit that
     cannot identify itself may be flashed."""
+    signatures: Mapping[str, Signature] = field(default_factory=dict)
+    """Signatures of the images, by target, checked when the unit was claimed; without a target for
+    which neither recipe nor trust file asks for any."""
 
 
 @dataclass(frozen=True)
@@ -298,6 +323,8 @@ class TargetRecord:
     version: str
     required: Verified
     reached: Verified | None
+    signature: str | None = None
+    """Result of checking its signatures before the run; null if nothing asked for any."""
 
 
 @dataclass(frozen=True)

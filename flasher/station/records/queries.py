@@ -17,6 +17,7 @@ from flasher.station.records.errors import NotFoundError
 from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
+    SIGNATURE,
     Figures,
     ReportedRun,
     RunDetails,
@@ -210,12 +211,14 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
         "recipe_sha256": recipe["sha256"],
         "verified": run["verification_reached"],
     }
+    signatures = {each["name"]: each["text"] for each in content["measurements"]}
     targets = [
         each
         | {
             "image": images[each["artifact_id"]]["name"],
             "image_sha256": images[each["artifact_id"]]["sha256"],
             "version": images[each["artifact_id"]]["version"],
+            "signature": signatures.get(f"{each['target']} {SIGNATURE}"),
         }
         for each in content["targets"]
         if each["artifact_id"] in images

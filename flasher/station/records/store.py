@@ -32,7 +32,7 @@ from flasher.errors import FlasherError
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
-from flasher.station.records.claims import Claiming, check_order
+from flasher.station.records.claims import Claiming, check_order, check_signatures
 from flasher.station.records.database import (
     Database,
     locate,
@@ -223,9 +223,10 @@ class Store:
         """
         now = self._clock.utc()
         order = check_order(order, recipe, now)
+        signatures = check_signatures(recipe)
         # One claim at a time in all stations: two must not take the last place of a lot.
         with self.signer.writing("claims") as trail:
-            return Claiming(trail, order, recipe, now).begin(self._clock.monotonic_s())
+            return Claiming(trail, order, recipe, signatures, now).begin(self._clock.monotonic_s())
 
     # -- while it runs ----------------------------------------------------------------------------
 
