@@ -177,3 +177,17 @@ def test_without_a_target_the_plan_is_for_the_one_that_the_image_names(
     run = flasher("image-info", SAMPLES / "wmc.hex", *more)
     assert f"  to:      {node} " in run.out
     assert ("the image names it" in run.out) is (not more)
+
+
+def test_a_release_is_shown_by_another_command(flasher: Flasher, tmp_path: Path) -> None:
+    release = tmp_path / "bike.wfw"
+    words = ("--image", f"bms={SAMPLES / 'bms.hex'}", "--product", "48V", "--counter", "7")
+    assert flasher("release", "build", release, *words).code == ExitCode.OK
+    run = flasher("image-info", release)
+    assert run.code == ExitCode.USAGE
+    assert f"release show {release}" in run.err
+    assert not run.out
+    release.write_bytes(release.read_bytes()[:-10])
+    assert "[E311]" in flasher("image-info", release).err
+    other = release.rename(tmp_path / "other.zip")
+    assert "a zip archive" in flasher("image-info", other).err

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Final
 
 from flasher import api
@@ -21,10 +23,12 @@ from flasher.cli.options import (
 from flasher.cli.output import Output
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.host.identity import IdentityCheck, judge_bytes
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import BMS, Target
+from flasher.protocol.text import printable
+from flasher.release.places import SUFFIX, is_container
 from flasher.settings.profile import load_profile
 
 _EXAMPLES: Final = """\
@@ -72,6 +76,8 @@ def image_info(
     """Show the contents of an image file and the plan of its upgrade. Opens no adapter. A file that
     no device should get is shown as far as it can be read, and refused as by flasher flash.
     """
+    if not image.is_piped:
+        _check_no_release(image.image)
     loaded = image.load()
     table = vector_table(loaded)
     file_sha256 = image.file_sha256()
@@ -106,3 +112,23 @@ def image_info(
             return output.failure(error, document)
         output.result(text.check_line(found.event))
     return output.document(document)
+
+
+def _check_no_release(path: str) -> None:
+    """Raise UsageError for a release, which has one image or several; ImageError for a damaged
+    one.
+    """
+    if not is_container(path):
+        return
+    from flasher.release.verify import open_package  # noqa: PLC0415  only for a zip
+
+    try:
+        open_package(path)
+    except ImageError:
+        if PurePath(path).suffix.lower() == SUFFIX:
+            raise
+        return  # another zip, reported as such
+    raise UsageError(
+        f"{printable(path)} is a release, with an image for each of its targets.",
+        remedy=f"Show it with flasher release show {printable(shlex.quote(path))}.",
+    )
