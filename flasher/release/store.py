@@ -146,6 +146,8 @@ class TrustStore:
             max(date, known.seen.newest_date),
             tuple(log) if len(log) > len(known.seen.log) else known.seen.log,
         )
+        if chain is known.chain and seen == known.seen:
+            return known
         with self._locked():
             # Another program may have learned more meanwhile.
             with contextlib.suppress(FlasherError):

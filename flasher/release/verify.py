@@ -136,7 +136,7 @@ def image_of(
         image = load(beside, allow_outside_vector=allow_outside_vector)
     else:
         image = load(
-            package.source,
+            f"{package.source}/{name}",  # its suffix may decide on the format
             stream=BytesIO(package.members[name]),
             allow_outside_vector=allow_outside_vector,
         )

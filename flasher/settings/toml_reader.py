@@ -262,7 +262,7 @@ class _Schema:
             else:
                 found = each.node.get("properties", {}).get(part)
                 found = found or each.node.get("additionalProperties")
-            if found:
+            if isinstance(found, dict):  # True or False: no limits, or no other keys
                 return _Schema(found, self.definitions).at(location[1:])
         return _Schema({}, {})
 

@@ -31,6 +31,7 @@ MODULES: Final = {
     "target-profile": "settings",
     "conformance-profile": "settings",
     "conformance-report": "settings",
+    "release": "releases",
     "recipe": "line",
     "station": "line",
     "scans": "line",
