@@ -141,6 +141,8 @@ def test_shards_with_ledgers_add_up_to_the_whole_campaign(
     assert main(["simulate", "merge", str(files[0]), "--html", str(page)]) == ExitCode.PARTIAL
     assert "MISSING: seeds " in capsys.readouterr().out
     assert "MISSING: seeds " in page.read_text("utf-8")
+    assert main(["simulate", "merge", str(files[1])]) == ExitCode.PARTIAL
+    assert "MISSING: 1 of the canaries, the first at seed 0" in capsys.readouterr().out
 
 
 @pytest.mark.slow

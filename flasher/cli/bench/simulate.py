@@ -476,7 +476,10 @@ def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
     output.result(counted(merged.result.runs, "run"))
     _print_sum(merged.result, output)
     missing = [f"MISSING: seeds {first} to {end - 1}" for first, end in merged.missing]
-    missing += [f"MISSING: the canary at seed {seed}" for seed in merged.missing_canaries]
+    if canaries := merged.missing_canaries:
+        missing.append(
+            f"MISSING: {len(canaries):,} of the canaries, the first at seed {canaries[0]}"
+        )
     output.results(missing)
     code = _exit_code(merged.result, is_strict=False)
     if merged.missing or merged.missing_canaries:
