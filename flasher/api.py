@@ -772,6 +772,7 @@ class Job:
         provenance = self.identity.provenance
         problem = None if provenance is None else provenance.problem
         if problem is not None and IdentityCheck.UNSIGNED not in self.identity.waived:
+            problem.waiver = waivers.UNSIGNED
             raise problem
         for found in self.checks:
             error = refusal(self.plan, found)

@@ -226,10 +226,9 @@ def provenance_of(
     release = package.statement.release_for(target)
     return Provenance(
         text=text(
-            "signed by {names} ({count} of {threshold} keys), trust file version {version}, "
+            "signed by {names}, keys needed: {threshold}, trust file version {version}, "
             "counter {counter}",
             names=names,
-            count=len(signers),
             threshold=threshold,
             version=known.trust.version,
             counter=release.counter,

@@ -390,7 +390,7 @@ class BenchController:
             self._check_device(job)
         except FlasherError as error:
             return Offer(path, refusal=error)
-        image = job.plan.image
+        image, provenance = job.plan.image, job.identity.provenance
         return Offer(
             path,
             new_version(image, job.identity.release) or "",
@@ -400,6 +400,8 @@ class BenchController:
             image.sha256,
             tuple(found.event for found in job.checks),
             waived=job.waived,
+            origin=text("the image is not signed") if provenance is None else provenance.text,
+            warnings=() if provenance is None else provenance.warnings,
         )
 
     def _job(self, path: Path, target: Target | None) -> Job:

@@ -22,6 +22,7 @@ from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
+from flasher.release.places import SUFFIX
 from flasher.report.base import visible
 from flasher.trace.decoder import Field, content_fields
 from flasher.translation import Translator
@@ -103,6 +104,8 @@ class Shelf:
                     each
                     for each in folder.iterdir()
                     if each.suffix.lower() in self._suffixes and each.is_file()
+                    # A release beside its image is opened with it.
+                    if not (each.suffix.lower() == SUFFIX and each.with_suffix("").is_file())
                 )
         return found[:_FILES_MAX]
 

@@ -55,6 +55,9 @@ class Offer:
     refusal: FlasherError | None = None
     waived: tuple[str, ...] = ()
     """Names of checks that were waived for the image (flasher.host.waivers)."""
+    origin: str = ""
+    """Who signed the image, or that nobody did, as a sentence."""
+    warnings: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

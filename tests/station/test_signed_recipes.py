@@ -91,7 +91,7 @@ def test_a_signed_release_is_read_with_its_manifest(tmp_path: Path, maker: Maker
     found = target.signature()
     assert found is not None
     assert (found.product, found.counter) == ("48V", 7)
-    assert "(anna) (1 of 1 keys), trust file version 1" in found.text
+    assert "(anna), keys needed: 1, trust file version 1" in found.text
 
 
 def test_a_release_beside_its_image_is_read_too(tmp_path: Path, maker: Maker) -> None:
