@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import itertools
+import re
 from pathlib import Path
 from typing import Final
 
@@ -60,8 +61,10 @@ def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in KINDS:
                 kind = KINDS[node.func.id]  # type: ignore[attr-defined]
                 for given in node.keywords:
-                    if given.arg == "code" and isinstance(given.value, ast.Attribute):
-                        code = ErrorCode[given.value.attr]
+                    # A code that is passed on was checked where it was given.
+                    named = ast.unparse(given.value)
+                    if given.arg == "code" and re.fullmatch(r"ErrorCode\.\w+", named):
+                        code = ErrorCode[named.removeprefix("ErrorCode.")]
                         assert exit_code_in(code) == kind.exit_code, (path, node.lineno)
                         used.add(code)
     used |= {kind.default_code for kind in KINDS.values()}
