@@ -122,7 +122,7 @@ class Player:
     ) -> None:
         self._port = subject.port
         self._answer_ids = _answer_ids(TARGETS[subject.target])
-        self._patience_s = patience_s
+        self._patience_s = float(patience_s)
         self._stopped = stopped
         self._decoder = Decoder()
         self._messages = 0
@@ -145,7 +145,7 @@ class Player:
             self._port.send(entry.frame)
             self.frames_sent += 1
             wanted = self._messages = 0
-        self._await(wanted, recorded[-1].at_s + late_s + tail_s)
+        self._await(wanted, recorded[-1].at_s + late_s + float(tail_s))
 
     def _await(self, wanted: int, due_at: float) -> float:
         """Receive until this time, and longer until the device has sent so many messages. Returns

@@ -125,6 +125,7 @@ class BusTester:
         self.left_at = self.began_at
         """End of the last frame sent."""
         self._stopped = stopped
+        self._stall_s = self.waits.stall_s
         self._stalled_s = 0.0
         self._left_port_at = self.began_at
         """When the port was last used."""
@@ -172,9 +173,8 @@ class BusTester:
         """What this program did since it last used the port takes its time, like a power switch."""
         self._left_port_at = self.now
 
-    def _note_stall(self, since: float, now: float) -> None:
-        gap_s = now - since
-        if gap_s > self.waits.stall_s:
+    def _note_stall(self, gap_s: float) -> None:
+        if gap_s > self._stall_s:
             self._stalled_s = max(self._stalled_s, gap_s)
 
     # -- sending ----------------------------------------------------------------------------------
@@ -304,7 +304,7 @@ class BusTester:
             )
         if self._stopped():
             raise RunStopped("the run was stopped")
-        self._note_stall(self._left_port_at, now)
+        self._note_stall(now - self._left_port_at)
         until = float(min(deadline, self.ends_at, now + _POLL_S))
         try:
             arrival = port.receive(until)
@@ -314,7 +314,7 @@ class BusTester:
             raise
         self._left_port_at = port.now()
         if arrival is None:
-            self._note_stall(max(now, until), self._left_port_at)
+            self._note_stall(self._left_port_at - max(now, until))
             return
         frame, at, is_echo = arrival
         self._record(at, frame, sent=is_echo)
@@ -362,10 +362,12 @@ class BusTester:
             self.update_was_sent = True
         port = self.port
         began_at = port.now()
-        self._note_stall(self._left_port_at, began_at)
         port.send(frame)
-        self._left_port_at = port.now()
-        self._note_stall(began_at, self._left_port_at)
+        now = port.now()
+        if now - self._left_port_at > self._stall_s:  # else neither part of it is one
+            self._note_stall(began_at - self._left_port_at)
+            self._note_stall(now - began_at)
+        self._left_port_at = now
         if port.echoes:
             self._echoes_due += 1
             return
