@@ -107,7 +107,7 @@ def test_a_flash_that_fails_is_no_trouble_for_the_example(flasher: Flasher, tmp_
 @pytest.mark.parametrize(
     ("number", "action"),
     [
-        ("24", ("--case", "TX-03")),  # an answer
+        ("37", ("--case", "TX-01")),  # an answer
         ("36", ("--case", "TX-03")),  # a write to flash that is not erased
         ("17", ("--case", "UP-08")),  # an image
         ("24", ("explore", "--replay", "reset update=300 packets=4 packet-beyond")),
