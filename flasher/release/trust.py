@@ -322,10 +322,10 @@ def _envelopes(raw: bytes) -> tuple[Envelope, ...]:
 
 def newer(known: Chain, found: Chain) -> Chain:
     """Return the longer one of two chains of one trust. Raises UsageError for a fork."""
-    if found.begins_with(known):
-        return found
     if known.begins_with(found):
         return known
+    if found.begins_with(known):
+        return found
     raise untrusted(
         found.source,
         text(

@@ -31,8 +31,14 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
         patch.setattr("can.util.load_file_config", lambda *_args: {})
         patch.setattr("can.util.load_environment_config", lambda *_args: {})
         # What it leaves for later pages it would find there.
-        for name in ("XDG_DATA_HOME", "XDG_STATE_HOME", "FLASHER_BUNDLE_DIR"):
+        for name in (
+            "XDG_CONFIG_HOME",
+            "XDG_DATA_HOME",
+            "XDG_STATE_HOME",
+            "FLASHER_BUNDLE_DIR",
+        ):
             patch.setenv(name, str(folder / name.lower()))
+        patch.setenv("KEY_WORDS", "the passphrase that pages name")
         images = ("bms.hex", "YOUR_IMAGE.hex")
         shown = any(
             block.language == "console" and any(image in block.text for image in images)

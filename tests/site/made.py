@@ -23,6 +23,7 @@ from flasher.cli.framework import CommandEntry, Program
 from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
 from flasher.conformance.profile import profile_keys, unstated
+from flasher.release import trust
 from flasher.settings import bus, device_model, manifest, profile
 from flasher.settings.toml_reader import Key, Reader
 from flasher.station import codes, config, operators, recipe
@@ -61,7 +62,7 @@ def _page_of(purpose: str) -> str:
     return _PAGES[list(PURPOSES).index(purpose)]
 
 
-_PAGES: Final = ("upgrade", "look", "trouble", "bootloaders", "line", "product")
+_PAGES: Final = ("upgrade", "look", "trouble", "releases", "bootloaders", "line", "product")
 """The page of each group of commands."""
 
 
@@ -186,6 +187,7 @@ _FILES: Final[Mapping[str, Callable[[], _Lines]]] = {
     "profile": lambda: _keys(profile.reader().keys),
     "bus": lambda: _keys(bus.READER.keys),
     "manifest": lambda: _keys(manifest.reader().keys),
+    "trust": lambda: _keys(trust.reader().keys),
     "recipe": lambda: _file(recipe.Recipe),
     "station": lambda: _file(config.StationConfig),
     "badges": lambda: _file(operators.BadgeTable),
