@@ -54,7 +54,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "memory_right": "every byte read back is the image's",
         "version_other": "the application runs another version than the image names",
         "no_answer": "the application does not answer",
-        "in_bootloader": "a bootloader continues to announce itself, and no application answers",
+        "in_bootloader": "a bootloader keeps announcing itself and no application answers",
         "memory_other": "the memory differs from the image",
         "two_devices": "two devices answer on the same id",
         "second_tool": "a second tool speaks on the bus",

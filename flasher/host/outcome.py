@@ -49,6 +49,12 @@ class DeviceLeft(Enum):
         return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW)
 
 
+def with_device_state(remedy: str, left: DeviceLeft) -> Text:
+    """Add the state of the device to a remedy."""
+    state = text(wording(left))
+    return text("{remedy} State of the device: {state}.", remedy=remedy, state=state)
+
+
 @dataclass(frozen=True)
 class Statistics:
     """Statistics of an upgrade; times in seconds."""
@@ -159,11 +165,7 @@ class Outcome:
             what,
             where=self.where,
             cause=Text(cause, names),
-            remedy=text(
-                "{remedy} State of the device: {state}.",
-                remedy=Text(remedy, names),
-                state=text(wording(self.device_left)),
-            ),
+            remedy=with_device_state(Text(remedy, names), self.device_left),
             code=code,
         )
         error.needs_rescue = self.device_left.needs_rescue

@@ -23,9 +23,15 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.host.options import UpgradeOptions, firmware_version
-from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLeft
+from flasher.host.outcome import (
+    TWO_DEVICES_CAUSE,
+    TWO_DEVICES_REMEDY,
+    DeviceLeft,
+    with_device_state,
+)
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
 from flasher.host.runner import Runner, Stage, StageInput, filtered
+from flasher.i18n import text
 from flasher.image.image import AddressSpan
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
@@ -142,13 +148,11 @@ class Verification:
         )
 
     def _error(self, target: Target, what: str) -> FlasherError:
-        left = wording(self.device_left)
-        state = f"State of the device: {left}."
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(
                 what,
                 where=f"verification by {self.level.value}",
-                remedy=f"Show its version with flasher info. {state}",
+                remedy=self._with_state("Show its version with flasher info."),
             )
         if self.verdict is Verdict.TWO_DEVICES:
             return WrongDeviceError(
@@ -163,7 +167,9 @@ class Verification:
                 what,
                 where=f"verification by {self.level.value}",
                 cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
-                remedy=f"End the other tool, then look at the device with flasher info. {state}",
+                remedy=self._with_state(
+                    "End the other tool, then look at the device with flasher info."
+                ),
                 code=ErrorCode.SECOND_TOOL,
             )
         if self.verdict is Verdict.IN_BOOTLOADER:
@@ -172,14 +178,19 @@ class Verification:
                 where=f"verification by {self.level.value}",
                 cause="the device does not start the image that it confirmed, or a second device "
                 "of its kind has lost its application",
-                remedy=f"Connect one {target.node.name} only and flash it again. {state}",
+                remedy=self._with_state(
+                    text(
+                        "Leave one {node} alone on the bus, then flash it again.",
+                        node=target.node.name,
+                    )
+                ),
                 code=ErrorCode.IN_BOOTLOADER,
             )
         remedy = (
             "Power-cycle the device and look at it with flasher info; then flash the right image."
         )
         if self.device_left.needs_rescue:
-            remedy += f" {state}"
+            remedy = self._with_state(remedy)
         return VerificationError(
             what,
             where=f"verification by {self.level.value}",
@@ -187,6 +198,9 @@ class Verification:
             remedy=remedy,
             code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,
         )
+
+    def _with_state(self, remedy: str) -> str:
+        return with_device_state(remedy, self.device_left)
 
 
 NOT_ASKED: Final = Verification(Level.NONE, Verdict.NOT_ASKED)

@@ -95,7 +95,7 @@ OTHER_VERSION: Final = _fail(
 )
 NOT_RUNNING: Final = _fail("NOT_RUNNING", text("the new application does not answer"))
 IN_BOOTLOADER: Final = _fail(
-    "IN_BOOTLOADER", text("a bootloader continues to announce itself, and no application answers")
+    "IN_BOOTLOADER", text("a bootloader keeps announcing itself and no application answers")
 )
 MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", text("the memory differs from the image"))
 WRITE_FAILED: Final = _fail("WRITE_FAILED", text("the device does not confirm a write"))

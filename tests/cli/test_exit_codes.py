@@ -281,7 +281,7 @@ CASES = [
     Case("does not run", ExitCode.VERIFICATION, application_is_silent,
          "verification by version", "does not start", "Power-cycle"),
     Case("stays in its bootloader", ExitCode.VERIFICATION, stays_in_its_bootloader,
-         "verification by version", "second device", "one BMS only"),
+         "verification by version", "second device", "one BMS alone"),
     Case("up to date", ExitCode.NOTHING_TO_DO, up_to_date),
     Case("Ctrl-C", ExitCode.INTERRUPTED, interrupted, P3, "", "seconds to time out"),
     Case("Ctrl-C twice", ExitCode.INTERRUPTED, interrupted_twice,

@@ -23,7 +23,7 @@ from flasher.simulate.play import play
 from tests.loops import each
 
 BUGS = upgrade_bugs()
-PARTS = {"host": 22, "bootloader": 12, "driver": 8, "bus": 7, "image": 4}
+PARTS = {"host": 23, "bootloader": 12, "driver": 8, "bus": 7, "image": 4}
 
 
 def bug(file: str, old: str, new: str) -> Bug:

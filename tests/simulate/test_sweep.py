@@ -145,7 +145,7 @@ def is_mock(case: Plan) -> bool:
     "name, chosen, bug, kind",
     [
         ("frames", drops_an_answer, "repeated-packet-stored-as-the-next", "CRASH"),
-        ("power", cuts_a_flash_operation, "complete-before-the-valid-mark", "DISHONEST"),
+        ("power", cuts_a_flash_operation, "cut-ends-the-flash-operation", "CRASH"),
         ("limits", has_early_deadline, "deadline-waits-for-a-timer", "LATE"),
     ],
 )
