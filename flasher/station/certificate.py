@@ -132,6 +132,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
+    signatures = {target.signature for target in last.targets}
     return {
         "life": life,
         "last": last,
@@ -160,6 +161,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
             (step, each, limits_of(each), verdict_of(each))
             for step in last.steps
             for each in step.measurements
+            if each.text is None or each.text not in signatures  # with the images
         ],
         "earlier": [
             (run, RUN_WORDS[run.state][1])

@@ -21,12 +21,13 @@ from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.items import Readable, find_item, meaningful_fields, readable
 from flasher.host.query import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
-from flasher.i18n import text
+from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
 from flasher.image.release import Provenance, Release
 from flasher.protocol.fields import Codec, NumberField
 from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
 from flasher.release.places import release_path
 from flasher.settings.manifest import manifest_path, read_release
 from flasher.settings.profile import Profile, load_profile
@@ -103,6 +104,9 @@ class LoadedTarget:
         found = self.check_signatures()
         if self.firmware.signature is SignatureRule.WAIVED and (found is None or found.problem):
             why = text("the image is not signed") if found is None else found.text
+            # Records name files of the recipe without their folder.
+            source = release_path(self.path) or self.path
+            why = with_value(why, printable(str(source)), printable(source.name))
             return Signature(text("waived by the recipe: {why}", why=why))
         if found is None:
             return None

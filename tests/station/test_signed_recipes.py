@@ -170,7 +170,7 @@ def test_a_waiver_is_for_the_named_target_and_states_what_it_waives(
     raw = released(maker, tmp_path, signers=["a stranger"])
     found = signature_of(recipe_with(tmp_path, table("waived"), raw))
     assert found is not None
-    assert found.text.startswith("waived by the recipe: ")
+    assert found.text.startswith("waived by the recipe: bike.wfw has 0 of the 1 signatures")
     assert found.counter is None
     found = signature_of(recipe_with(tmp_path, table("waived"), released(maker, tmp_path)))
     assert found is not None
@@ -242,6 +242,7 @@ def test_record_and_certificate_state_who_signed_or_what_was_waived(
     assert target.signature.startswith(sentence)
     page = render_certificate(life, bench.clock.utc(), proven(bench.store, life))
     assert sentence in page
+    assert page.count(sentence) == 1
     assert check_certificate(bench.store, page.encode()).problems == ()
     forged = page.replace(sentence, "signed by the works")
     assert check_certificate(bench.store, forged.encode()).problems
