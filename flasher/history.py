@@ -381,6 +381,13 @@ def highest_counters(flashes: list[Flash], *, target: str, product: str) -> dict
     return found
 
 
+def latest_left_open(flashes: list[Flash]) -> Flash | None:
+    """Return the latest upgrade on a real adapter that may have left its device in the transfer."""
+    places = {(each.began.target, each.began.adapter) for each in flashes}
+    found = [left_open(flashes, target=target, adapter=adapter) for target, adapter in places]
+    return max((each for each in found if each is not None), key=flashes.index, default=None)
+
+
 def matching(
     flashes: list[Flash], *, target: str | None, serial_number: str | None
 ) -> Iterator[Flash]:

@@ -20,6 +20,7 @@ from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
 from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
+from flasher.history import Flash
 from flasher.host.event_text import progress_line, warning_text
 from flasher.host.identity import OF_STATE, DeviceAnswers, judge_device, new_version
 from flasher.host.outcome import AGAIN
@@ -31,6 +32,7 @@ from flasher.procedures import nothing_received_error
 from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
+from flasher.release.places import SUFFIX as RELEASE_SUFFIX
 from flasher.report.base import visible
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
@@ -90,6 +92,7 @@ class BenchBackend(Protocol):
     def is_physical(self, adapter: Adapter) -> bool: ...
     def images(self) -> Sequence[Path]: ...
     def dropped(self) -> Sequence[str]: ...
+    def unfinished(self) -> Flash | None: ...
     def use_folder(self, path: str) -> None: ...
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         """Open an adapter. With `asks` False, nothing may be sent."""
@@ -141,6 +144,8 @@ class BenchController:
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
         self._has_new_files = threading.Event()
+        self._last_image: Path | None = None
+        """Image that was dropped or selected last, since an upgrade began."""
         self._is_closing = self._ends_at_once = False
         self._set()
 
@@ -156,8 +161,11 @@ class BenchController:
         self._orders.put(order)
         return True
 
-    def files_came(self) -> None:
-        """Check dropped files as soon as the bench is idle."""
+    def file_came(self, path: Path) -> None:
+        """Check a dropped file as soon as the bench is idle, and select it if it fits."""
+        is_beside = path.suffix.lower() == RELEASE_SUFFIX and path.with_suffix("").is_file()
+        if path.suffix.lower() != ".toml" and not is_beside:  # these belong to an image
+            self._last_image = path
         self._has_new_files.set()
 
     def stop(self) -> None:
@@ -229,11 +237,12 @@ class BenchController:
             was_looked_for=True,
             is_rescue=is_rescue,
             dropped=self.state.dropped,
+            unfinished=self.state.unfinished,
         )
         self.find_adapters()
 
     def find_adapters(self) -> None:
-        self._set(doing=Activity.ADAPTERS)
+        self._set(doing=Activity.ADAPTERS, unfinished=self._backend.unfinished())
         self._set(adapters=tuple(self._backend.adapters(self._cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
@@ -277,7 +286,9 @@ class BenchController:
             self.judge()
             return
         fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
-        self._set(offer=_known(fitting, name), done=None)
+        offer = _known(fitting, name)
+        self._last_image = offer.path
+        self._set(offer=offer, done=None)
 
     def use_folder(self, path: str) -> None:
         self._backend.use_folder(path)
@@ -296,11 +307,27 @@ class BenchController:
         self._set(offers=tuple(offers))
 
     def take_files(self) -> None:
-        """Check files dropped on the page."""
+        """Check files dropped on the page. The image that came last replaces the selected one, or
+        its refusal does. Raises FlasherError for a refused one.
+        """
         self._has_new_files.clear()
         self._set(dropped=tuple(self._backend.dropped()))
-        if self.state.target is not None and self.state.offer is None:
-            self.judge()
+        if self.state.target is None or self.state.done is not None:
+            return
+        self.judge()
+        self._select_last()
+
+    def _select_last(self) -> None:
+        """Select the last image. Raises FlasherError if it was refused."""
+        self._select(lambda offer: offer.path == self._last_image)
+        for each in self.state.offers:
+            if each.path == self._last_image and each.refusal is not None:
+                raise each.refusal
+
+    def _select(self, is_wanted: Callable[[Offer], bool]) -> None:
+        """Select the first fitting image that is wanted, or none."""
+        fitting = (each for each in self.state.offers if each.refusal is None)
+        self._set(offer=next(filter(is_wanted, fitting), None))
 
     def waive(self, name: str, waiver: str) -> None:
         """Accept an image that this check refused."""
@@ -315,8 +342,7 @@ class BenchController:
             )
         self._set(done=None, waived=self.state.waived | {(name, waiver)})
         self.judge()
-        fitting = (each for each in self.state.offers if each.name == name and not each.refusal)
-        self._set(offer=next(fitting, None))
+        self._select(lambda offer: offer.name == name)
 
     def watch(self) -> None:
         """Show the bus traffic until stopped, without sending."""
@@ -449,12 +475,18 @@ class BenchController:
                 "Another device or image was chosen meanwhile; nothing was sent.",
                 remedy="Check the selection, then start again.",
             )
+        if self._has_new_files.is_set():
+            raise UsageError(
+                "A file came meanwhile; nothing was sent.",
+                remedy="Check the selection, then start again.",
+            )
         adapter = self._adapter()
         self._set(
             doing=Activity.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
             repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
             adapter_left_s=None, watched=None,
         )  # fmt: skip
+        self._last_image = None
         job = self._job(offer.path, chosen)
         if job.plan.image.sha256 != offer.sha256:
             raise ImageError(
@@ -513,9 +545,24 @@ class BenchController:
             raise UsageError("No upgrade has failed.", remedy="Start with the adapter.")
         self._set(is_rescue=True, done=None, offer=None, checks=(), notes=())
         self.judge()
-        if done.may_rescue_with_it:
-            same = [each for each in self.state.offers if each.sha256 == done.offer.sha256]
-            self._set(offer=next(iter(same), None))
+        if self._last_image is not None:
+            self._select_last()
+        elif done.may_rescue_with_it:
+            self._select(lambda offer: offer.sha256 == done.offer.sha256)
+
+    def rescue_unfinished(self) -> None:
+        """Rescue the device of the unfinished upgrade: on its adapter if that is here, with its
+        image if that is still on the shelf.
+        """
+        flash = self.state.unfinished
+        if flash is None:
+            raise UsageError("No upgrade is unfinished.", remedy="Start with the adapter.")
+        began = flash.began
+        self.start_over(is_rescue=True)
+        if began.adapter in {each.name for each in self.state.adapters}:
+            self.use_adapter(began.adapter)
+            self.choose_target(began.target)
+            self._select(lambda offer: offer.sha256 == began.image_sha256)
 
     def _adapter(self) -> Adapter:
         if self.state.adapter is None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -55,6 +57,7 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "next": (BenchController.start_over, ()),
     "rescue": (partial(BenchController.start_over, is_rescue=True), ()),
     "rescue-it": (BenchController.rescue_it, ()),
+    "rescue-unfinished": (BenchController.rescue_unfinished, ()),
 }
 """Orders by the command of a form, with the names of their fields."""
 
@@ -96,18 +99,16 @@ class Shelf:
         self.folder = path.resolve()
 
     def files(self) -> list[Path]:
-        """Possible images, dropped ones first."""
-        found: list[Path] = []
+        """Possible images, dropped ones first; one hides a file of its name in the folder."""
+        found: dict[str, Path] = {}
         for folder in (self._dropped, self.folder):
             if folder.is_dir():
-                found += sorted(
-                    each
-                    for each in folder.iterdir()
-                    if each.suffix.lower() in self._suffixes and each.is_file()
+                for each in sorted(folder.iterdir()):
                     # A release beside its image is opened with it.
-                    if not (each.suffix.lower() == SUFFIX and each.with_suffix("").is_file())
-                )
-        return found[:_FILES_MAX]
+                    is_detached = each.suffix.lower() == SUFFIX and each.with_suffix("").is_file()
+                    if each.suffix.lower() in self._suffixes and each.is_file() and not is_detached:
+                        found.setdefault(each.name, each)
+        return list(found.values())[:_FILES_MAX]
 
     def dropped(self) -> list[str]:
         """Names of dropped images and manifests."""
@@ -191,10 +192,12 @@ class BenchPage:
         yield {"ended": True}
 
     def _parts(self, translate: Translator, state: BenchState) -> dict[str, str]:
+        state = as_it_is_now(state)
         return self._pages.parts(
             translate, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
             left_s=left_s(state), battery_answers=battery_answers(state), waivers=WAIVERS,
+            without_options=without_options,
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:
@@ -228,7 +231,7 @@ class BenchPage:
             return JSONResponse({"error": "no file of flasher"}, 415)
         if path.parent == self._shelf.traces:
             return JSONResponse({"page": f"/kept/story?{urlencode({'trace': path.name})}"})
-        self._bench.files_came()
+        self._bench.file_came(path)
         return JSONResponse({})
 
 
@@ -256,6 +259,29 @@ def _listed(shown: Field) -> str:
         return ""
     values = {f"name_{number}": text(name) for number, name in enumerate(names)}
     return Text(", ".join(f"{{{name}}}" for name in values), values)
+
+
+_WAIVES: Final = re.compile(r"; --allow-[\w-]+ waives this.*(?=\)\.?$)", re.DOTALL)
+_OPTION: Final = re.compile(r"(?<!\w)--[a-z]")
+
+
+def without_options(message: str) -> str:
+    """Leave out what a message says of options of the command line: a page has controls instead."""
+    if not _OPTION.search(message):
+        return message
+    sentences = re.split(r"(?<=[.!?]) ", _WAIVES.sub("", message))
+    return " ".join(each for each in sentences if not _OPTION.search(each))
+
+
+def as_it_is_now(state: BenchState) -> BenchState:
+    """Return the state with the answers after an upgrade in place of those before it; without any
+    while the new application was not asked.
+    """
+    done = state.done
+    if done is None or done.before is None or done.before.target is not done.target:
+        return state
+    has_changed = done.is_transferred or (done.error is not None and done.error.needs_rescue)
+    return replace(state, bike=done.after) if has_changed else state
 
 
 def facts(state: BenchState) -> list[tuple[str, str]]:

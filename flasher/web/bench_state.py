@@ -11,6 +11,7 @@ from pathlib import Path
 from flasher import events
 from flasher.api import DeviceInfo, Result
 from flasher.errors import FlasherError
+from flasher.history import Flash
 from flasher.host.verify import Verdict
 from flasher.protocol.spec import Target
 from flasher.report.base import visible
@@ -164,6 +165,8 @@ class BenchState:
 
     doing: Activity = Activity.NOTHING
     is_rescue: bool = False
+    unfinished: Flash | None = None
+    """Latest upgrade of this computer that left its device without an application, or perhaps."""
     adapters: tuple[Adapter, ...] = ()
     was_looked_for: bool = False
     adapter: Adapter | None = None

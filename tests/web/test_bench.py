@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import re
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +27,8 @@ from flasher.errors import (
     UsageError,
     WrongDeviceError,
 )
-from flasher.history import FlashHistory
+from flasher.history import MOCK, Began, Flash, FlashHistory, Reached, latest_left_open
+from flasher.host.event_text import progress_line
 from flasher.host.verify import Level, Verdict, Verification
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
@@ -36,11 +38,12 @@ from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
-from flasher.web.bench_page import battery_answers
+from flasher.web.bench_page import as_it_is_now, battery_answers, facts, without_options
 from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
+from tests.loops import each
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
 
 
@@ -318,12 +321,12 @@ def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(
     assert done.result is not None
     away = replace(done.result, outcome=replace(done.result.outcome, unobserved_s=1.5))
     translate = translator(language)
-    for each, is_shown in ((done, False), (replace(done, result=away), True)):
+    for shown, is_shown in ((done, False), (replace(done, result=away), True)):
         sheet = Pages(language).text(
             "bench_sheet.html",
             translate,
             "",
-            done=each,
+            done=shown,
             rows=[],
             device=None,
             waivers={},
@@ -622,3 +625,172 @@ def test_the_upgrade_that_has_no_end_is_among_the_notes(place: BenchPlace) -> No
     place.bench._happened(events.UpgradeLeftOpen("2026-05-17T10:31:02+02:00", "a.hex", False))
     (note,) = place.bench.state.notes
     assert "2026-05-17 10:31:02+02:00 with a.hex has no end" in note
+
+
+# -- files that come while an image is selected ---------------------------------------------------
+
+
+def _drop(place: BenchPlace, name: str, data: bytes) -> BenchState:
+    path = place.shelf.take(name, data)
+    assert path is not None
+    place.bench.file_came(path)
+    return place.do(BenchController.take_files)
+
+
+def test_the_file_that_came_last_replaces_the_selected_image(place: BenchPlace) -> None:
+    _chosen(place)
+    state = _drop(place, "newer.bin", image_of(PACKETS + 1, NEW).data)
+    assert state.offer is not None
+    assert state.offer.name == "newer.bin"
+
+
+@each(
+    "name, data",
+    [
+        ("tiny.bin", bytes(range(16))),
+        ("page.bin", b"<!doctype html><title>404</title>\n" * 9),
+        ("motor.bin", image_of(PACKETS, NEW).data + b"\0WMC V1r0r4_20220512\0"),
+        ("broken.s19", b"S1"),
+    ],
+)
+def test_a_file_that_is_refused_takes_the_selected_image_away_and_says_why(
+    name: str, data: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = BenchPlace(tmp_path_factory.mktemp("place"))
+    _chosen(place)
+    state = _drop(place, name, data)
+    assert state.offer is None
+    assert state.trouble is not None
+
+
+def test_a_manifest_that_comes_later_keeps_the_image_that_was_chosen(place: BenchPlace) -> None:
+    _drop(place, "dropped.bin", image_of(PACKETS + 1, NEW).data)
+    _chosen(place)
+    state = _drop(place, "dropped.bin.toml", b"format = 1\n")
+    assert state.offer is not None
+    assert state.offer.name == IMAGE
+
+
+def test_a_dropped_image_hides_the_one_of_its_name_in_the_folder(place: BenchPlace) -> None:
+    _chosen(place)
+    other = image_of(PACKETS + 1, NEW)
+    state = _drop(place, IMAGE, other.data)
+    assert state.offer is not None
+    assert state.offer.sha256 == other.sha256
+    assert [each.name for each in state.offers].count(IMAGE) == 1
+
+
+def test_an_order_given_while_a_file_comes_sends_nothing(place: BenchPlace) -> None:
+    upgrade = _upgrade(_chosen(place))
+    path = place.shelf.take("newer.bin", image_of(PACKETS + 1, NEW).data)
+    assert path is not None
+    place.bench.file_came(path)
+    state = place.do(upgrade)
+    assert isinstance(state.trouble, UsageError)
+    assert state.done is None
+
+
+def test_a_file_for_a_failed_upgrade_is_the_one_that_rescues(place: BenchPlace) -> None:
+    state = place.do(_upgrade(_chosen(place, BikeFault.POWER)))
+    assert state.done is not None
+    assert state.done.error is not None
+    _drop(place, "newer.bin", image_of(PACKETS + 1, NEW).data)
+    assert place.bench.state.done is not None, "its result stays on the page"
+    state = place.do(BenchController.rescue_it)
+    assert state.offer is not None
+    assert state.offer.name == "newer.bin"
+
+
+# -- what the page shows --------------------------------------------------------------------------
+
+
+def test_after_an_upgrade_the_page_shows_the_new_version_as_the_bikes(place: BenchPlace) -> None:
+    before = place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
+    assert OLD in dict(facts(as_it_is_now(before))).values()
+    _done(place)
+    shown = as_it_is_now(place.bench.state)
+    assert NEW in dict(facts(shown)).values()
+    assert OLD not in str(battery_answers(shown))
+    done = place.bench.state.done
+    assert done is not None
+    unknown = replace(place.bench.state, done=replace(done, after=None))
+    assert facts(as_it_is_now(unknown)) == []
+
+
+def test_an_unfinished_upgrade_is_offered_with_its_adapter_device_and_image(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = image_of(PACKETS, NEW)
+    began = Began(
+        at="2026-05-17T10:31:02+02:00", command="flash", target="bms", is_virtual=False,
+        adapter=BikeFault.NONE.value, image=IMAGE, image_sha256=image.sha256,
+        image_size_bytes=image.size_bytes, image_version=NEW,
+    )  # fmt: skip
+    flash = Flash(began, None, reached=Reached("transfer", 12))
+    monkeypatch.setattr(place.bikes, "unfinished", lambda: flash)
+    state = place.do(BenchController.find_adapters)
+    assert state.unfinished is flash
+    state = place.do(BenchController.rescue_unfinished)
+    assert state.is_rescue
+    assert state.target is BMS
+    assert state.offer is not None
+    assert state.offer.sha256 == image.sha256
+
+
+def test_the_latest_upgrade_without_an_end_is_found_until_its_device_has_an_application(
+    tmp_path: Path,
+) -> None:
+    history = FlashHistory(tmp_path / "history.jsonl")
+    began = Began(
+        at="2026-05-17T10:31:02+02:00", command="flash", target="bms", is_virtual=False,
+        adapter="socketcan can0", image="a.hex", image_sha256="0" * 64, image_size_bytes=1,
+        image_version=None,
+    )  # fmt: skip
+    assert latest_left_open(history.flashes()[0]) is None
+    name = history.begin(began)
+    history.reached(name, Reached("transfer", 3))
+    flashes = [replace(each, is_running=False) for each in history.flashes()[0]]
+    assert latest_left_open(flashes) is flashes[0]
+    virtual = [replace(each, began=replace(began, adapter=MOCK)) for each in flashes]
+    assert latest_left_open(virtual) is None
+
+
+@each("code", ["de", "zh"])
+def test_no_english_is_left_in_a_step_that_a_page_shows_in_another_language(code: str) -> None:
+    translate = translator(code)
+    steps = (
+        events.AttemptStarted(2, "restarted", 100.0),
+        *(events.PhaseEntered(phase, 1) for phase in events.Phase),
+        events.UpgradeLeftOpen("2026-05-17T10:31:02+02:00", "a.hex", False),
+        events.UpgradeLeftOpen("2026-05-17T10:31:02+02:00", "a.hex", True),
+        events.HostStalled(2.5),
+        events.AdapterBack(),
+    )
+    for step in steps:
+        line = progress_line(step)
+        assert line is not None
+        shown = translate(line[0])
+        assert not re.search(r"\b(the|again|device|for|is|has|waiting)\b", shown), shown
+    assert "2,5" in translate(progress_line(events.HostStalled(2.5))[0]) or code == "zh"  # type: ignore[index]
+
+
+@each("name, data", [("tiny.bin", bytes(range(16))), ("motor.bin", b"")])
+def test_an_error_on_the_page_names_no_option_of_the_command_line(
+    name: str, data: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = BenchPlace(tmp_path_factory.mktemp("place"))
+    _chosen(place)
+    image = image_of(PACKETS, NEW).data + b"\0WMC V1r0r4_20220512\0"
+    trouble = _drop(place, name, data or image).trouble
+    assert trouble is not None
+    assert "--allow-" in trouble.what, "the command line names it"
+    shown = without_options(trouble.what), without_options(trouble.remedy)
+    assert "--" not in "".join(shown)
+    assert all(shown)
+    assert shown[0].endswith(")."), "the brackets stay whole"
+
+
+def test_a_message_without_options_is_the_same_and_one_of_options_alone_is_empty() -> None:
+    assert without_options("Wake it. Look again.") == "Wake it. Look again."
+    assert without_options("Wake it. Or add --force.") == "Wake it."
+    assert without_options("Allow more time with --timeout.") == ""

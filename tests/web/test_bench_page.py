@@ -14,6 +14,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from flasher import events
+from flasher.history import Began, Flash, Reached
+from flasher.web.bench import BenchController
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.firmware import VECTORS
@@ -119,7 +121,7 @@ def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page
     _check(page)
     image = image_of(3, NEW).data
     page.set_input_files("#file", {"name": "own <b>.bin", "mimeType": "", "buffer": image})
-    expect(page.locator("#image-2")).to_have_text("own <b>.bin")
+    expect(page.locator("#image strong")).to_have_text("own <b>.bin")
     page.set_input_files("#file", {"name": "run.sh", "mimeType": "", "buffer": image})
     expect(page.locator("#message")).to_contain_text("neither an image")
 
@@ -265,3 +267,80 @@ def test_reloading_disturbs_nothing_and_a_second_tab_shows_the_same(
     second.close()
     page.go_back()
     assert _claims(page) == ["YES", "YES", "YES"]
+
+
+def test_a_file_that_is_chosen_while_an_image_is_selected_is_the_one_to_be_flashed(
+    page: Page,
+) -> None:
+    _choose(page)
+    expect(page.locator("#go")).to_be_visible()
+    newer = image_of(PACKETS + 1, NEW).data
+    page.set_input_files("#file", {"name": "newer.bin", "mimeType": "", "buffer": newer})
+    expect(page.locator("#image strong")).to_have_text("newer.bin")
+    expect(page.locator("#start")).to_contain_text("newer.bin into the BMS")
+    page.set_input_files("#file", {"name": "tiny.bin", "mimeType": "", "buffer": bytes(range(16))})
+    expect(page.locator("#trouble")).to_contain_text("not plausible as firmware")
+    expect(page.locator("#trouble h2")).to_be_in_viewport()
+    expect(page.locator("#go")).to_have_count(0)
+
+
+def test_a_page_that_lost_its_server_in_an_upgrade_says_what_is_known_and_what_to_do(
+    tab: Tab, place: BenchPlace
+) -> None:
+    reached, go_on = threading.Event(), threading.Event()
+
+    def hold(event: object) -> None:
+        if isinstance(event, events.PacketAcknowledged) and event.number == 7:
+            reached.set()
+            go_on.wait(30)
+
+    place.bikes.hold = hold
+    with place.served() as url:
+        tab.page.goto(url)
+        _choose(tab.page)
+        tab.page.click("#go")
+        assert reached.wait(20)
+        expect(tab.page.locator("#pace")).to_contain_text("7 of 20 packets")
+        tab.page.evaluate("document.body.classList.add('lost')")
+        cover = tab.page.locator("#cover")
+        expect(cover).to_be_visible()
+        expect(cover).to_contain_text("Last reported of the upgrade: 7 of 20 packets")
+        expect(cover.get_by_text("If it was ended")).to_be_visible()
+        expect(cover.get_by_text("No upgrade was running")).to_be_hidden()
+        go_on.set()
+        tab.page.wait_for_selector("#next-bike:enabled")
+        tab.page.evaluate("document.body.classList.add('lost')")
+        expect(cover.get_by_text("No upgrade was running")).to_be_visible()
+        tab.page.goto("about:blank")
+
+
+def test_the_focus_is_back_on_the_control_that_was_used_by_enter(page: Page) -> None:
+    page.focus("#do-adapters")
+    page.keyboard.press("Enter")
+    expect(page.locator("#do-adapters")).to_be_focused()
+    _choose(page)
+    page.click("#do-image")
+    page.focus("#folder")
+    page.keyboard.press("Enter")
+    expect(page.locator("#image-1")).to_be_visible()
+    expect(page.locator("#folder")).to_be_focused()
+
+
+def test_an_unfinished_upgrade_is_the_first_thing_on_the_page(tab: Tab, place: BenchPlace) -> None:
+    began = Began(
+        at="2026-05-17T10:31:02+02:00", command="flash", target="bms", is_virtual=False,
+        adapter=BikeFault.NONE.value, image=IMAGE,
+        image_sha256=image_of(PACKETS, NEW).sha256, image_size_bytes=1, image_version=NEW,
+    )  # fmt: skip
+    place.bikes.unfinished = lambda: Flash(began, None, reached=Reached("transfer", 12))  # type: ignore[method-assign]
+    place.do(BenchController.find_adapters)
+    with place.served() as url:
+        tab.page.goto(url)
+        expect(tab.page.locator("#rescue h2")).to_have_text(
+            "An upgrade has no end: rescue the device"
+        )
+        expect(tab.page.locator("#rescue")).to_contain_text("its application is erased")
+        _check(tab.page)
+        tab.page.click("#do-rescue-unfinished")
+        expect(tab.page.locator("#go")).to_have_text("Rescue the BMS now")
+        tab.page.goto("about:blank")

@@ -9,7 +9,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -34,6 +34,7 @@ from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
+from flasher.history import Flash, FlashHistory, latest_left_open
 from flasher.host.options import DEFAULT_ATTEMPTS
 from flasher.i18n import text
 from flasher.procedures import DeviceInfo
@@ -244,6 +245,11 @@ class Adapters(_Place):
         listed = [Adapter(name, notes[name], was_last=name == last) for name in self._buses]
         return sorted(listed, key=lambda adapter: not adapter.was_last)
 
+    def unfinished(self) -> Flash | None:
+        with suppress(FlasherError, OSError):  # a flash reports what is wrong with the history
+            return latest_left_open(FlashHistory().flashes()[0])
+        return None
+
     def use(self, adapter: Adapter) -> None:
         self._memory.keep(adapter=adapter.name)
 
@@ -269,6 +275,9 @@ class VirtualBikes(_Place):
 
     def adapters(self, _cancelled: Callable[[], bool]) -> Sequence[Adapter]:
         return [Adapter(fault.value, NOTES[fault]) for fault in BikeFault]
+
+    def unfinished(self) -> Flash | None:
+        return None  # a virtual bike is gone with the program
 
     def use(self, adapter: Adapter) -> None:
         """Select a bike, which keeps its state, so that it can be rescued."""

@@ -2,6 +2,8 @@
 // Bench page: inserts the parts that the server renders, and submits forms.
 
 let isFocusLost = false;
+// Control that was used last: it gets the focus back as soon as it is shown again.
+let used = "";
 
 // Name of the file to which a <details> element belongs, if any.
 function about(summary) {
@@ -24,12 +26,16 @@ function apply(message) {
     }
   }
   // Restore the keyboard focus, or move it to the next control as soon as there is one.
-  for (const id of isFocusLost ? [name, "now"] : []) {
+  for (const id of isFocusLost ? [name === "now" ? used : name, used, "now"] : []) {
     if (document.activeElement === document.body) {
       byId(id)?.focus();
     }
   }
   isFocusLost &&= document.activeElement === document.body;
+  byId("last").textContent = document.querySelector("#pace > p")?.textContent ?? "";
+  if (message.parts?.trouble?.trim()) {
+    byId("trouble").scrollIntoView({ block: "nearest" });
+  }
 }
 
 async function send(path, body) {
@@ -54,6 +60,7 @@ async function upload(files) {
 
 addEventListener("submit", (event) => {
   event.preventDefault();
+  used = document.activeElement.id;
   send("/bench/order", Object.fromEntries(new FormData(event.target, event.submitter)));
 });
 addEventListener("change", (event) => event.target.type === "file" && upload(event.target.files));
