@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from flasher.host.verify import Level, Verdict, Verification
+from flasher.host.verify import GOOD, Level, Verdict, Verification
 from flasher.i18n import Text, text, with_value
 from flasher.protocol.spec import TARGETS
 from flasher.station.scans import Word
@@ -140,3 +140,13 @@ def test_a_verification_that_fails_is_translated_whole(language: str, translated
     assert "completed" not in text
     assert "instead" not in text
     assert translated in text
+
+
+@each("language", ["de", "zh"])
+@each("verdict", [each for each in Verdict if each not in GOOD])
+def test_each_failed_verification_is_translated(verdict: Verdict, language: str) -> None:
+    error = Verification(Level.VERSION, verdict).error(TARGETS["bms"])
+    assert error is not None
+    translated = translator(language)
+    shown = " ".join(map(translated, (error.what, error.cause, error.remedy)))
+    assert not re.findall(r"\b(?:a|the|it|and|then|is)\b", shown)
