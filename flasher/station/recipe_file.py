@@ -262,7 +262,7 @@ def _load_target(
         if firmware.manifest or firmware.base is not None:
             raise UsageError(
                 f"{firmware.image!a:.80} is signed with its manifest, as a whole file.",
-                remedy="Remove manifest and base: the release contains both.",
+                remedy="Remove manifest and base: a release is taken as it is.",
             )
     files = [image_path, manifest, *([profile_path] if profile_path else [])]
     # Hashed before and after loading: the hashes are those of the loaded bytes.
