@@ -667,6 +667,16 @@ def two_devices_error(target: Target, evidence: str, written: str) -> WrongDevic
     )
 
 
+def in_bootloader_error(target: Target, boot_version: str) -> NoAnswerError:
+    """Create the error for a device that answers no query, because its bootloader runs."""
+    node = target.node.name
+    return NoAnswerError(
+        f"The {node} is in its bootloader ({boot_version}): it answers no query there.",
+        cause="an upgrade was interrupted, or its application does not start",
+        remedy=f"A complete upgrade makes it run again: flasher flash IMAGE -t {target.name}.",
+    )
+
+
 def nothing_received_error(survey: Survey, bitrate_bps: int) -> NoAnswerError:
     """Create the error for a bus without messages of any documented node."""
     count = survey.foreign_frames

@@ -147,3 +147,16 @@ def test_a_wmc_that_sends_nothing_is_exit_5_and_said_to_be_unaskable(flasher: Fl
     run = flasher("info", "-t", "wmc", *MOCK)
     assert run.code == ExitCode.NO_ANSWER
     assert "no question to ask it" in " ".join(run.err.split())
+
+
+@pytest.mark.parametrize("words", [("info",), ("read", "serial-number")])
+def test_a_device_in_its_bootloader_is_reported_with_the_way_on(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    bootloader = Battery(silent=frozenset(range(0x10000)), repeats=((0x725, 0xC109, b"BMSV1.0.0"),))
+    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(bootloader))
+    run = flasher(*words, "-t", "bms", *MOCK, "--json")
+    assert run.code == run.document["exit_code"] == ExitCode.NO_ANSWER
+    assert "The BMS is in its bootloader (BMS V1.0.0)" in run.document["error"]["what"]
+    assert "flasher flash IMAGE -t bms" in run.document["error"]["remedy"]
+    assert "key" not in run.err

@@ -1,4 +1,4 @@
-"""Ten questions of people who see the site for the first time, and the way to each answer.
+"""Questions of people who see the site for the first time, and the way to each answer.
 
     python -m tests.site
 
@@ -49,6 +49,36 @@ QUESTIONS: Final = (
         "Which versions and which serial number has this battery?",
         "how-to/read.html",
         "firmware version",
+    ),
+    Question(
+        "service",
+        "Does a flash keep odometer and settings?",
+        "how-to/questions.html#does-a-flash-keep-odometer-and-settings",
+        "in it flasher writes no setting",
+    ),
+    Question(
+        "service",
+        "Can all three devices be upgraded in one go?",
+        "how-to/questions.html#can-all-three-devices-be-upgraded-in-one-go",
+        "stops at the first one that fails",
+    ),
+    Question(
+        "service",
+        "Can it be installed without Python?",
+        "how-to/questions.html#can-it-be-installed-without-python",
+        "it needs Python 3.11 or later",
+    ),
+    Question(
+        "service",
+        "How do I update flasher?",
+        "how-to/questions.html#how-is-flasher-updated",
+        "git pull",
+    ),
+    Question(
+        "line",
+        "How many sockets does a PC carry?",
+        "how-to/questions.html#how-many-sockets-does-a-pc-carry",
+        "flasher sets no limit",
     ),
     Question(
         "line",

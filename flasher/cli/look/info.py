@@ -12,7 +12,7 @@ from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ErrorCode, ExitCode, NoAnswerError
-from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo
+from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo, in_bootloader_error
 from flasher.protocol.spec import Target
 
 _EXAMPLES: Final = """\
@@ -59,13 +59,23 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
-        error = None if found.is_there else silence_error(found)
+        error = no_application_error(found) if found.is_there else silence_error(found)
         if error is not None:
             record.failed(error)
     if error is not None:
         return output.failure(error, info_document(found))
     output.results(_lines(found))
     return output.document(info_document(found))
+
+
+def no_application_error(found: DeviceInfo) -> NoAnswerError | None:
+    """Create the error for a device that answers nothing, because its bootloader announces itself;
+    None for any other.
+    """
+    heard = found.survey.heard[found.target.node]
+    if not heard.boot_version or not found.readings or any(each.answer for each in found.readings):
+        return None
+    return in_bootloader_error(found.target, heard.boot_version)
 
 
 def silence_error(found: DeviceInfo) -> NoAnswerError:

@@ -18,9 +18,10 @@ from flasher.cli.look.memory import MEMORY, intel_hex, read_with_bar
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode, NoAnswerError, UsageError
 from flasher.host.items import find_item, meaningful_fields, readable
 from flasher.host.query import check_range
+from flasher.procedures import in_bootloader_error
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 from flasher.protocol.text import printable
@@ -158,7 +159,13 @@ def _read_item(
 ) -> int:
     entry = find_item(item, readable(target, bus.dialect), target, "read")
     with recorded_device(recorded, bus, output, target) as (device, record):
-        answer = device.read(entry.name)
+        try:
+            answer = device.read(entry.name)
+        except NoAnswerError as error:
+            heard = device.connection.scan(bus.dialect, taps=record.taps).heard.get(target.node)
+            if heard is None or not heard.boot_version:
+                raise
+            raise in_bootloader_error(target, heard.boot_version) from error
     document = content_document(answer)
     output.results(content_lines(answer, entry.field))
     if entry.field:
