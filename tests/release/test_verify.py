@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,3 +69,22 @@ def test_what_was_seen_is_kept_in_the_data_folder(own_computer: Path) -> None:
     assert known is not None
     assert (known.seen.version, known.seen.newest_date) == (1, "2026-02-01")
     assert list((own_computer / "data").rglob("*.json"))
+
+
+_WITHOUT_TRUST = """
+import os, sys
+from flasher import api
+from flasher.protocol.spec import BMS
+from flasher.settings.profile import load_profile
+api.prepare(sys.argv[1], load_profile(os.devnull, BMS)).checked()
+wanted = {"flasher.release.verify", "securesystemslib", "cryptography", "zipfile"}
+sys.exit(repr(wanted & sys.modules.keys()) if wanted & sys.modules.keys() else 0)
+"""
+
+
+@pytest.mark.slow
+def test_an_upgrade_without_a_trust_file_loads_nothing_for_signatures() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _WITHOUT_TRUST, IMAGE], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
