@@ -399,7 +399,7 @@ class Bench:
             got = f"{min(total, _PIECES)} of {total} pieces, read over the bus"
         # During a transfer, a part of it may still be in a buffer.
         name = "buffer_bytes"
-        by = {} if runs else {f"device.{name}": self.number(name)}
+        by = {} if runs else {f"device.{name}": float(self.number(name))}
         return self.check(differs_at is None, expected, got, by=by)
 
     def is_kept_aside(self, image: bytes) -> bool:
