@@ -227,7 +227,9 @@ def _times(chance: random.Random, choices: Choices) -> dict[str, int]:
         made["START_US"] = min(made["START_US"], max(left_us // 2, 0))
     made["GAP_US"] = chance.choice((0, 0, 0, 300_000, 900_000))
     made["FRAME_GAP_US"] = chance.choice((101_000, 120_000, 180_000))
-    made["REQUEST_US"] = drawn(_LIMITS.erase_s, page_us)
+    # From an update command in the burst, which it may process after the window (R12).
+    waits_us = burst_us if choices["BURST_HEARS"] == 2 else 0
+    made["REQUEST_US"] = drawn(_LIMITS.erase_s, page_us + waits_us)
     made["ACK_US"] = drawn(_LIMITS.ack_s, page_us)
     made["NAK_US"] = drawn(_LIMITS.ack_s, page_us)
     made["END_NAK_US"] = drawn(_LIMITS.complete_s, 2 * page_us)

@@ -62,12 +62,23 @@ def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> Non
     assert faults_of(9, Selection(cases=("EN-02",)), make=lambda _: device) == []
 
 
-def test_an_early_end_may_be_refused_so_late_that_the_bootloader_has_just_restarted() -> None:
-    device = right_c_device(5)
-    profile = ConformanceProfile({**device.profiles["default"].given, "limits.ack_s": 1.5})
+def verdict(seed: int, case_id: str, given: dict[str, Value]) -> CaseVerdict:
+    """Of that case with the sizes of the device, and `given`."""
+    device = right_c_device(seed)
+    profile = ConformanceProfile({**device.profiles["default"].given, **given})
     with device.subject() as subject:
-        report = run(subject, profile, selection=Selection(cases=("EN-02",)))
-    assert [one.verdict for one in report.results] == [CaseVerdict.PASS_IN_PART]
+        report = run(subject, profile, selection=Selection(cases=(case_id,)))
+    return report.results[0].verdict
+
+
+def test_an_early_end_may_be_refused_so_late_that_the_bootloader_has_just_restarted() -> None:
+    assert verdict(5, "EN-02", {"limits.ack_s": 1.5}) is CaseVerdict.PASS_IN_PART
+
+
+def test_a_transfer_may_last_though_a_padded_update_command_is_rejected() -> None:
+    given: dict[str, Value] = {"up_08": "starts_over", "limits.erase_s": 4.8}
+    given |= {"limits.pause_s": 8.6, "fr_07": "rejected", "device.versions": 6}
+    assert verdict(13, "FR-07", given) in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART)
 
 
 @each(
@@ -83,6 +94,18 @@ def test_an_early_end_may_be_refused_so_late_that_the_bootloader_has_just_restar
         (5, {}, {"rs_03_old": "either", "rs_03": "announces", "device.largest_image_bytes": 4098}),
         # An update command in the burst is answered after it.
         (6, {}, {"up_04_burst": "accepted"}),
+        # Before packet 1, it ignores an update command for another size.
+        (
+            10,
+            {"APPLICATION_BYTES": 8192, "LARGEST_BYTES": 7000, "PAGE_BYTES": 8192, "ERASE_US": 0},
+            {"up_08": "starts_over", "device.largest_image_bytes": 7000},
+        ),
+        # It still writes packet 1 when packet 2 begins.
+        (11, {}, {"limits.inter_frame_s": 0.16, "tx_01_lost_frame": "silence"}),
+        # Only a lost frame is answered by NAK, late.
+        (12, {}, {"tx_01_lost_frame": "nak", "limits.ack_s": 1.5}),
+        # After a pause of 9 s it takes another 1.4 s to announce itself.
+        (13, {}, {"limits.pause_s": 8.6}),
     ),
 )
 def test_init_finds(seed: int, changed: dict[str, int], wanted: dict[str, Value | None]) -> None:

@@ -120,7 +120,10 @@ class Probe(PacketTransfer):
         else:
             if reset and reply is None:  # by now the application was started
                 bench.reset_to_bootloader()
-            if reset or reply is not None:
+            lasts = bench.choice("up_08") == "starts_over" and not bench.is_pause_near(
+                bench.waits.settle_s
+            )
+            if reset or reply is not None or lasts:
                 bench.update(len(self.image))
             else:
                 bench.update_again(len(self.image))

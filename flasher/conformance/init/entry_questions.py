@@ -470,11 +470,16 @@ def largest_image(session: InitSession) -> Findings:
 
     def is_taken(size_bytes: int) -> bool:
         nonlocal in_transfer
-        if keeps_old and not in_transfer:
+        if not in_transfer:
             bench.wait_for_window()
         share = packet_count(size_bytes) / session.total
         within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
-        reply = _answer_to_size(session, bench.encoder.update(size_bytes), within_s)
+        frames = bench.encoder.update(size_bytes)
+        reply = _answer_to_size(session, frames, within_s)
+        if in_transfer and reply is not None and reply.kind is Reply.BOOT_VERSION:
+            # A pause had ended the transfer, and the command may have come in the restart.
+            bench.wait_for_window()
+            reply = _answer_to_size(session, frames, within_s)
         taken = reply is not None and reply.kind is Reply.REQUEST
         if taken:
             _prepare_for_next_size(session, size_bytes)
@@ -521,9 +526,11 @@ def _answer_to_size(
     bench.forget()
     sent = bench.send(frames)
     deadline, versions = sent.left_at + within_s, 0
+    # It may process the command after its burst.
+    most = max(3, bench.number("versions"))
     reply: Received | None = None
     kinds = (Reply.REQUEST, Reply.NAK, Reply.BOOT_VERSION)
-    while versions < 3:
+    while versions < most:
         reply = bench.wait_for(*kinds, within_s=deadline - bench.now)
         if reply is None or reply.kind is Reply.NAK:
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import floor
 from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
@@ -30,6 +31,8 @@ _GAP_WATCHED_S: Final = 1.6
 _GAP_RESOLUTION_S: Final = 0.002
 _LATER_S: Final = 0.5
 _PAUSE_WATCHED_S: Final = 30.0
+_PAUSE_RESOLUTION_S: Final = 0.05
+"""Of a pause of 1 s, and a share of a longer one."""
 _END_ANSWERS: Final = (Reply.REQUEST, Reply.ACK, Reply.NAK, Reply.COMPLETE)
 _SEVERAL_PAGES: Final = 65
 """Packets, one more than 8 KiB."""
@@ -128,15 +131,17 @@ def lost_frame(session: InitSession) -> Findings:
             session.reach(1, 2)
             bench.forget()
             frames = session.frames()
-            bench.send(frames[:index] + frames[index + 1 :])
+            sent = bench.send(frames[:index] + frames[index + 1 :])
             replies = bench.answers()
             late = bench.collect(_LATER_S)
+            for one in (*replies, *late):
+                if one.kind is Reply.NAK:  # counted from when the device may notice the gap
+                    noticed_at = sent.left_at + bench.limit("inter_frame_s")
+                    bench.measure(TimeName.REJECTED, max(one.at - noticed_at, 0.0))
             kinds = [one.kind for one in (*replies, *late)]
             value = {0: "silence", 1: "nak"}.get(len(kinds), "")
             if kinds not in ([], [Reply.NAK]):
                 value = ""
-            elif late:
-                value = "either"
             answer = answer_text([*replies, *late]) + (", late" if late else "")
             stimulus = f"a packet without its frame {index + 1}"
             yield Trial(value, answer.replace(f" {session.stored + 1}", ""), stimulus)
@@ -251,6 +256,8 @@ def frame_gap(session: InitSession) -> Findings:
             break
         asked_s = (low_s + high_s) / 2 if high_s else min(max(2 * low_s, _FIRST_GAP_S), longest_s)
         session.reach(0, 1)
+        # One that still writes the last packet sees a shorter gap.
+        bench.wait(min(bench.limit("ack_s"), longest_s) / 2)
         taken = session.offer(session.frames(), gap_s=asked_s, gaps=1)
         low_s, high_s = (asked_s, high_s) if taken else (low_s, asked_s)
     else:
@@ -313,6 +320,8 @@ def update_again(session: InitSession) -> Findings:
             if taken:
                 bench.measure(TimeName.REQUEST, reply.at - sent.left_at)
                 session.stored = 0
+            if size and taken:
+                bench.packets(session.image[:-size], 1, 1)  # before packet 1 it may ignore one
             if size or not taken:  # the other size, or it was a pause
                 session.update()
         session.finish()
@@ -343,6 +352,37 @@ def pause(session: InitSession) -> Findings:
     for one_s in found_s:
         bench.measure(TimeName.LATE, one_s - min(found_s))
     yield pause_answer("limits.pause_s", found_s, bench.port.uncertainty_s)
+    # The transfer may have ended long before the first boot version.
+    low_s, high_s = 0.0, min(found_s)
+    asked_s = high_s - max(_PAUSE_RESOLUTION_S, 2 * bench.port.uncertainty_s)
+    if _continues_after(session, asked_s):
+        return
+    high_s = asked_s
+    while high_s - low_s > _PAUSE_RESOLUTION_S * min(found_s):
+        asked_s = (low_s + high_s) / 2
+        continues = _continues_after(session, asked_s)
+        low_s, high_s = (asked_s, high_s) if continues else (low_s, asked_s)
+    seen = f"a packet is accepted after a pause of {low_s:.2f} s, and not after {high_s:.2f} s"
+    yield KeyAnswer("limits.pause_s", floor(low_s * 10) / 10 or low_s, f"{seen}, by bisection")
+
+
+def _continues_after(session: InitSession, pause_s: float) -> bool:
+    """Whether packet 2 is acknowledged after a pause; the good image runs again afterwards."""
+    bench = session.bench
+    session.begin()
+    session.packets(1)
+    bench.wait_until(bench.continued_at + pause_s)
+    bench.forget()
+    bench.send(session.packet(2))
+    kinds = (Reply.ACK, Reply.BOOT_VERSION)
+    reply = bench.wait_for(*kinds, within_s=bench.limit("ack_s"))
+    continues = reply is not None and reply.kind is Reply.ACK
+    if continues:
+        session.stored = 2
+    elif reply is not None or bench.wait_for(Reply.BOOT_VERSION) is not None:
+        session.update()
+    session.finish()
+    return continues
 
 
 def reset_again(session: InitSession) -> Findings:
