@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 from flasher.conformance.profile import profile_keys
 from flasher.conformance.results import KeyAnswer
 
-_LONGEST: Final = 3
+LONGEST: Final = 3
+"""A limit is so many times the longest measured time."""
 _ACCEPTED: Final = 0.9
 _DEVIATION: Final = 2
 MARGINS: Final = (
-    f"limits are {_LONGEST} times the longest measured time, gaps {_ACCEPTED:g} of the longest "
+    f"limits are {LONGEST} times the longest measured time, gaps {_ACCEPTED:g} of the longest "
     f"accepted one, tolerances {_DEVIATION} times the largest deviation"
 )
 """Margins of the written times, for people."""
@@ -75,12 +76,12 @@ def limit_answer(key: str, values_s: Sequence[float], least_s: float, unsure_s: 
     if not values_s:
         return KeyAnswer(key, None, "never measured")
     longest_s = max(values_s)
-    value = _rounded(max(_LONGEST * longest_s + 2 * unsure_s, least_s), ceil)
+    value = _rounded(max(LONGEST * longest_s + 2 * unsure_s, least_s), ceil)
     times = "once" if len(values_s) == 1 else f"{len(values_s)} times"
     return KeyAnswer(
         key,
         value,
-        f"measured {times}, at most {longest_s * 1000:.1f} ms; the limit is {_LONGEST} times that, "
+        f"measured {times}, at most {longest_s * 1000:.1f} ms; the limit is {LONGEST} times that, "
         f"and at least {least_s:g} s",
     )
 

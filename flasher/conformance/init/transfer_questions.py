@@ -8,7 +8,7 @@ from typing import Final
 
 from flasher.conformance.cases.fr import PADDINGS, PacketForm, forms
 from flasher.conformance.cases.tx import restarted
-from flasher.conformance.init.answers import Findings, Trial, gap_answer, pause_answer
+from flasher.conformance.init.answers import LONGEST, Findings, Trial, gap_answer, pause_answer
 from flasher.conformance.init.session import ANSWER_S, REPEATS, InitSession, answer_text
 from flasher.conformance.judge import TimeName
 from flasher.conformance.profile import choice_words
@@ -257,7 +257,7 @@ def frame_gap(session: InitSession) -> Findings:
         asked_s = (low_s + high_s) / 2 if high_s else min(max(2 * low_s, _FIRST_GAP_S), longest_s)
         session.reach(0, 1)
         # One that still writes the last packet sees a shorter gap.
-        bench.wait(min(bench.limit("ack_s"), longest_s) / 2)
+        bench.wait_until(bench.tester.left_at + bench.limit("ack_s") / LONGEST)
         taken = session.offer(session.frames(), gap_s=asked_s, gaps=1)
         low_s, high_s = (asked_s, high_s) if taken else (low_s, asked_s)
     else:
