@@ -35,7 +35,7 @@ from flasher.protocol.text import printable
 from flasher.release import container, verify
 from flasher.release.build import Part, build, with_signature, with_signatures
 from flasher.release.envelope import Envelope
-from flasher.release.keys import SigningKey, read_public_key
+from flasher.release.keys import PublicKey, read_public_key
 from flasher.release.places import SUFFIX, detached_path
 from flasher.release.transparency import LOG_MAX_SIZE, ReleaseLog, parse_log
 from flasher.release.trust import CHAIN_MAX_SIZE, Chain, parse_chain
@@ -374,7 +374,8 @@ def sign(output: Output, passphrases: Passphrases, *, file: str, keys: tuple[str
     package = verify.open_package(file)
     _check_images(package, file)
     opened = open_keys(keys, passphrases)
-    return _write(output, file, with_signatures(package, package.envelope.sign(opened)), opened)
+    raw = with_signatures(package, package.envelope.sign(opened))
+    return _write(output, file, raw, [key.public for key in opened])
 
 
 def _check_images(package: verify.Package, file: str) -> None:
@@ -384,10 +385,10 @@ def _check_images(package: verify.Package, file: str) -> None:
         verify.image_of(package, target, beside=beside)
 
 
-def _write(output: Output, file: str, raw: bytes, keys: list[SigningKey]) -> int:
+def _write(output: Output, file: str, raw: bytes, keys: list[PublicKey]) -> int:
     write_whole(Path(file), raw, "FILE")
     for key in keys:
-        output.result(f"signed by {key.public.id}")
+        output.result(f"added: signature of {key.id}")
     package = verify.open_package(file)
     _print(output, package)
     return output.document(_release_document(package))
@@ -451,11 +452,7 @@ def attach(output: Output, *, file: str, public_key: str, signature: str) -> int
             remedy="Sign the file of `flasher release payload`, as its help shows.",
             code=ErrorCode.RELEASE_UNSIGNED,
         )
-    write_whole(Path(file), with_signature(package, key.id, made), "FILE")
-    output.result(f"attached: signature of {key.id}")
-    package = verify.open_package(file)
-    _print(output, package)
-    return output.document(_release_document(package))
+    return _write(output, file, with_signature(package, key.id, made), [key])
 
 
 # -- verify and show ------------------------------------------------------------------------------

@@ -227,7 +227,7 @@ examples:
 def key(
     output: Output, passphrases: Passphrases, *, file: str, scheme: str, token: str | None
 ) -> int:
-    """Make a key pair: an encrypted private key, and FILE.pub. The private key never leaves you."""
+    """Make a key pair: an encrypted private key, and the public key beside it, as FILE.pub."""
     private, public = Path(file), Path(f"{file}.pub")
     _check_absent(public)
     if token is not None:
