@@ -23,6 +23,7 @@ myst_enable_extensions = ["deflist"]
 html_theme = "furo"
 html_title = f"flasher {release}"
 html_static_path = ["_static"]
+html_search_scorer = str(Path(__file__).with_name("scorer.js"))  # Sphinx opens it from anywhere
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
