@@ -348,7 +348,7 @@ def test_the_users_directory_is_the_systems_own(
     looked_at: list[Path] = []
     monkeypatch.setenv("HOME", "/h")
     monkeypatch.setenv("XDG_CONFIG_HOME", configured)
-    monkeypatch.setattr(Path, "is_file", lambda path: looked_at.append(path))  # noqa: PLW0108
+    monkeypatch.setattr("flasher.settings.profile.is_regular", looked_at.append)
     monkeypatch.setattr(Path, "cwd", lambda: Path("/here"))
     find_profile()
     assert looked_at == [Path("/here/flasher.toml"), Path(expected, "flasher.toml")]

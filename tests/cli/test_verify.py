@@ -116,7 +116,7 @@ def test_an_image_that_names_no_version_says_what_runs(verify: Comparison) -> No
 def test_a_device_in_its_bootloader_runs_nothing(verify: Comparison) -> None:
     run = verify(Stage(has_application=False))
     assert run.code == ExitCode.VERIFICATION
-    assert "a bootloader continues to announce itself" in run.err
+    assert "a bootloader keeps announcing itself" in run.err
     assert "flasher flash IMAGE -t bms" in run.err
     assert "version: not reported" in run.out
 
