@@ -242,7 +242,7 @@ IMAGES = (
         IMAGE,
         "outside its program header",
     ),
-    Row("bomb.hex", packed(b"\n", 60 * MEGA), "image-info FILE", IMAGE, "damaged"),
+    Row("bomb.hex", packed(b"\n", 60 * MEGA), "image-info FILE", IMAGE, "a gzip file"),
     Row(
         "a.bin",
         with_manifest(os.mkfifo),
