@@ -47,6 +47,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (21, "EN-07"),  # it takes longer to announce itself than the reset is repeated
         (9, "EN-07"),  # a bootloader that starts its application confirms a reset
         (10, "UP-01"),  # an update command before packet 1 is ignored
+        (24, "BU-01"),  # a lost end of transfer was awaited for longer than its pause
         (2, "FR-09"),  # an empty frame splits a message
     ),
 )

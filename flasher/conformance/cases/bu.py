@@ -292,7 +292,8 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=bench.waits.silence_s)
+            within_s = min(bench.waits.silence_s, max(give_up_at - bench.now, 0.0))
+            reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
         if disturbance.hits_answer:
             break
     if reply is not None and reply.kind is Reply.COMPLETE:
