@@ -35,7 +35,10 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "ui": CommandEntry("upgrade.ui:ui", "upgrade a bike in a browser, step by step"),
         "image-info": CommandEntry(
             "upgrade.image_info:image_info",
-            "show an image, the bytes to be sent, and the time it takes",
+            "show images, the bytes to be sent, and the time it takes",
+        ),
+        "image": CommandEntry(
+            "upgrade.image:image", "convert and merge images: Intel HEX, S-record, raw binary"
         ),
         "history": CommandEntry(
             "upgrade.history:history", "list the upgrades made from this computer"

@@ -62,13 +62,9 @@ STANDARD_INPUT: Final = "-"
 
 
 @dataclass(frozen=True)
-class ImageOptions:
-    """Image file, and the selection of its bytes."""
+class Selection:
+    """Selection of the bytes of an image file."""
 
-    image: Annotated[str, argument(
-        "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
-        help="Intel HEX, S-record, ELF or raw binary; - is standard input",
-    )]  # fmt: skip
     format: Annotated[str | None, option(
         "--format", type=click.Choice(FORMATS), panel="image",
         help="format of IMAGE, instead of detecting it",
@@ -79,8 +75,14 @@ class ImageOptions:
     )]  # fmt: skip
     range_: Annotated[tuple[int, int] | None, option(
         "--range", "range_", type=values.address_range, metavar="START:END", panel="image",
-        help="send only these addresses, END exclusive",
+        help="use only these addresses, END exclusive",
     )]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SentSelection(Selection):
+    """Selection of the bytes to send."""
+
     fill_gaps_up_to: Annotated[int, option(
         "--fill-gaps-up-to", type=values.number, default=str(DEFAULT_FILL_GAPS_UP_TO),
         metavar="BYTES", panel="image",
@@ -90,6 +92,21 @@ class ImageOptions:
         "--allow-outside-vector", is_flag=True, panel="image",
         help=f"send {WAIVERS[OUTSIDE_VECTOR].permits}",
     )]  # fmt: skip
+
+
+def image_argument(name: str = "image", *, also: str = "", **more: Any) -> Decorator:
+    """Declare the argument IMAGE; `also` adds to its help."""
+    return argument(
+        name, **{"metavar": "IMAGE", **more}, type=values.FilePath(*values.IMAGE_SUFFIXES),
+        help=f"Intel HEX, S-record, ELF or raw binary; - is standard input{also}",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ImageOptions(SentSelection):
+    """Image file, and the selection of its bytes."""
+
+    image: Annotated[str, image_argument()]
 
     @property
     def is_piped(self) -> bool:
@@ -102,7 +119,7 @@ class ImageOptions:
 
     @cached_property
     def _piped(self) -> io.BytesIO:
-        return _standard_input()
+        return standard_input()
 
     def file_sha256(self) -> str:
         """Compute the SHA-256 of the file itself, in hexadecimal. Raises ImageError."""
@@ -151,7 +168,7 @@ class ImageOptions:
 image_options: Final = option_set("image", ImageOptions)
 
 
-def _standard_input() -> io.BytesIO:
+def standard_input() -> io.BytesIO:
     """Read standard input to its end. Raises UsageError for a terminal and for too many bytes."""
     if sys.stdin.isatty():
         raise UsageError(

@@ -131,6 +131,10 @@ class Output:
         if not self.json_wanted:
             self._print(text.removesuffix("\n"))
 
+    def data(self, data: bytes) -> None:
+        """Write a file to stdout, unchanged."""
+        self._to_stdout(lambda: sys.stdout.buffer.write(data), "")
+
     def print_help(self, text: str) -> None:
         """Print help, laid out for the window; also with --json."""
         self._print("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
@@ -161,11 +165,15 @@ class Output:
             self._print(text)
 
     def _print(self, text: str) -> None:
-        """Print to stdout. Where that fails, a command that changes a device continues on stderr,
+        self._to_stdout(lambda: print(text), text)
+
+    def _to_stdout(self, write: Callable[[], object], text: str) -> None:
+        """Write to stdout. Where that fails, a command that changes a device continues on stderr,
         and its exit code reports the device; any other raises UsageError.
         """
         try:
-            print(text, flush=True)
+            write()
+            sys.stdout.flush()
         except BrokenPipeError:
             _give_up(sys.stdout)
         except OSError as error:
@@ -215,16 +223,20 @@ class Output:
         """Print an error as text, and as the JSON document of the command, with the document
         `known` so far. Return its exit code.
         """
+        failure = self.error(error)
+        if self.ending is not None:
+            self.verdict(self.ending(error))
+        return self.document(known, exit_code=error.exit_code, error=failure)
+
+    def error(self, error: FlasherError) -> ErrorDocument:
+        """Print an error as text. Return it as a part of a document."""
         what, *others = str(error).splitlines()
         text = "\n".join((f"{what} [{error.code}]", *others))
         _LOG.error("error: %s", text, extra=PRINTED)
         head = painted("error:", "red") if self.colour else "error:"
         self.say(f"{head} {text}")
-        if self.ending is not None:
-            self.verdict(self.ending(error))
         words = {name: self.as_started(getattr(error, name)) for name in ("remedy", "command")}
-        failure = document_of(ErrorDocument, error, kind=type(error).__name__, **words)
-        return self.document(known, exit_code=error.exit_code, error=failure)
+        return document_of(ErrorDocument, error, kind=type(error).__name__, **words)
 
 
 def _plain_stderr(text: str) -> None:

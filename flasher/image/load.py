@@ -12,10 +12,9 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from enum import Enum
 from pathlib import PurePath
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
 from flasher.errors import ErrorCode, ImageError, UsageError
 from flasher.files import opened
@@ -63,6 +62,7 @@ _SUFFIXES: Final = {
         Format.SREC,
     ),
     **dict.fromkeys((".elf", ".axf"), Format.ELF),
+    ".bin": Format.BIN,
 }
 _RECORDS: Final = {
     Format.HEX: re.compile(rb":[0-9A-Fa-f]{8}"),
@@ -72,7 +72,7 @@ _STARTS: Final = {Format.HEX: re.compile(rb":"), Format.SREC: re.compile(rb"S[0-
 _TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\n\v\f\r"
 FORMATS: Final = tuple(form.value for form in Format)
 """Values of `--format`."""
-_READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf.read}
+READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf.read}
 
 
 def load(
@@ -96,7 +96,45 @@ def load(
     Raises ImageError if the file cannot be used; UsageError if it does not exist, is not a regular
     file, or the options contradict each other.
     """
-    _check_options(format, base, range_, fill_gaps_up_to)
+    _check_filled(fill_gaps_up_to)
+    content = read(path, stream=stream, format=format, base=base, range_=range_)
+    sparse = content.sparse
+    data, first = sparse.join(fill_gaps_up_to)
+    image = Image(
+        data=data,
+        base=first if content.has_addresses else None,
+        format=content.format.title,
+        source=sparse.source,
+        segments=sparse.spans(),
+        filled_bytes=len(data) - sparse.size_bytes,
+        version=find_firmware_version(data),
+        elf_machine=content.elf_machine,
+    )
+    if not allow_outside_vector:
+        check_starts_inside(image)
+    return image
+
+
+class Content(NamedTuple):
+    """Bytes of a firmware file, its gaps not filled."""
+
+    sparse: SparseBytes
+    format: Format
+    has_addresses: bool
+    """False for a raw binary without a base: its first byte is at 0."""
+    elf_machine: int | None
+
+
+def read(
+    path: str | os.PathLike[str],
+    *,
+    stream: BinaryIO | None = None,
+    format: str | None = None,  # noqa: A002  the option's own name
+    base: int | None = None,
+    range_: tuple[int, int] | None = None,
+) -> Content:
+    """Read the bytes of a firmware file, with the arguments and errors of `load`."""
+    _check_options(format, base, range_)
     source = printable(os.fspath(path))
     with _content(path, stream) as (file, size_bytes):
         file.seek(0)
@@ -105,13 +143,13 @@ def load(
         form = Format(format) if format else _detect(head, source)
         sparse = SparseBytes(source, range_)
         if form is Format.BIN:
-            image = _binary(file, size_bytes, sparse, base, fill_gaps_up_to)
+            _read_binary(file, size_bytes, sparse, base)
         else:
             if base is not None:
                 raise UsageError(
-                    f"--base is for a raw binary, and {source} is an {form.title} file",
+                    f"a base is for a raw binary, and {source} is an {form.title} file",
                     where="the file itself contains the addresses",
-                    remedy="omit --base; choose a part of the file with --range START:END",
+                    remedy="leave out the base; choose a part of the file with --range START:END",
                 )
             if size_bytes > FILE_MAX_SIZE:
                 raise ImageError(
@@ -120,13 +158,11 @@ def load(
                     remedy="strip it, or convert it to a raw binary: objcopy -O binary",
                     code=ErrorCode.IMAGE_TOO_LARGE,
                 )
-            _READERS[form](file, source, sparse)
-            image = _joined(sparse, form, fill_gaps_up_to)
-        if form is Format.ELF:
-            image = replace(image, elf_machine=elf.machine_of(head))
-    if not allow_outside_vector:
-        check_starts_inside(image)
-    return image
+            READERS[form](file, source, sparse)
+    has_addresses = form is not Format.BIN or base is not None
+    return Content(
+        sparse, form, has_addresses, elf.machine_of(head) if form is Format.ELF else None
+    )
 
 
 @contextmanager
@@ -141,9 +177,7 @@ def _content(
             yield content
 
 
-def _check_options(
-    form: str | None, base: int | None, range_: tuple[int, int] | None, fill_gaps_up_to: int
-) -> None:
+def _check_options(form: str | None, base: int | None, range_: tuple[int, int] | None) -> None:
     if form is not None and form not in FORMATS:
         raise UsageError(f"there is no image format {form!r}", remedy=f"one of {FORMATS}")
     if base is not None and not 0 <= base < ADDRESS_SPACE:
@@ -153,6 +187,9 @@ def _check_options(
             f"the range {range_[0]:#x}:{range_[1]:#x} is empty or not inside 32-bit addresses",
             remedy="give START:END with END one past the last byte",
         )
+
+
+def _check_filled(fill_gaps_up_to: int) -> None:
     if fill_gaps_up_to < 0:
         raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
 
@@ -173,10 +210,12 @@ def _detect(head: bytes, source: str) -> Format:
         matching = sum(record.match(line) is not None for line in lines)
         if 2 * matching > len(lines):
             return form
-    suffix = PurePath(source).suffix.lower()
-    if suffix in _SUFFIXES:
-        return _SUFFIXES[suffix]
-    return Format.BIN
+    return format_of_suffix(source) or Format.BIN
+
+
+def format_of_suffix(name: str) -> Format | None:
+    """Return the format that the suffix of a file name stands for."""
+    return _SUFFIXES.get(PurePath(name).suffix.lower())
 
 
 def _is_mostly_text(head: bytes) -> bool:
@@ -184,14 +223,8 @@ def _is_mostly_text(head: bytes) -> bool:
     return 2 * len(head.translate(None, _TEXT)) <= len(head)
 
 
-def _binary(
-    file: BinaryIO,
-    size_bytes: int,
-    sparse: SparseBytes,
-    base: int | None,
-    fill_gaps_up_to: int,
-) -> Image:
-    """Load a raw binary, or the part of it inside the address range."""
+def _read_binary(file: BinaryIO, size_bytes: int, sparse: SparseBytes, base: int | None) -> None:
+    """Read a raw binary, or the part of it inside the address range."""
     source, window = sparse.source, sparse.window
     if window and base is None:
         raise UsageError(
@@ -211,18 +244,3 @@ def _binary(
     if low < high:
         file.seek(low - start)
         sparse.add(low, file.read(high - low), str)
-    image = _joined(sparse, Format.BIN, fill_gaps_up_to)
-    return image if base is not None else replace(image, base=None)
-
-
-def _joined(sparse: SparseBytes, form: Format, fill_gaps_up_to: int) -> Image:
-    data, base = sparse.join(fill_gaps_up_to)
-    return Image(
-        data=data,
-        base=base,
-        format=form.title,
-        source=sparse.source,
-        segments=sparse.spans(),
-        filled_bytes=len(data) - sparse.size_bytes,
-        version=find_firmware_version(data),
-    )

@@ -131,6 +131,8 @@ def _foreign(image: Image) -> str | None:
 
 def file_type(head: bytes) -> str | None:
     """Name a file type by the first bytes of a file; None if they are of no known one."""
+    if _HTML.match(head):
+        return "an HTML page"
     return next((name for magic, name in _MAGICS.items() if head.startswith(magic)), None)
 
 
@@ -140,8 +142,6 @@ def _is_pe(data: bytes) -> bool:
 
 
 def _text(data: bytes) -> str | None:
-    if _HTML.match(data):
-        return "an HTML page"
     if _XML.match(data):
         return "an XML document"
     if data.startswith(_UTF_16):

@@ -7,7 +7,7 @@ Pieces may arrive in any order and may repeat, but not contradict each other.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from flasher.errors import ErrorCode, ImageError
@@ -85,6 +85,11 @@ class SparseBytes:
             else:
                 spans.append(AddressSpan(start, len(piece)))
         return tuple(spans)
+
+    def pieces(self) -> Iterator[tuple[int, bytes]]:
+        """Yield the pieces with their addresses, ascending."""
+        for start, piece in zip(self._starts, self._pieces, strict=True):
+            yield start, bytes(piece)
 
     def join(self, fill_gaps_up_to: int) -> tuple[bytes, int]:
         """Join all bytes from the first address (that of the window, if any) to the last, with gaps

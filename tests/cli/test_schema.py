@@ -82,6 +82,10 @@ def test_every_command_has_its_definition(schema: dict[str, Any]) -> None:
 
 COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image-info", SAMPLES / "wmc.hex"),
+        ("image-info", SAMPLES / "wmc.hex", OBC),
+        ("image", "info", OBC),
+        ("image", "convert", SAMPLES / "wmc.hex", "-o", Path("wmc.s19")),
+        ("image", "merge", SAMPLES / "wmc.hex", f"{OBC}@0x8010000", "-o", Path("both.hex")),
         ("help", "E402"),
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),

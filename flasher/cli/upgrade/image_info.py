@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Final
+from typing import Any, Final
 
 from flasher import api
-from flasher.cli.documents import ImageDocument, PlanDocument
-from flasher.cli.framework import command
+from flasher.cli.documents import ErrorDocument, ImageDocument, PlanDocument
+from flasher.cli.framework import command, option_set
 from flasher.cli.options import (
+    STANDARD_INPUT,
     ImageOptions,
+    SentSelection,
     allow_implausible_option,
     dialect_option,
     gap_options,
-    image_options,
+    image_argument,
     profile_option,
     target_option,
 )
-from flasher.cli.output import Output
+from flasher.cli.output import Output, counted
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
 from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
@@ -36,6 +39,9 @@ examples:
   flasher image-info firmware.hex
   flasher image-info firmware.bin --base 0x8004000 -t wmc
   flasher image-info merged.hex --range 0x8004000:0x8020000
+  flasher image-info release/*.hex --json
+
+Several images are shown one after the other; the exit code is that of the worst.
 """
 
 
@@ -52,17 +58,86 @@ class ImageInfoDocument:
     Targets differ only by their ids."""
 
 
-DOCUMENTS: Final = (ImageInfoDocument,)
+@dataclass(frozen=True)
+class ShownImageDocument:
+    """One of several image files."""
+
+    file: str
+    exit_code: ExitCode
+    shown: ImageInfoDocument | None
+    """Null if the file cannot be read."""
+    error: ErrorDocument | None
+
+
+@dataclass(frozen=True)
+class ImagesInfoDocument:
+    """Several image files. The exit code is the highest of them."""
+
+    images: list[ShownImageDocument]
+
+
+DOCUMENTS: Final = (ImageInfoDocument, ImagesInfoDocument)
 
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE,))
-@image_options
+@image_argument("images", nargs=-1, required=True, metavar="IMAGE...")
+@option_set("selection", SentSelection)
 @allow_implausible_option("image")
 @target_option(required=False)
 @dialect_option
 @profile_option
 @gap_options
 def image_info(
+    output: Output,
+    images: tuple[str, ...],
+    selection: SentSelection,
+    target: Target | None,
+    **chosen: Any,
+) -> int:
+    """Show the contents of image files and the plan of an upgrade with each. Opens no adapter. A
+    file that no device should get is shown as far as it can be read, and refused as by flasher
+    flash.
+    """
+    check_one_standard_input(images)
+    shown: list[ShownImageDocument] = []
+    for file in images:
+        if shown:
+            output.result("")
+        known = None
+        error: FlasherError | None = None
+        try:
+            known, error = _show(
+                output, ImageOptions(**vars(selection), image=file), target, **chosen
+            )
+        except FlasherError as refused:
+            error = refused
+        if len(images) == 1:
+            return output.document(known) if error is None else output.failure(error, known)
+        if known is None:
+            output.result(f"{printable(file)}: refused, it cannot be read")
+        failed = None if error is None else output.error(error)
+        code = ExitCode.OK if error is None else error.exit_code
+        shown.append(ShownImageDocument(file, code, known, failed))
+    refused_count = sum(each.error is not None for each in shown)
+    output.result("")
+    output.result(
+        f"{counted(len(shown), 'image')}: {len(shown) - refused_count} can be sent, "
+        f"{refused_count} refused"
+    )
+    worst = max(shown, key=lambda each: each.exit_code)
+    return output.document(ImagesInfoDocument(shown), exit_code=worst.exit_code, error=worst.error)
+
+
+def check_one_standard_input(images: Sequence[str]) -> None:
+    """Raise UsageError if standard input, which can be read once, is named twice."""
+    if images.count(STANDARD_INPUT) > 1:
+        raise UsageError(
+            "- is named twice, and standard input can be read once.",
+            remedy="Name it once, and the other images by their files.",
+        )
+
+
+def _show(
     output: Output,
     image: ImageOptions,
     target: Target | None,
@@ -72,12 +147,10 @@ def image_info(
     frame_gap_s: float | None,
     packet_gap_s: float | None,
     allow_implausible: bool,
-) -> int:
-    """Show the contents of an image file and the plan of its upgrade. Opens no adapter. A file that
-    no device should get is shown as far as it can be read, and refused as by flasher flash.
-    """
+) -> tuple[ImageInfoDocument, FlasherError | None]:
+    """Print an image. Return its document, and the reason why it would not be sent."""
     if not image.is_piped:
-        _check_no_release(image.image)
+        check_no_release(image.image)
     loaded = image.load()
     table = vector_table(loaded)
     file_sha256 = image.file_sha256()
@@ -109,12 +182,12 @@ def image_info(
     for found in judge_bytes(loaded, identity):
         error = api.refusal(plan, found)
         if error is not None:
-            return output.failure(error, document)
+            return document, error
         output.result(text.check_line(found.event))
-    return output.document(document)
+    return document, None
 
 
-def _check_no_release(path: str) -> None:
+def check_no_release(path: str) -> None:
     """Raise UsageError for a release, which has one image or several; ImageError for a damaged
     one.
     """
