@@ -220,7 +220,7 @@ class Procedures:
     def listen_first(self, *, may_cancel: bool = True) -> None:
         """Listen for another tool before a query. Raises BusError if one is detected."""
         if not self.is_alone:
-            _check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
+            check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
 
     def ask(self, request: Request, *, for_write: str = "") -> Content:
         """Send a request. Raises NoAnswerError, InterruptedByUserError and WrongDeviceError."""
@@ -343,7 +343,7 @@ class Procedures:
             INFO_LISTEN_S if queried else INFO_LISTEN_ONLY_S,
         )
         if queried:
-            _check_no_other_tool(survey)
+            check_no_other_tool(survey)
         queries = dict(zip((entry.name for entry in queried), survey.queries, strict=False))
         readings = tuple(_reading(entry, queries.get(entry.name)) for entry in queried)
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
@@ -355,7 +355,7 @@ class Procedures:
             () if request is None else [request],
             INFO_LISTEN_ONLY_S if request is None else INFO_LISTEN_S,
         )
-        _check_no_other_tool(survey)
+        check_no_other_tool(survey)
         heard = survey.heard.get(self.target.node)
         return heard is not None and bool(heard.messages)
 
@@ -628,7 +628,7 @@ def _interrupted() -> InterruptedByUserError:
     return InterruptedByUserError("Interrupted by the user.")
 
 
-def _check_no_other_tool(survey: Survey) -> None:
+def check_no_other_tool(survey: Survey) -> None:
     if survey.other_tool_heard:
         raise BusError(
             "Another tool sends on this bus; nothing was queried or written.",

@@ -18,7 +18,7 @@ _SHOWN: Final = (
     "bus/simulated", "host/event_text", "host/guard", "host/identity", "host/outcome",
     "host/query", "host/session", "host/upgrade", "host/verify", "image/cortexm", "image/elf",
     "image/load", "image/plausible", "image/records", "image/release", "image/segments",
-    "settings/manifest",
+    "settings/bike_set", "settings/manifest",
     "trace/blf", "trace/bounds", "trace/explain", "trace/mf4", "trace/observed_upgrade",
     "trace/pcapng",
     "trace/reader", "trace/source", "trace/steps", "trace/verdict", "report/base",

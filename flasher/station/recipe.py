@@ -32,9 +32,9 @@ from datetime import date, time
 from enum import StrEnum
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from flasher.protocol.spec import TARGETS, Target, find_target
+from flasher.settings.bike_set import TargetImage, TargetTable, check_named_once
 from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.pattern import CHECKS, TEXT_MAX, pattern_of
 from flasher.station.records.model import StepName, Verified
@@ -45,24 +45,6 @@ _TRIES_MAX: Final = 10
 ShortText = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Seconds = Annotated[float, Field(gt=0, le=_TIME_MAX_S)]
-
-
-def _target_name(value: str) -> str:
-    target = find_target(value)
-    if target is None:
-        raise ValueError(f"unknown target {value!a:.20}; targets are {', '.join(TARGETS)}")
-    return target.name
-
-
-class TargetTable(TomlTable):
-    """Base of tables that name a target."""
-
-    target: Annotated[str, AfterValidator(_target_name)]
-    """Name of the device, for example "bms"."""
-
-    @property
-    def device(self) -> Target:
-        return TARGETS[self.target]
 
 
 class SerialNumberRule(TomlTable):
@@ -159,21 +141,14 @@ class SignatureRule(StrEnum):
     WAIVED = "waived"
 
 
-class Firmware(TargetTable):
+class Firmware(TargetImage):
     """A target and its image. Targets are flashed in the order of the recipe."""
 
-    image: str = Field(min_length=1)
-    """The image, or the release (`*.wfw`) with it: a file in the recipe's folder."""
-    manifest: str = ""
-    """The release manifest of the image; empty: `IMAGE.toml` beside the image. A release contains
-    its own."""
     signature: SignatureRule = SignatureRule.CHECKED
     """checked: trusted keys must have signed the image if this computer has a trust file;
     required: in any case; waived: it need not be signed, which the records state."""
     sha256: Sha256
     """SHA-256 of the bytes to be sent, as in the manifest."""
-    base: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
-    """Address of the first byte of a raw binary."""
     hardware_versions: tuple[ShortText, ...] = ()
     """Accepted hardware versions, in addition to the manifest's limits; * matches any text."""
     previous_versions: tuple[ShortText, ...] = ()
@@ -305,9 +280,8 @@ class Recipe(TomlTable):
 
     @model_validator(mode="after")
     def _check_targets(self) -> Recipe:
+        check_named_once(self.target)
         names = [firmware.target for firmware in self.target]
-        if len(set(names)) < len(names):
-            raise ValueError("a target is named twice in [[target]]")
         for key in ("write", "unchanged", "limit"):
             for part in getattr(self, key):
                 if part.target not in names:

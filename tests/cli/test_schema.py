@@ -90,6 +90,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),
         ("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),
+        ("flash", "--bike", Path("bike.toml"), "--mock", "--mock-speed", "0", "--events"),
         ("simulate", "replay", "job packets=3 ; mock"),
         ("history",),
         ("info", *MOCK),
@@ -143,6 +144,7 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", _press_ctrl_c)
     named = {str(word) for word in request.getfixturevalue("words")}
+    Path("bike.toml").write_text(f"[[target]]\ntarget = 'obc'\nimage = '{OBC}'\n", "utf-8")
     Path("right.toml").write_text("attempts = 5\n", "utf-8")
     Path("nothing.log").write_text("(1.0) can0 123#616263\n", "utf-8")
     Path("nameless.bin").write_bytes(bytes(300))

@@ -24,7 +24,7 @@ from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
 from flasher.conformance.profile import profile_keys, unstated
 from flasher.release import trust
-from flasher.settings import bus, device_model, manifest, profile
+from flasher.settings import bike_set, bus, device_model, manifest, profile
 from flasher.settings.toml_reader import Key, Reader
 from flasher.station import codes, config, operators, recipe
 
@@ -187,6 +187,7 @@ _FILES: Final[Mapping[str, Callable[[], _Lines]]] = {
     "profile": lambda: _keys(profile.reader().keys),
     "bus": lambda: _keys(bus.READER.keys),
     "manifest": lambda: _keys(manifest.reader().keys),
+    "bike": lambda: _file(bike_set.BikeSet),
     "trust": lambda: _keys(trust.reader().keys),
     "recipe": lambda: _file(recipe.Recipe),
     "station": lambda: _file(config.StationConfig),

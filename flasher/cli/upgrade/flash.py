@@ -30,7 +30,7 @@ from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.progress import Progress
-from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
+from flasher.cli.upgrade.text import BikeDocument, DryRunDocument, UpgradeDocument
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError, UsageError
 from flasher.host.identity import WAIVABLE, IdentityCheck
@@ -48,7 +48,7 @@ from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.settings.profile import Profile, load_profile
 
-DOCUMENTS: Final = (UpgradeDocument, DryRunDocument)
+DOCUMENTS: Final = (UpgradeDocument, DryRunDocument, BikeDocument)
 _FLASH_EXAMPLES: Final = """\
 examples:
   flasher flash firmware.hex -t bms --mock              try it without hardware
@@ -56,6 +56,15 @@ examples:
   flasher flash firmware.bin -t mc -i kvaser -c 0 --base 0x8004000
   flasher flash firmware.hex -t bms --skip-same-version -i socketcan -c can0
   flasher flash firmware.hex -t obc --dry-run           show the plan, open no adapter
+  flasher flash --bike bike.wfw -i socketcan -c can0    all devices of a bike
+  flasher flash --bike bike.toml --mock
+
+--bike takes a release with several images, or a TOML file that names an image for each device.
+Everything is checked before the first device is erased. A device without an application comes
+first; then OBC and WMC, and the battery last: it supplies the others, and has to work as long as
+one of them may need a rescue. After an interruption the same command goes on: a device that
+reports the version of the set is left alone unless --force; one that cannot report is upgraded
+again.
 
 "Transferred" (every packet acknowledged), "completed" (reported by the device) and "running
 version X" (the new application answered) are three claims; the last lines report which hold.
@@ -187,6 +196,47 @@ class UpgradeChoices:
         given = {name: None if value is False else value for name, value in chosen.items()}
         return profile.upgrade_options(**given, power_up_timeout_s=wait)
 
+    def job(
+        self,
+        opened: api.OpenedImage,
+        profile: Profile,
+        bus: Bus,
+        *,
+        allow_outside_vector: bool,
+        verify: str | None,
+        at_power_up: bool = False,
+        power_up_timeout_s: float | None = None,
+        skip_same_version: bool = False,
+    ) -> api.Job:
+        """Prepare the upgrade of a device. Raises ImageError and UsageError."""
+        waived = [name for name in OF_DEVICE if self.allows(name)]
+        waived += [OUTSIDE_VECTOR] * (allow_outside_vector or self.force)
+        waived += [UNSIGNED] * self.allow_unsigned
+        return api.prepare(
+            opened.image,
+            profile,
+            bitrate_bps=bus.bit_rate.bps,
+            options=self.options(profile, power_up_timeout_s),
+            verify=None if self.dry_run else verify,
+            identity=profile.identity(
+                release=opened.release,
+                provenance=opened.provenance,
+                waived=self.waived_checks(),
+                skip_same_version=skip_same_version,
+                reports_unchecked=at_power_up,
+            ),
+            at_power_up=at_power_up,
+            waived=waived,
+        )
+
+    def check_signature_options(self) -> None:
+        """Raise UsageError for options that contradict each other."""
+        if self.require_signed and self.allow_unsigned:
+            raise UsageError(
+                "--require-signed and --allow-unsigned contradict each other.",
+                remedy="Leave one of them out.",
+            )
+
 
 _upgrade_options: Final = option_set("choices", UpgradeChoices)
 
@@ -195,9 +245,17 @@ _upgrade_options: Final = option_set("choices", UpgradeChoices)
 
 
 @command(epilog=_FLASH_EXAMPLES, exit_codes=(*_EXIT_CODES, ExitCode.NOTHING_TO_DO))
-@target_option()
+@target_option(required=False)
 @image_options
 @_upgrade_options
+@option(
+    "--bike", is_flag=True, panel="upgrade", brief=True,
+    help="IMAGE is a set: upgrade each device that it has an image for, in a safe order",
+)  # fmt: skip
+@option(
+    "--without", type=values.target, multiple=True, metavar="TARGET", panel="upgrade",
+    help="with --bike: leave this device of the set alone; may be repeated",
+)  # fmt: skip
 @option(
     "--skip-same-version", is_flag=True, panel="upgrade",
     help="leave a device alone that already runs the image's version: exit code 11",
@@ -206,19 +264,32 @@ _upgrade_options: Final = option_set("choices", UpgradeChoices)
 @recording_options
 def flash(
     output: Output,
-    target: Target,
+    target: Target | None,
     image: ImageOptions,
     choices: UpgradeChoices,
     bus: Bus,
     recorded: RecordingOptions,
     *,
+    bike: bool,
+    without: tuple[Target, ...],
     skip_same_version: bool,
 ) -> int:
     """Upgrade a device: ask for its identity, check that the image fits, reset it into its
     bootloader, transfer, wait for the final answer, verify. A device whose bootloader announces
     itself starts at once, and so does one that still waits in an interrupted upgrade; one that
-    announces itself only at power-up needs `flasher rescue`.
+    announces itself only at power-up needs `flasher rescue`. With --bike it upgrades all devices
+    of a bike, one after the other.
     """
+    if bike:
+        from flasher.cli.upgrade.bike import BikeUpgrade  # noqa: PLC0415  it imports this module
+
+        return BikeUpgrade(output, image, choices, bus, recorded, frozenset(without)).run(target)
+    if without:
+        raise UsageError("--without needs --bike.", remedy="Add --bike, or leave --without out.")
+    if target is None:
+        ctx = click.get_current_context()
+        missing = next(each for each in ctx.command.params if each.name == "target")
+        raise click.MissingParameter(ctx=ctx, param=missing)
     upgrade = _Upgrade(output, target, image, choices, bus, recorded)
     return upgrade.run(skip_same_version=skip_same_version)
 
@@ -279,33 +350,19 @@ class _Upgrade:
         self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
             self.bus = choose_adapter(self.bus, output)
-        waived = [name for name in OF_DEVICE if choices.allows(name)]
-        waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
-        waived += [UNSIGNED] * choices.allow_unsigned
-        job = api.prepare(
-            image,
+        job = choices.job(
+            opened,
             profile,
-            bitrate_bps=self.bus.bit_rate.bps,
-            options=choices.options(profile, power_up_timeout_s),
-            verify=None if choices.dry_run else choices.verify,
-            identity=profile.identity(
-                release=opened.release,
-                provenance=opened.provenance,
-                waived=choices.waived_checks(),
-                skip_same_version=skip_same_version,
-                reports_unchecked=at_power_up,
-            ),
+            self.bus,
+            allow_outside_vector=self.image.allow_outside_vector,
+            verify=choices.verify,
             at_power_up=at_power_up,
-            waived=waived,
+            power_up_timeout_s=power_up_timeout_s,
+            skip_same_version=skip_same_version,
         )
         show = output.result if choices.dry_run else output.progress
         table = vector_table(image)
-        for line in (
-            *text.image_lines(image),
-            *([f"  origin:  {opened.provenance.text}"] if opened.provenance else []),
-            *text.vector_lines(table),
-            *text.plan_lines(job.plan, job.options),
-        ):
+        for line in text.job_lines(job):
             show(line)
         job.checked()
         for warning in opened.provenance.warnings if opened.provenance else ():
@@ -327,11 +384,7 @@ class _Upgrade:
 
     def _open(self) -> api.OpenedImage:
         choices = self.choices
-        if choices.require_signed and choices.allow_unsigned:
-            raise UsageError(
-                "--require-signed and --allow-unsigned contradict each other.",
-                remedy="Leave one of them out.",
-            )
+        choices.check_signature_options()
         with self.image.advice():
             return api.open_image(
                 self.image.source,
@@ -345,7 +398,7 @@ class _Upgrade:
         output = self.output
         ctx = click.get_current_context()
         name, replaced = str(ctx.info_name), _image_again(ctx)
-        words = rebuild_command_line(ctx, name, without=_TRACE_FILE.__eq__, replaced=replaced)
+        words = rebuild_command_line(ctx, name, without=TRACE_FILE.__eq__, replaced=replaced)
         again = shlex.join(["flasher", *words])
         recorded = replace(self.recorded, overwrites=self.choices.force)
         upgrade_run = UpgradeRun(job, self.bus, recorded, output, self._add_repair, again)
@@ -425,8 +478,10 @@ OTHER_IMAGE: Final = "OTHER_IMAGE"
 """Placeholder for another image, after the device refused the one sent."""
 SAME_IMAGE: Final = "IMAGE"
 """Placeholder for an image from standard input, which is read once."""
-_TRACE_FILE: Final = "--trace-file"
-_LEFT_OUT: Final = frozenset({"--timeout", _TRACE_FILE, "--skip-same-version"})
+TRACE_FILE: Final = "--trace-file"
+_LEFT_OUT: Final = frozenset(
+    {"--timeout", TRACE_FILE, "--skip-same-version", "--bike", "--without"}
+)
 """Options that the repair command omits: a deadline for a device that answers at once (a rescue
 waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
 _OF_THE_IMAGE: Final = frozenset(
@@ -438,16 +493,19 @@ def _image_again(ctx: click.Context) -> dict[str, str]:
     return {"image": SAME_IMAGE} if ctx.params["image"] == STANDARD_INPUT else {}
 
 
-def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
+def repair_command(
+    ctx: click.Context, *, is_refused: bool, of_set: tuple[Target, str] | None = None
+) -> str:
     """Return the `flasher rescue` command for the command of `ctx`, quoted for a shell. Options
-    about an image that the device refused are omitted.
+    about an image that the device refused are omitted. `of_set` is a device of a bike, and the file
+    of its image.
     """
 
     def is_left_out(name: str) -> bool:
         of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
         return name in _LEFT_OUT or (is_refused and of_the_image)
 
-    replaced = {"image": OTHER_IMAGE} if is_refused else _image_again(ctx)
-    return shlex.join(
-        ["flasher", *rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)]
-    )
+    image = _image_again(ctx) if of_set is None else {"image": of_set[1]}
+    replaced = {"image": OTHER_IMAGE} if is_refused else image
+    words = rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)
+    return shlex.join(["flasher", *words, *(() if of_set is None else ("-t", of_set[0].name))])

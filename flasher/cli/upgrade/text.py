@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Final
 
+from flasher.api import Job
 from flasher.cli.documents import (
     ImageDocument,
     PlanDocument,
@@ -61,6 +63,41 @@ class DryRunDocument:
     checks: list[CheckMade]
 
 
+class DeviceState(Enum):
+    """What became of a device of the set."""
+
+    UPGRADED = "upgraded"
+    UP_TO_DATE = "up_to_date"
+    """It reported the version of the set, and was left alone."""
+    FAILED = "failed"
+    NOT_BEGUN = "not_begun"
+    LEFT_OUT = "left_out"
+
+
+@dataclass(frozen=True)
+class BikeDeviceDocument:
+    """A device of the set."""
+
+    target: str
+    state: DeviceState
+    was_in_bootloader: bool
+    """It had no application before, or perhaps none."""
+    checks: list[CheckMade]
+    """Checks before the first upgrade of the bike."""
+    upgrade: UpgradeDocument | None
+    """Null for one that was not begun, and after a failure of the adapter."""
+
+
+@dataclass(frozen=True)
+class BikeDocument:
+    """Result of an upgrade of a whole bike, its devices in the order of their upgrades."""
+
+    set: str
+    order_reason: str
+    dry_run: bool
+    devices: list[BikeDeviceDocument]
+
+
 # -- images and plans in words ---------------------------------------------------------------------
 
 
@@ -112,6 +149,17 @@ def plan_lines(plan: Plan, options: UpgradeOptions) -> list[str]:
         f"  to:      {target.node.name} ({ids}) at {plan.bitrate_bps / 1000:g} kbit/s{foreign}",
         f"  plan:    {sent}, {byte_count(plan.bytes_on_wire)} of frame data",
         f"  time:    {time}, erasing and the device's own time extra",
+    ]
+
+
+def job_lines(job: Job) -> list[str]:
+    """Describe an upgrade before it begins: image, origin and plan."""
+    image, provenance = job.plan.image, job.identity.provenance
+    return [
+        *image_lines(image),
+        *([f"  origin:  {provenance.text}"] if provenance else []),
+        *vector_lines(vector_table(image)),
+        *plan_lines(job.plan, job.options),
     ]
 
 
