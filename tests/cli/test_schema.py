@@ -111,6 +111,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("adapters",),
         ("ui", "--mock", "--mock-speed", "0"),
         ("doctor", "--mock", "--listen", "0.1", "--mock-speed", "0"),
+        ("doctor", *MOCK[2:], "--throughput"),
         ("manifest", "create", Path("image.bin"), "-t", "obc"),
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),
         ("trust", "show"),

@@ -1,6 +1,7 @@
 """`flasher doctor`: diagnose adapter, interface, bus and traffic, with a command for each fault.
 
-It never sends a frame: at a wrong bit rate that would disturb a live bus.
+It never sends a frame, because at a wrong bit rate that would disturb a live bus; except, on
+request, queries that measure the speed of a bus that was found in order.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from flasher.cli import values
 from flasher.cli.adapters import use_only_adapter
 from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
-from flasher.cli.look import findings
+from flasher.cli.look import findings, throughput
 from flasher.cli.look.findings import Finding, ListenResult, Severity, TrafficCounter
+from flasher.cli.look.throughput import BURSTS, QUERIES, Throughput
 from flasher.cli.options import Bus, bus_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -35,21 +37,26 @@ from flasher.errors import (
     without_password,
 )
 from flasher.host.survey import Survey
-from flasher.protocol.spec import BMS
+from flasher.protocol.spec import BMS, FRAMES_PER_PACKET
 from flasher.protocol.text import printable
 
 LISTEN_S: Final = 1.0
 """Default of --listen: most nodes of a running system send within this time."""
 
-_EXAMPLES: Final = """\
+_EXAMPLES: Final = f"""\
 examples:
   flasher doctor                                   list the adapters
   flasher doctor -i socketcan -c can0              check one: interface, bus, traffic
   flasher doctor -i pcan -c PCAN_USBBUS1 --listen 5 --json
+  flasher doctor -i slcan -c /dev/ttyACM0 --throughput
   flasher doctor --mock                            the output for a healthy bus
 
 Never sends a frame, and listens without acknowledging where the adapter can. So it does not try
 other bit rates, and cannot detect a device that sends only when asked: flasher scan asks.
+
+--throughput then sends version queries to the BMS, which change nothing: {QUERIES} that wait for
+their answer, and {BURSTS} bursts of {FRAMES_PER_PACKET} frames. It sends nothing if a problem was
+found, another tool sends, or a device is in its bootloader.
 """
 
 
@@ -98,6 +105,8 @@ class DoctorDocument:
     health: HealthDocument | None
     """State of the controller; null if no adapter was opened, like `traffic`."""
     traffic: TrafficDocument | None
+    throughput: Throughput | None
+    """Speed of the adapter; null unless it was measured."""
 
 
 DOCUMENTS: Final = (DoctorDocument,)
@@ -120,8 +129,12 @@ _WORDS: Final = {
     "--listen", type=values.seconds, default=LISTEN_S, metavar="S", brief=True,
     help="listen for so many seconds",
 )  # fmt: skip
+@option(
+    "--throughput", "measures", is_flag=True, brief=True,
+    help="then measure the adapter's speed, with version queries to the BMS",
+)  # fmt: skip
 @bus_options()
-def doctor(output: Output, bus: Bus, *, listen: float) -> int:
+def doctor(output: Output, bus: Bus, *, listen: float, measures: bool) -> int:
     """Check the adapters, the selected one, its bus and the traffic."""
     examination = Diagnostics(bus, listen, output)
     with stop_on_signal() as stopped:
@@ -129,6 +142,8 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
             examination.look_at_mock(stopped)
         else:
             examination.look_at_adapters(stopped)
+        if measures:
+            examination.measure(stopped)
     output.results(lines(examination.findings, is_coloured=takes_colour(sys.stdout)))
     worst = max(examination.findings, key=lambda finding: list(Severity).index(finding.severity))
     document = _document(examination)
@@ -176,6 +191,7 @@ def _document(examination: Diagnostics) -> DoctorDocument:
             nodes=sorted(node.name.lower() for node in heard.survey.heard),
             foreign_frames=heard.foreign_frames,
         ),
+        throughput=examination.throughput,
     )
 
 
@@ -193,6 +209,7 @@ class Diagnostics:
         self.bitrate_bps = self.dialect.bitrate_bps
         self.detected = DetectionResult()
         self.listened: ListenResult | None = None
+        self.throughput: Throughput | None = None
         self.findings: list[Finding] = []
         """Findings in the order of printing."""
 
@@ -318,6 +335,32 @@ class Diagnostics:
             bus_arguments,
         )  # fmt: skip
         self._note(*findings.traffic(self.listened))
+
+    def measure(self, stopped: Callable[[], bool]) -> None:
+        """Measure the speed of the adapter, unless its queries could disturb something."""
+        reason = self._reason_not_to_send()
+        if reason is not None:
+            self._note(Finding(Severity.WARNING, "speed", f"not measured: {reason}"))
+            return
+        self._output.progress("measuring, with version queries to the BMS ...")
+        try:
+            with self._bus.connect(BMS) as connection:
+                device = connection.device(BMS, dialect=self.dialect, cancelled=stopped)
+                is_real_time = not self._bus.mock or self._bus.mock_speed > 0
+                self.throughput = throughput.measure(device, is_real_time=is_real_time)
+        except BusError as error:
+            self._note(findings.opening_failed(error))
+            return
+        self._note(*findings.throughput(self.throughput))
+
+    def _reason_not_to_send(self) -> str | None:
+        if self.listened is None or any(
+            each.severity is Severity.PROBLEM for each in self.findings
+        ):
+            return "a problem was found above"
+        if any(node.boot_version for node in self.listened.survey.heard.values()):
+            return "a device is in its bootloader"
+        return None
 
     def _note(self, *findings: Finding) -> None:
         self.findings += findings

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import Final
 
@@ -27,14 +28,18 @@ from flasher.bus.inspect_interface import (
     start_command,
 )
 from flasher.bus.opening import needed_extra
-from flasher.cli.output import counted
+from flasher.cli.look.throughput import Throughput
+from flasher.cli.output import counted, spread_ms
 from flasher.errors import BusError, hide_passwords, install_command
+from flasher.host.options import FRAME_GAP_SHARE
 from flasher.host.survey import Survey
 from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import FRAMES_PER_PACKET, Dialect, Node
 from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.trace.decoder import bits_of
+from flasher.trace.figures import Distribution
 from flasher.wording import wording
 
 _SHOWN_AT_MOST: Final = 20
@@ -47,6 +52,7 @@ _EXAMPLES: Final = (
 _LIST_INTERFACES: Final = "ip -brief link show type can"
 _VARIABLES: Final = ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG")
 _HIGH_LOAD: Final = 0.8
+_SLOW_TIMES: Final = 2.0
 _MANY_ERRORS: Final = 0.1
 """Share of error frames from which a bus counts as disturbed."""
 
@@ -66,7 +72,7 @@ class Finding:
 
     severity: Severity
     about: str
-    """Subject: "python-can", "adapters", "interface", "adapter", "bus", "traffic"."""
+    """Subject: "python-can", "adapters", "interface", "adapter", "bus", "traffic", "speed"."""
     what: str
     fix: tuple[str, ...] = ()
 
@@ -421,3 +427,84 @@ def _nodes(heard: ListenResult) -> Iterator[Finding]:
         fix = f"flasher doctor --dialect {guessed.name} {heard.bus_arguments}".rstrip()
         what = f"the bus speaks {guessed.name}, not {heard.dialect.name}: {why}"
         yield _warning("traffic", what, (fix,))
+
+
+# -- speed -----------------------------------------------------------------------------------------
+
+
+def throughput(found: Throughput, timings: Timings = DEFAULT_TIMINGS) -> Iterator[Finding]:
+    """Judge the speed of the adapter, and name the profile keys that it needs."""
+    sent = f"{counted(found.frames_sent, 'frame')} sent, all of them version queries to the BMS"
+    yield _note("speed", sent)
+    if found.set_aside:
+        what = f"this computer paused for up to {found.worst_pause_s * 1000:.0f} ms: "
+        what += f"{counted(found.set_aside, 'measurement')} set aside, not blamed on the adapter"
+        fix = ("close other programs, and measure again",)
+        yield _warning("speed", what, fix)
+    else:
+        what = f"longest pause of this computer: {found.worst_pause_s * 1000:.1f} ms"
+        yield _ok("speed", what)
+    if found.worst_gap_out_s is not None:
+        yield from _sending(found, timings)
+    if found.echo_delay is not None:
+        what = f"own frames are returned after {spread_ms(found.echo_delay)} ms"
+        yield _ok("speed", f"{what} (min/median/p95/p99/max)")
+    if found.round_trip is None:
+        what = "no answer was measured: only sending is known"
+        yield _warning("speed", what, ("switch the system on (press its key)",))
+        return
+    yield from _answers(found, found.round_trip, timings)
+
+
+def _sending(found: Throughput, timings: Timings) -> Iterator[Finding]:
+    rate = found.frames_out_per_s
+    out = "at once" if rate is None else f"at {rate:,.0f} frames/s"
+    queued = "" if rate is not None and rate <= found.line_frames_per_s else ", and queues them"
+    gap_s = found.worst_gap_out_s or 0.0
+    what = f"accepts frames {out} (the line: {found.line_frames_per_s:,.0f}){queued}, "
+    what += f"longest gap {gap_s * 1000:.1f} ms"
+    if gap_s > FRAME_GAP_SHARE * timings.inter_frame_timeout_s:
+        limit = f"{timings.inter_frame_timeout_s * 1000:.0f} ms"
+        yield _problem(
+            "speed",
+            f"{what}: a device drops a message whose frames are {limit} apart, and no setting of "
+            "this computer changes that",
+            ("try another cable, port or adapter",),
+        )
+    else:
+        yield _ok("speed", what)
+
+
+def _answers(found: Throughput, trip: Distribution, timings: Timings) -> Iterator[Finding]:
+    what = f"round trip {spread_ms(trip)} ms (min/median/p95/p99/max), the device's own time "
+    yield _ok("speed", f"{what}included; {found.answered} of {found.queries} answered")
+    if found.worst_gap_in_s is not None:
+        rate = found.frames_in_per_s
+        how = "at once" if rate is None else f"at {rate:,.0f} frames/s"
+        what = f"delivers answers {how}, longest gap {found.worst_gap_in_s * 1000:.1f} ms"
+        yield _ok("speed", what)
+    needed = {}
+    if (found.worst_gap_in_s or 0.0) > timings.inter_frame_timeout_s / 2:
+        needed["inter_frame_timeout_s"] = 3 * (found.worst_gap_in_s or 0.0)
+    if trip.maximum_s > timings.ack_timeout_s / 2:
+        needed["ack_timeout_s"] = 3 * trip.maximum_s
+    if trip.maximum_s > timings.command_repeat_s:
+        needed["command_repeat_s"] = 2 * trip.maximum_s
+        needed["command_timeout_s"] = max(timings.command_timeout_s, 6 * trip.maximum_s)
+    if needed:
+        keys = tuple(f"{key} = {ceil(value * 10) / 10:g}" for key, value in needed.items())
+        what = "slow for the default limits; a profile needs"
+        yield _warning("speed", what, ("[timings]", *keys))
+    else:
+        yield _ok("speed", "the default limits of a profile are enough")
+    if trip.median_s > timings.burst_s - timings.boot_watch_s:
+        what = (
+            f"an update command may reach a bootloader {trip.median_s * 1000:.0f} ms late, after "
+        )
+        what += f"the {timings.burst_s * 1000:.0f} ms in which it announces itself"
+        yield _problem("speed", what, ("try another cable, port or adapter",))
+    if found.packet_s is not None:
+        times = found.packet_s / found.line_packet_s
+        what = f"a packet takes about {found.packet_s * 1000:.1f} ms, {times:.1f} times as long as "
+        what += "on a line that never waits"
+        yield (_note if times > _SLOW_TIMES else _ok)("speed", what)
