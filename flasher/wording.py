@@ -116,6 +116,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "unconfirmed": "the final answer never came",
         "complete_too_early": "complete before the end of the transfer",
         "other_version": "completed, but another version answers",
+        "in_bootloader": "completed, but the device stays in its bootloader",
         "recording_ends": "the recording ends in the middle",
         "queries_only": "no upgrade, but drive-system traffic",
         "foreign_only": "no upgrade, only traffic of other kinds",
@@ -251,6 +252,11 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     "other_version": Explanation(
         "the device fell back to an older image, or the image names its version wrongly",
         "Compare with flasher image-info, then flash the right image.",
+    ),
+    "in_bootloader": Explanation(
+        "the device does not start the image that it confirmed, or a second device of its kind has "
+        "lost its application",
+        f"It has no application now. {_RESCUE}",
     ),
     "recording_ends": Explanation(
         "the recording was stopped or its file was cut off before the upgrade was over",

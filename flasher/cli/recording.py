@@ -66,8 +66,7 @@ class RecordingOptions:
 
     trace_file: Annotated[str | None, option(
         "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
-        brief=True, help="record all frames; format by suffix (.asc .blf ...). A file that exists "
-        "is refused; flash and rescue overwrite it with --force",
+        brief=True, help="record all frames; format by suffix (.asc .blf ...)",
     )] = None  # fmt: skip
     bundle_dir: Annotated[Path | None, option(
         "--bundle-dir", metavar="DIR", type=FolderPath(), panel="recording",
@@ -78,8 +77,10 @@ class RecordingOptions:
     no_bundle: Annotated[bool, option(
         "--no-bundle", is_flag=True, panel="recording", help="leave none",
     )] = False  # fmt: skip
-    overwrites: bool = False
-    """True if the trace file may exist already (--force)."""
+    overwrites: Annotated[bool, option(
+        "--overwrite-trace", "overwrites", is_flag=True, panel="recording",
+        help="overwrite an older trace file",
+    )] = False  # fmt: skip
 
 
 recording_options: Final = option_set("recorded", RecordingOptions)
@@ -229,7 +230,7 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
         raise UsageError(
             f"{printable(path)} exists already.",
             where="--trace-file",
-            remedy="Name another file, or move this one away.",
+            remedy="Name another file, or add --overwrite-trace.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         )
     from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can

@@ -17,7 +17,7 @@ from typing import Final
 
 from flasher.errors import ErrorCode, FlasherError, ImageError, UsageError, WrongDeviceError
 from flasher.history import FlashHistory, highest_counters
-from flasher.i18n import text
+from flasher.i18n import Text, text
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.release import Provenance, Release
@@ -164,8 +164,12 @@ def unsigned(source: str, store: TrustStore | None = None) -> Provenance:
     if problem is None:
         problem = ImageError(
             text("{file} is not signed.", file=printable(source)),
-            remedy=text(
-                "Take the release (*.wfw) of its maker; --allow-unsigned flashes your own image."
+            remedy=Text(
+                "{remedy} {option}",
+                {
+                    "remedy": text("Take the release (*.wfw) of its maker."),
+                    "option": text("--allow-unsigned flashes your own image."),
+                },
             ),
             code=ErrorCode.RELEASE_UNSIGNED,
         )

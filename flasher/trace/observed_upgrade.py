@@ -147,6 +147,8 @@ class ObservedUpgrade:
     end_naks: int = 0
     boots_after_end: int = 0
     completed_at_s: float | None = None
+    announced_on_s: float = 0.0
+    """Time over which the bootloader announced itself after complete, in seconds."""
     early_complete: bool = False
     running_version: str | None = None
 
@@ -164,6 +166,7 @@ class ObservedUpgrade:
         self._by_number: dict[int, PacketStory] = {}
         self._left_s: dict[int, float] = {}
         """Time when the latest copy of each packet had left the wire, in seconds."""
+        self._boot_again_at_s: float | None = None
         self._last_boot = ""
         self._tail = b""
 
@@ -377,6 +380,9 @@ class ObservedUpgrade:
                     self._restarted()
             case Phase.END | Phase.CONFIRM if self.completed_at_s is None:
                 self.boots_after_end += 1
+            case Phase.END | Phase.CONFIRM:
+                self._boot_again_at_s = self._boot_again_at_s or timed.begin_s
+                self.announced_on_s = now - self._boot_again_at_s
 
     def _request(self, timed: TimedEvent) -> None:
         if self.phase is Phase.TRANSFER and self.current is not None:

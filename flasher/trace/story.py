@@ -47,6 +47,8 @@ class Cause(Enum):
     UNCONFIRMED = "unconfirmed"
     COMPLETE_TOO_EARLY = "complete_too_early"
     OTHER_VERSION = "other_version"
+    IN_BOOTLOADER = "in_bootloader"
+    """The device reported complete, and its bootloader went on announcing itself."""
 
     # What the trace is.
     RECORDING_ENDS = "recording_ends"

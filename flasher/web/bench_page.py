@@ -168,6 +168,7 @@ class BenchPage:
             rows=compared(done),
             device=identity(done),
             waivers=WAIVERS,
+            without_options=without_options,
             is_saved=is_saved,
         )
         if is_saved:
@@ -262,6 +263,8 @@ def _listed(shown: Field) -> str:
 
 
 _WAIVES: Final = re.compile(r"; --allow-[\w-]+ waives this.*(?=\)\.?$)", re.DOTALL)
+_JOINED: Final = re.compile(r"\{\w+\}( \{\w+\})*")
+"""Matches the template of joined sentences, which are translated one by one."""
 _OPTION: Final = re.compile(r"(?<!\w)--[a-z]")
 
 
@@ -269,8 +272,11 @@ def without_options(message: str) -> str:
     """Leave out what a message says of options of the command line: a page has controls instead."""
     if not _OPTION.search(message):
         return message
-    sentences = re.split(r"(?<=[.!?]) ", _WAIVES.sub("", message))
-    return " ".join(each for each in sentences if not _OPTION.search(each))
+    sentences: list[str] = re.split(r"(?<=[.!?]) ", _WAIVES.sub("", message))
+    if isinstance(message, Text) and _JOINED.fullmatch(message.template):
+        sentences = list(message.values.values())
+    kept = [each for each in sentences if not _OPTION.search(each)]
+    return kept[0] if len(kept) == 1 else " ".join(kept)
 
 
 def as_it_is_now(state: BenchState) -> BenchState:

@@ -305,7 +305,7 @@ def test_a_silent_device_leaves_a_bundle_that_is_explained(
     assert "The BMS did not answer." in told.out
 
 
-def test_an_existing_trace_file_is_overwritten_only_with_force(
+def test_an_existing_trace_file_is_overwritten_only_on_request(
     flasher: Flasher, short_bms: Path, tmp_path: Path
 ) -> None:
     trace = tmp_path / "kept.asc"
@@ -315,7 +315,11 @@ def test_an_existing_trace_file_is_overwritten_only_with_force(
     assert run.code == ExitCode.USAGE
     assert "exists already" in run.err
     assert trace.read_text() == "evidence\n"
-    assert flasher(*words, "--force").code == ExitCode.OK
+    assert flasher(*words, "--force").code == ExitCode.USAGE, "it waives checks alone"
+    assert trace.read_text() == "evidence\n"
+    run = flasher(*words, "--overwrite-trace", "--json")
+    assert run.code == ExitCode.OK
+    assert not [check for check in run.document["checks"] if check["verdict"] == "waived"]
     assert "evidence" not in trace.read_text()
     trace.write_text("")
     assert flasher(*words).code == ExitCode.OK

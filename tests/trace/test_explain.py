@@ -53,6 +53,12 @@ def unanswered(tape: Tape, times: int) -> Tape:
     return tape
 
 
+def repeatedly(tape: Tape, bursts: int) -> Tape:
+    for _ in range(bursts):
+        tape.wait(0.2).boot().wait(0.05).boot()
+    return tape
+
+
 CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | None]] = [
     ("complete", lambda t: t.to_end().complete(), Cause.COMPLETED, Phase.END, None),
     (
@@ -66,6 +72,27 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
         "another version",
         lambda t: with_version(t).complete().wait(0.3).version(OLD),
         Cause.OTHER_VERSION,
+        Phase.CONFIRM,
+        None,
+    ),
+    (
+        "announces itself for good after complete",
+        lambda t: repeatedly(t.to_end().complete(), 8),
+        Cause.IN_BOOTLOADER,
+        Phase.END,
+        None,
+    ),
+    (
+        "announces itself once after complete, on its way to the application",
+        lambda t: repeatedly(t.to_end().complete(), 1),
+        Cause.COMPLETED,
+        Phase.END,
+        None,
+    ),
+    (
+        "starts its application after a long announcement",
+        lambda t: repeatedly(with_version(t).complete(), 8).wait(0.3).version(NEW),
+        Cause.COMPLETED,
         Phase.CONFIRM,
         None,
     ),

@@ -30,6 +30,7 @@ from flasher.errors import (
 from flasher.history import MOCK, Began, Flash, FlashHistory, Reached, latest_left_open
 from flasher.host.event_text import progress_line
 from flasher.host.verify import Level, Verdict, Verification
+from flasher.i18n import Text, text
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
@@ -793,4 +794,7 @@ def test_an_error_on_the_page_names_no_option_of_the_command_line(
 def test_a_message_without_options_is_the_same_and_one_of_options_alone_is_empty() -> None:
     assert without_options("Wake it. Look again.") == "Wake it. Look again."
     assert without_options("Wake it. Or add --force.") == "Wake it."
+    joined = Text("{a} {b}", {"a": text("Wake it."), "b": text("--force sends it.")})
+    assert without_options(joined) == "Wake it."
+    assert isinstance(without_options(joined), Text), "it can be translated"
     assert without_options("Allow more time with --timeout.") == ""

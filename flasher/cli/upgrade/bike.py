@@ -29,7 +29,7 @@ from flasher.cli.output import ClosingLine, Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade import text
-from flasher.cli.upgrade.flash import TRACE_FILE, UpgradeChoices, repair_command
+from flasher.cli.upgrade.flash import TRACE_OPTIONS, UpgradeChoices, repair_command
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     BikeDeviceDocument,
@@ -107,7 +107,7 @@ class BikeUpgrade:
         self._devices: list[_Device] = []
         self._left_out: list[SetImage] = []
         ctx = click.get_current_context()
-        words = rebuild_command_line(ctx, str(ctx.info_name), without=TRACE_FILE.__eq__)
+        words = rebuild_command_line(ctx, str(ctx.info_name), without=TRACE_OPTIONS.__contains__)
         self._again = shlex.join(["flasher", *words])
 
     def run(self, target: Target | None) -> int:
@@ -260,9 +260,7 @@ class BikeUpgrade:
     ) -> FlasherError | None:
         """Upgrade a device; return the error of a failure."""
         output = self.output
-        recorded = replace(
-            self.recorded, overwrites=self.choices.force, trace_file=self._trace_file(device)
-        )
+        recorded = replace(self.recorded, trace_file=self._trace_file(device))
         upgrade_run = UpgradeRun(
             device.job, self.bus, recorded, output, partial(self._add_repair, device), self._again
         )

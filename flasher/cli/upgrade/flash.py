@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Annotated, Final
 
 import click
@@ -398,10 +398,11 @@ class _Upgrade:
         output = self.output
         ctx = click.get_current_context()
         name, replaced = str(ctx.info_name), _image_again(ctx)
-        words = rebuild_command_line(ctx, name, without=TRACE_FILE.__eq__, replaced=replaced)
+        words = rebuild_command_line(
+            ctx, name, without=TRACE_OPTIONS.__contains__, replaced=replaced
+        )
         again = shlex.join(["flasher", *words])
-        recorded = replace(self.recorded, overwrites=self.choices.force)
-        upgrade_run = UpgradeRun(job, self.bus, recorded, output, self._add_repair, again)
+        upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
         result = upgrade_run.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
             lambda connection, record: self._watching(upgrade_run.job, connection, record),
@@ -478,10 +479,8 @@ OTHER_IMAGE: Final = "OTHER_IMAGE"
 """Placeholder for another image, after the device refused the one sent."""
 SAME_IMAGE: Final = "IMAGE"
 """Placeholder for an image from standard input, which is read once."""
-TRACE_FILE: Final = "--trace-file"
-_LEFT_OUT: Final = frozenset(
-    {"--timeout", TRACE_FILE, "--skip-same-version", "--bike", "--without"}
-)
+TRACE_OPTIONS: Final = frozenset({"--trace-file", "--overwrite-trace"})
+_LEFT_OUT: Final = TRACE_OPTIONS | {"--timeout", "--skip-same-version", "--bike", "--without"}
 """Options that the repair command omits: a deadline for a device that answers at once (a rescue
 waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
 _OF_THE_IMAGE: Final = frozenset(
