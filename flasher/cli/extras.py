@@ -10,6 +10,7 @@ from flasher.errors import ErrorCode, UsageError, how_to_install
 _PACKAGES: Final = {
     "cluster": ("distributed",),
     "mf4": ("asammdf",),
+    "plant": ("alembic", "cryptography", "psycopg", "sqlalchemy"),
     "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("itsdangerous", "pygal", "starlette", "uvicorn"),
 }

@@ -111,6 +111,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "station": CommandEntry(
             "station.commands:station", "flash unit after unit at the end of a line, with records"
         ),
+        "plant": CommandEntry(
+            "plant.commands:plant", "collect the records of all stations of a plant"
+        ),
     },
     "what a product does its own way": {
         "profile": CommandEntry(

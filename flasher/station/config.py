@@ -176,6 +176,9 @@ class StationConfig(TomlTable):
     heads: tuple[str, ...] = Field(default=(), max_length=8)
     """Places for copies of the signed heads of the audit trail: folders, best on another computer,
     or URLs of PostgreSQL databases; one text, or a list."""
+    plant: str = ""
+    """Database that collects the records of all stations, such as
+    "postgresql://flasher_line_2@plant-db/flasher"; empty: none."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """Time limit of a write while another program locks the database."""
     badges: str = ""

@@ -35,7 +35,7 @@ class HealthWatch:
     """Checks the health of a station; disk and clock every `LOOK_EVERY_S`.
 
     `folder`: the files of the records; `utc` and `monotonic_s`: the clocks; `unkept` returns the
-    places that lack the last chain heads.
+    places that lack the last chain heads. `plant` checks the sending of records to a plant.
     """
 
     def __init__(
@@ -44,7 +44,9 @@ class HealthWatch:
         utc: Callable[[], datetime],
         monotonic_s: Callable[[], float],
         unkept: Callable[[], Collection[str]] = tuple,
+        plant: Callable[[], HealthCheck] | None = None,
     ) -> None:
+        self._plant = plant
         self._unkept = unkept
         self._folder = folder
         self._utc = utc
@@ -57,7 +59,8 @@ class HealthWatch:
         """Run all checks."""
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
-            self._looked_at, self._seen = now, (self._disk(), self._clock())
+            plant = () if self._plant is None else (self._plant(),)
+            self._looked_at, self._seen = now, (*plant, self._disk(), self._clock())
         sentence = board.records_fault or text("every run is saved")
         checks = [HealthCheck(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:

@@ -33,12 +33,12 @@ from flasher.protocol.text import printable
 from flasher.station.board import Board
 from flasher.station.config import StationConfig, load_config
 from flasher.station.events import RunEnded, StationEvent
-from flasher.station.health import HealthWatch
+from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import RunFilter, RunState, StationClock, utc_moment
-from flasher.station.records.store import SystemClock
+from flasher.station.records.store import Store, SystemClock
 from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
 from flasher.station.station import Station
 from flasher.web.guard import BODY_MAX, application
@@ -115,7 +115,13 @@ def operator_page(
         if run.station == store.station and run.state is not RunState.RUNNING:
             tally.add(EndedRun(utc_moment(run.begun_at), run.serial, run.state, run.code))
     clock = station.clock
-    watch = HealthWatch(store.files.folder, clock.utc, clock.monotonic_s, store.signer.unkept)
+    watch = HealthWatch(
+        store.files.folder,
+        clock.utc,
+        clock.monotonic_s,
+        store.signer.unkept,
+        partial(_plant_check, store, clock) if config.plant else None,
+    )
     screen = Screen(tally, watch)
     pages = Pages(options.language)
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
@@ -140,6 +146,13 @@ def operator_page(
             yield view, url
         finally:
             screen.feed.close()
+
+
+def _plant_check(store: Store, clock: StationClock) -> HealthCheck:
+    """Check the sending of records to the plant's database."""
+    from flasher.plant.health import check  # noqa: PLC0415  an extra
+
+    return check(store.files.folder, clock.utc())
 
 
 # -- supervisor pages only ------------------------------------------------------------------------

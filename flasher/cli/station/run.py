@@ -6,13 +6,14 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from flasher.cli.extras import need
 from flasher.cli.output import Output
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import StationRunDocument, figures_document
@@ -74,7 +75,10 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
         view = JsonLines(output)
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
-    with _opened_records(options, records, config, output) as store:
+    with (
+        _opened_records(options, records, config, output) as store,
+        _sent_to_plant(options, records, config),
+    ):
         session = _Session(
             options, pages, output, store, view, crew, config, is_virtual,
             is_temporary=_is_temporary(options, records),
@@ -178,6 +182,19 @@ def _opened_records(
         file, key_locations = Path(folder) / "records.sqlite", KeyLocations(Path(folder) / "keys")
         with Store.open(str(file), station=config.name, key_locations=key_locations) as store:
             yield store
+
+
+def _sent_to_plant(
+    options: RunOptions, records: RecordsOptions, config: StationConfig
+) -> AbstractContextManager[None]:
+    """Send the records to the plant of the station file. Raises UsageError."""
+    if not config.plant or _is_temporary(options, records):
+        return nullcontext()
+    need("Sending records to a plant", "plant")
+    from flasher.plant.process import Sending, sending  # noqa: PLC0415  an extra
+
+    place = records_of(records)
+    return sending(Sending(config.plant, config.name, place.url, place.files))
 
 
 @dataclass

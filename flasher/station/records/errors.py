@@ -212,7 +212,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "42501": (
         RecordsReadOnlyError,
         "this user of the database lacks the right",
-        "The owner of the database grants it with `flasher station roles`.",
+        "The owner of the database grants it: flasher station roles, or flasher plant init.",
     ),
     "53": (
         DiskFullError,
@@ -239,8 +239,10 @@ _SYSTEM: Final[dict[int, _Kind]] = {
 
 
 @contextmanager
-def mapped(where: str, *, writes: bool) -> Iterator[None]:
-    """Map errors of the block to RecordErrors. `where` names the database in messages."""
+def mapped(where: str, *, writes: bool, begin: str = "") -> Iterator[None]:
+    """Map errors of the block to RecordErrors. `where` names the database in messages, which start
+    with `begin`.
+    """
     error: Exception
     cause = ""
     try:
@@ -262,5 +264,5 @@ def mapped(where: str, *, writes: bool) -> Iterator[None]:
         why, error = found.strerror or type(found).__name__, found
     else:
         return
-    begin = NOT_SAVED if writes else "The records cannot be read"
+    begin = begin or (NOT_SAVED if writes else "The records cannot be read")
     raise kind(f"{begin}: {why}.", where=where, cause=cause, remedy=remedy) from error

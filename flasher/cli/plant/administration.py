@@ -1,0 +1,133 @@
+"""`flasher plant init`, `status` and `send`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+from flasher.cli.output import Output, byte_count, counted, duration
+from flasher.cli.plant.documents import PlantInitDocument, PlantSendDocument, PlantStatusDocument
+from flasher.errors import ExitCode, UsageError
+from flasher.plant.central import Central, plant_location
+from flasher.plant.process import Sending
+from flasher.plant.setup import create_database, role_of, setup
+from flasher.plant.stations import StationStatus, stations_of
+from flasher.protocol.text import printable
+from flasher.station.config import load_config
+from flasher.station.records.database import Location
+
+SILENT_S = 60.0
+"""A station that has not reported for this time is shown as silent."""
+
+
+def init(
+    output: Output, url: str, stations: Sequence[str], renewed: Sequence[str], *, prints: bool
+) -> int:
+    location = plant_location(url)
+    if prints:
+        roles = {name: role_of(name) for name in (*stations, *renewed)}
+        lines = [*_before(location), *_after(location, roles, roles.values())]
+        output.results(lines)
+        return output.document(PlantInitDocument(is_new=False, roles=roles, to_run=lines))
+    if create_database(url):
+        output.result(printable(f"created the database {location.url.database}"))
+    made = setup(url, stations, datetime.now(UTC), renewed=renewed)
+    output.result("created the tables" if made.is_new else "the tables are up to date")
+    for each in made.stations:
+        is_new = each in made.created
+        what = "created its role" if is_new else "has its role"
+        output.result(printable(f"{each.station}: {what}, {each.role}"))
+    roles = {each.station: each.role for each in made.stations}
+    lines = list(_after(location, roles, [each.role for each in made.created]))
+    output.results(lines)
+    return output.document(PlantInitDocument(is_new=made.is_new, roles=roles, to_run=lines))
+
+
+def _before(location: Location) -> Iterator[str]:
+    """SQL for an administrator of the server, before `init`."""
+    user, name = location.url.username or "flasher_plant", location.url.database
+    yield "-- as an administrator of the server (psql postgres):"
+    yield f'CREATE ROLE "{printable(user)}" LOGIN CREATEROLE;'
+    yield f'CREATE DATABASE "{printable(str(name))}" OWNER "{printable(user)}";'
+
+
+def _after(location: Location, roles: Mapping[str, str], created: Collection[str]) -> Iterator[str]:
+    """What is to be done by hand for the stations."""
+    host, name = location.url.host or "localhost", location.url.database
+    port = f":{location.url.port}" if location.url.port else ""
+    if created:
+        yield "-- in psql, a password for each new role (stations read theirs from ~/.pgpass):"
+        yield from (printable(f"\\password {role}") for role in created)
+    if roles:
+        yield "# in pg_hba.conf, above lines that allow more:"
+        yield from (
+            printable(f"hostssl {name} {role} samenet scram-sha-256") for role in roles.values()
+        )
+    for station, role in roles.items():
+        yield printable(f"# in the station file of {station}:")
+        yield printable(f'plant = "postgresql://{role}@{host}{port}/{name}?sslmode=verify-full"')
+
+
+# -- status ----------------------------------------------------------------------------------------
+
+
+def status(output: Output, url: str) -> int:
+    with closing(Central(url)) as central:
+        found = stations_of(central)
+    for each in found:
+        output.results(_lines(each))
+    if not found:
+        output.result("no stations: flasher plant init --station NAME adds one")
+    code = ExitCode.VERIFICATION if any(each.refusal for each in found) else ExitCode.OK
+    return output.document(PlantStatusDocument(found), exit_code=code)
+
+
+def _lines(each: StationStatus) -> Iterator[str]:
+    name = printable(each.station)
+    if each.reported_at is None:
+        yield f"{name}: has never connected"
+        return
+    silent_s = each.silent_s or 0.0
+    seen = "SILENT for" if silent_s > SILENT_S else "reported"
+    ago = "" if silent_s > SILENT_S else " ago"
+    yield f"{name}: {seen} {duration(silent_s)}{ago}, flasher {printable(each.version)}"
+    if each.refusal:
+        yield printable(f"  REFUSED: {each.refusal}")
+    at = f", of {printable(each.head_at)}" if each.head_at else ""
+    yield f"  last row:  {each.head_number:,}{at}, hash {(each.head_hash or 'none')[:16]}"
+    if each.unsent:
+        oldest = printable(each.oldest_unsent_at or "")
+        yield f"  unsent:    {counted(each.unsent, 'row')}, the first of {oldest}"
+    if each.clock_offset_s is not None:
+        yield f"  clock:     {each.clock_offset_s:+.1f} s"
+    if each.disk_free_bytes is not None:
+        yield f"  disk:      {byte_count(each.disk_free_bytes)} free"
+
+
+# -- sending ---------------------------------------------------------------------------------------
+
+
+def sending_of(file: Path) -> Sending:
+    """What a station file asks to send. Raises UsageError."""
+    config = load_config(file)
+    if not config.plant:
+        raise UsageError(
+            "The station file names no plant.",
+            where=printable(str(file)),
+            remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
+        )
+    files = Path(config.files) if config.files else None
+    return Sending(config.plant, config.name, config.records, files)
+
+
+def send(output: Output, file: Path) -> int:
+    with closing(sending_of(file).open()) as forwarder:
+        while forwarder.forward():
+            output.progress(f"{counted(forwarder.state.unsent, 'row')} left")
+        state = forwarder.state
+        if forwarder.error is not None:
+            raise forwarder.error
+    output.result(f"everything is sent: {counted(state.sent, 'row')}")
+    return output.document(PlantSendDocument(state))

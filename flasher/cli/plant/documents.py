@@ -1,0 +1,39 @@
+"""Documents that `flasher plant --json` prints; see `flasher.cli.documents`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.plant.forwarder import ForwarderState
+from flasher.plant.stations import StationStatus
+
+
+@dataclass(frozen=True)
+class PlantInitDocument:
+    """Result of `flasher plant init`."""
+
+    is_new: bool
+    """True if the tables were created now."""
+    roles: dict[str, str]
+    """Role of each station by its name."""
+    to_run: list[str]
+    """What an administrator has to run or write, line by line."""
+
+
+@dataclass(frozen=True)
+class PlantStatusDocument:
+    """The stations of a plant."""
+
+    stations: list[StationStatus]
+
+
+@dataclass(frozen=True)
+class PlantSendDocument:
+    """State after `flasher plant send`."""
+
+    state: ForwarderState
+
+
+DOCUMENTS: Final = (PlantInitDocument, PlantStatusDocument, PlantSendDocument)
+LINES: Final[tuple[type, ...]] = ()

@@ -1,0 +1,136 @@
+"""Connects to the plant's database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import DBAPIError
+
+from flasher.errors import ErrorCode, UsageError, how_to_install
+from flasher.plant.functions import REFUSED
+from flasher.protocol.text import printable
+from flasher.station.records.database import Location, locate
+from flasher.station.records.errors import RuleBrokenError, mapped
+
+LOCK_TIMEOUT_S: Final = 10.0
+
+
+class Refusal(StrEnum):
+    """Why the plant refuses a station's chain."""
+
+    FORKED = "forked"
+    """Two chains continue the same row: records were copied, or restored and written again."""
+    EDITED = "edited"
+    """Rows do not have the hash or the digests that the chain states."""
+    REPLAYED = "replayed"
+    """The station's records end before the plant's: an older copy."""
+    INCOMPLETE = "incomplete"
+    """A row is missing in between."""
+    FOREIGN = "foreign"
+    """The chain belongs to another station, user or records."""
+
+    @property
+    def remedy(self) -> str:
+        if self is Refusal.FOREIGN:
+            return (
+                "If the station has new records: flasher plant init --renew STATION. Else give this"
+                " station its own user."
+            )
+        return (
+            "Find out who changed or copied the records (flasher station verify). Units that this"
+            " station passes are not in the plant's records until then."
+        )
+
+
+class ChainRefusedError(RuleBrokenError):
+    """The plant's database refused a station's chain. Nothing was stored."""
+
+    def __init__(self, refusal: Refusal, detail: str, *, where: str) -> None:
+        super().__init__(
+            f"The plant refuses this station's audit trail, {refusal.value}: {printable(detail)}.",
+            where=where,
+            remedy=refusal.remedy,
+        )
+        self.refusal = refusal
+        self.text = f"{refusal.value}: {detail}"
+
+
+def plant_location(url: str) -> Location:
+    """Parse the URL of a plant's database. Raises UsageError."""
+    location = locate(url, Path())
+    if location.url.get_backend_name() != "postgresql":
+        raise UsageError(
+            f"{location.shown} is not a PostgreSQL database.",
+            remedy="Name postgresql://USER@HOST/NAME.",
+        )
+    return location
+
+
+class Central:
+    """The plant's database. Each method raises RecordError, ChainRefusedError."""
+
+    def __init__(
+        self, url: str, *, database: str | None = None, statement_limit_s: float | None = None
+    ) -> None:
+        self.location = plant_location(url)
+        try:
+            from flasher.station.records.server import make_engine  # noqa: PLC0415  an extra
+        except ImportError as error:
+            raise UsageError(
+                "A plant's database needs a driver that is not installed.",
+                cause=printable(str(error)),
+                remedy=how_to_install("plant"),
+                code=ErrorCode.PACKAGE_MISSING,
+            ) from error
+        address = (
+            self.location.url if database is None else self.location.url.set(database=database)
+        )
+        self._engine = make_engine(address, LOCK_TIMEOUT_S, statement_limit_s)
+
+    @property
+    def shown(self) -> str:
+        """URL for messages, without a password."""
+        return self.location.shown
+
+    def close(self) -> None:
+        self._engine.dispose()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Open a read transaction with one consistent snapshot."""
+        with self._mapped(writes=False), self._engine.connect() as connection:
+            connection.execution_options(
+                isolation_level="REPEATABLE READ", postgresql_readonly=True
+            )
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """Open a transaction; committed when the block ends without an error."""
+        with self._mapped(writes=True), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def outside_transaction(self) -> Iterator[Connection]:
+        """Connect in autocommit mode, for what a transaction cannot do."""
+        with self._mapped(writes=True), self._engine.connect() as connection:
+            yield connection.execution_options(isolation_level="AUTOCOMMIT")
+
+    @contextmanager
+    def _mapped(self, *, writes: bool) -> Iterator[None]:
+        begin = f"The plant's database cannot be {'written' if writes else 'read'}"
+        with mapped(self.shown, writes=writes, begin=begin):
+            try:
+                yield
+            except DBAPIError as error:
+                if getattr(error.orig, "sqlstate", None) != REFUSED:
+                    raise
+                message = getattr(error.orig.diag, "message_primary", "")  # type: ignore[union-attr]
+                word, _, detail = message.partition(": ")
+                raise ChainRefusedError(Refusal(word), detail, where=self.shown) from error

@@ -1,0 +1,313 @@
+"""Sends a station's records to the plant's database, in the order of the station's audit trail.
+
+    with closing(Forwarder(records, files, central, "line-2", SystemClock())) as forwarder:
+        while forwarder.forward():     # a batch is one transaction
+            pass
+
+The database says which row it has last (`plant_enter`), so nothing is remembered here: whatever is
+killed at whatever moment, the next batch begins after that row. Rows that arrive twice are ignored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+from uuid import UUID
+
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import Connection, func, select, text
+
+from flasher import __version__
+from flasher.files import read
+from flasher.plant.central import Central, ChainRefusedError, Refusal
+from flasher.plant.schema import OWN_PARTS, SHARED_PARTS
+from flasher.protocol.text import printable
+from flasher.station.records import chain, schema
+from flasher.station.records.database import Database
+from flasher.station.records.errors import RecordError, mapped
+from flasher.station.records.files import FileStore
+from flasher.station.records.model import StationClock, utc_text
+from flasher.station.records.schema import audit
+
+BATCH_ROWS: Final = 200
+BATCH_BYTES: Final = 4 * 1024 * 1024
+"""Traces of a batch; the first run is sent whatever its size."""
+STATE_FILE: Final = "plant.json"
+_STATE_MAX_SIZE: Final = 64 * 1024
+_ROW: Final = ("number", "at", "event", "data", "previous_hash", "hash", "signature")
+
+_ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
+_REPORT: Final = text("SELECT plant_report(:version, :unsent, :oldest, :offset_s, :free, :refusal)")
+_ADD_PART: Final = text(
+    "INSERT INTO shared_part (station, sha256, content) VALUES (:station, :sha256, :content)"
+    " ON CONFLICT DO NOTHING"
+)
+_ADD_TRACE: Final = text(
+    "INSERT INTO trace (sha256, data) VALUES (:sha256, :data) ON CONFLICT DO NOTHING"
+)
+_ADD_ROW: Final = text(
+    "INSERT INTO chain_row (station, number, at, event, run_number, data, previous_hash, hash,"
+    " signature, content) VALUES (:station, :number, :at, :event, :run_number, :data,"
+    " :previous_hash, :hash, :signature, CAST(:content AS json)) ON CONFLICT DO NOTHING"
+)
+
+
+@dataclass(frozen=True)
+class ForwarderState:
+    """What the forwarder knows about the plant's database; also the content of its file."""
+
+    at: str = ""
+    """Time of the last attempt."""
+    sent: int = 0
+    """Number of the last audit row that the database has."""
+    unsent: int = 0
+    """Audit rows that it lacks."""
+    oldest_unsent_at: str = ""
+    """Time of the first of these; "" without any."""
+    clock_offset_s: float | None = None
+    """This computer's clock minus the database's; null before the first connection."""
+    fault: str = ""
+    """Why the last attempt failed; "" if it did not."""
+    refusal: str = ""
+    """Why the database refuses the chain; "" if it does not."""
+
+
+_STATE: Final = TypeAdapter(ForwarderState)
+
+
+def load_state(folder: Path) -> ForwarderState:
+    """Read the forwarder's file in the folder of the records' files; the default without one.
+    Raises RecordError.
+    """
+    path = folder / STATE_FILE
+    if not path.exists():
+        return ForwarderState()
+    try:
+        return _STATE.validate_json(read(path, _STATE_MAX_SIZE, error=RecordError))
+    except ValidationError as error:
+        raise RecordError(
+            "The state of sending to the plant cannot be read.",
+            where=printable(str(path)),
+            remedy="Delete the file; it is written again.",
+        ) from error
+
+
+@dataclass
+class _Batch:
+    """Values of the rows that one transaction inserts."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    parts: dict[str, str] = field(default_factory=dict)
+    """Shared parts of runs by their digest."""
+    traces: list[dict[str, Any]] = field(default_factory=list)
+    size_bytes: int = 0
+    """Size of the traces."""
+
+
+@dataclass(frozen=True)
+class _Head:
+    """The last row that the database has of this station, and its clock."""
+
+    station: UUID
+    number: int
+    hash: str
+    now: datetime
+
+
+class Forwarder:
+    """Sends the records of one station. `forward` raises RecordError if the station's records
+    cannot be read; whatever concerns the plant's database is in `state`.
+    """
+
+    def __init__(
+        self,
+        records: Database,
+        files: FileStore,
+        central: Central,
+        station: str,
+        clock: StationClock,
+    ) -> None:
+        self._records = records
+        self._files = files
+        self._central = central
+        self._station = station
+        self._clock = clock
+        self._parts: set[str] = set()
+        """Digests of shared parts that the database has."""
+        self.state = ForwarderState()
+        self.error: RecordError | None = None
+        """Why the last batch was not sent."""
+
+    def close(self) -> None:
+        self._central.close()
+        self._records.close()
+
+    def forward(self) -> bool:
+        """Send a batch, and report the state; True if more rows wait."""
+        self.error = None
+        fault = refusal = ""
+        head: _Head | None = None
+        try:
+            head = self._enter()
+            batch = self._batch_after(head)
+            if batch.rows:
+                self._send(batch)
+                head = self._enter()  # what was committed, not what was sent
+        except ChainRefusedError as error:
+            self._parts.clear()  # an older copy of the database may lack them
+            self.error, refusal = error, error.text
+        except RecordError as error:
+            if error.where != self._central.shown:
+                raise
+            self._parts.clear()
+            self.error, fault = error, error.cause or error.what
+        self._note(head, fault, refusal)
+        self._report()
+        return not (fault or refusal) and self.state.unsent > 0
+
+    def has_new(self) -> bool:
+        """True if the station has rows that were not sent."""
+        with self._records.reading() as local:
+            query = _rows_after(self._station, self.state.sent).limit(1)
+            return local.execute(query).first() is not None
+
+    def _enter(self) -> _Head:
+        """Ask the database for the last row that it has. Raises RecordError."""
+        with self._central.writing() as central:
+            named = {"records": self._records_id, "station": self._station}
+            return _Head(*central.execute(_ENTER, named).one())
+
+    @cached_property
+    def _records_id(self) -> str:
+        with self._records.reading() as local:
+            return str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
+
+    def _batch_after(self, head: _Head) -> _Batch:
+        """Read the rows after the database's last one. Raises ChainRefusedError for a last row that
+        the station does not have.
+        """
+        batch = _Batch()
+        with self._records.reading() as local:
+            if head.number:
+                self._compare(local, head)
+            rows = local.execute(_rows_after(self._station, head.number)).mappings().all()
+            ended = [row["run_id"] for row in rows if row["event"] in chain.ENDINGS]
+            contents = chain.contents_of(local, ended)
+        for row in rows:
+            content = contents.get(row["run_id"]) if row["event"] in chain.ENDINGS else None
+            if content is not None:
+                traces = list(self._traces_of(content))
+                batch.size_bytes += sum(len(each["data"]) for each in traces)
+                if batch.traces and batch.size_bytes > BATCH_BYTES:
+                    break
+                batch.traces += traces
+                for name in SHARED_PARTS:
+                    part = chain.canonical(content[name])
+                    batch.parts[hashlib.sha256(part.encode("ascii")).hexdigest()] = part
+            own = content and chain.canonical({name: content[name] for name in OWN_PARTS})
+            batch.rows.append(
+                {name: row[name] for name in _ROW}
+                | {"station": head.station, "run_number": row["run_id"], "content": own}
+            )
+        return batch
+
+    def _compare(self, local: Connection, head: _Head) -> None:
+        """Compare the database's last row with the station's. Raises ChainRefusedError."""
+        found = chain.hash_at(local, self._station, head.number)
+        if found is None:
+            what = f"the plant has row {head.number}, the station does not"
+            raise ChainRefusedError(Refusal.REPLAYED, what, where=self._central.shown)
+        if found != head.hash:
+            what = f"the plant has row {head.number} with another hash"
+            raise ChainRefusedError(Refusal.FORKED, what, where=self._central.shown)
+
+    def _traces_of(self, content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+        """Attachments of a run. One that is missing or damaged is left out: `plant verify` reports
+        it, and the runs after it are not held up.
+        """
+        for file in content["attachments"]:
+            with suppress(RecordError):
+                yield {"sha256": file["sha256"], "data": self._files.read(file["sha256"])}
+
+    def _send(self, batch: _Batch) -> None:
+        """Insert a batch in one transaction. Raises RecordError."""
+        station = batch.rows[0]["station"]
+        new = [
+            {"station": station, "sha256": sha256, "content": part}
+            for sha256, part in batch.parts.items()
+            if sha256 not in self._parts
+        ]
+        with self._central.writing() as central:
+            for statement, values in (
+                (_ADD_PART, new), (_ADD_TRACE, batch.traces), (_ADD_ROW, batch.rows),
+            ):  # fmt: skip
+                if values:
+                    central.execute(statement, values)
+        self._parts |= {each["sha256"] for each in new}
+
+    # -- state ------------------------------------------------------------------------------------
+
+    def _note(self, head: _Head | None, fault: str, refusal: str) -> None:
+        """Compute the state, and write it to the file."""
+        now, number, offset_s = self._clock.utc(), self.state.sent, self.state.clock_offset_s
+        if head is not None:
+            number, offset_s = head.number, (now - head.now).total_seconds()
+        with self._records.reading() as local:
+            last, oldest = _rest(local, self._station, number)
+        self.state = ForwarderState(
+            utc_text(now), number, last - number, oldest, offset_s, fault, refusal
+        )
+        path = self._files.folder / STATE_FILE
+        part = path.with_suffix(".part")
+        with mapped(printable(str(path)), writes=True):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(_STATE.dump_json(self.state))
+            part.replace(path)  # not flushed to the disk: the next attempt writes it again
+
+    def _report(self) -> None:
+        """Report the state to the database, if it can be reached."""
+        state = self.state
+        if state.fault:
+            return
+        values = {
+            "version": __version__,
+            "unsent": state.unsent,
+            "oldest": state.oldest_unsent_at,
+            "offset_s": state.clock_offset_s,
+            "free": shutil.disk_usage(self._files.folder).free,
+            "refusal": state.refusal,
+        }
+        try:
+            with self._central.writing() as central:
+                central.execute(_REPORT, values)
+        except RecordError as error:
+            self.state = replace(state, fault=error.cause or error.what)
+
+
+def _rows_after(station: str, number: int) -> Any:
+    station_id = select(schema.station.c.id).where(schema.station.c.name == station)
+    return (
+        select(audit)
+        .where(audit.c.station_id == station_id.scalar_subquery(), audit.c.number > number)
+        .order_by(audit.c.number)
+        .limit(BATCH_ROWS)
+    )
+
+
+def _rest(local: Connection, station: str, number: int) -> tuple[int, str]:
+    """Number of the last row, and time of the first row after `number`."""
+    first = local.execute(_rows_after(station, number).limit(1)).mappings().one_or_none()
+    if first is None:
+        return number, ""
+    station_id = select(schema.station.c.id).where(schema.station.c.name == station)
+    last = select(func.max(audit.c.number)).where(
+        audit.c.station_id == station_id.scalar_subquery()
+    )
+    return int(local.execute(last).scalar_one()), str(first["at"])

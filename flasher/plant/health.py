@@ -1,0 +1,36 @@
+"""Checks for the operator page whether a station's records reach the plant."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from flasher.errors import FlasherError
+from flasher.i18n import text
+from flasher.plant.forwarder import load_state
+from flasher.plant.process import RETRY_MAX_S
+from flasher.protocol.text import printable
+from flasher.station.health import HealthCheck
+from flasher.station.records.model import utc_moment
+
+STALE_S: Final = 4 * RETRY_MAX_S
+"""Age of the last attempt after which the process that sends is regarded as dead."""
+
+
+def check(folder: Path, now: datetime) -> HealthCheck:
+    """Check the state that the forwarder has written into the folder of the records' files."""
+    name = text("plant")
+    try:
+        state = load_state(folder)
+    except FlasherError as error:
+        return HealthCheck(name, is_good=False, text=error.what)
+    if state.refusal:
+        sentence = text("REFUSED by the plant: {reason}", reason=printable(state.refusal))
+    elif not state.at or abs((now - utc_moment(state.at)).total_seconds()) > STALE_S:
+        sentence = text("nothing is sent to the plant: the process that sends does not run")
+    elif state.fault:
+        sentence = text("{count} rows wait: the plant cannot be reached", count=state.unsent)
+    else:
+        return HealthCheck(name, is_good=True, text=text("sent to the plant"))
+    return HealthCheck(name, is_good=False, text=sentence)

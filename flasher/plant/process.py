@@ -1,0 +1,117 @@
+"""The process of a station that sends its records to the plant's database."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Final
+
+from flasher.errors import FlasherError
+from flasher.plant.central import Central
+from flasher.plant.forwarder import Forwarder
+from flasher.processes import signals_blocked
+from flasher.station.records.database import locate, open_database
+from flasher.station.records.files import FileStore
+from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
+from flasher.station.records.store import SystemClock
+
+LOOK_S: Final = 1.0
+"""Interval at which the station's records are looked at."""
+REPORT_S: Final = 10.0
+"""Interval at which the state is reported if nothing has to be sent."""
+RETRY_MAX_S: Final = 30.0
+_END_S: Final = 5.0
+"""Time limit for the last batch when the station ends; what is left is sent at the next start."""
+_LOG: Final = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Sending:
+    """What to send, and where to."""
+
+    url: str
+    """The plant's database."""
+    station: str
+    records: str
+    files: Path | None
+
+    def open(self) -> Forwarder:
+        """Open the station's records for reading. Raises UsageError, RecordError."""
+        clock = SystemClock()
+        location = locate(self.records, self.files)
+        central = Central(self.url)
+        records = open_database(
+            location,
+            clock.utc(),
+            lock_timeout_s=DEFAULT_LOCK_TIMEOUT_S,
+            create=False,
+            read_only=True,
+        )
+        return Forwarder(records, FileStore(location.folder), central, self.station, clock)
+
+
+def keep_sending(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
+    """Send what the station records, until `wait` (seconds) returns True; then what is left."""
+    pause_s = LOOK_S
+    is_over = False
+    while not is_over:
+        more = forwarder.forward()
+        state = forwarder.state
+        if more:
+            is_over = wait(0.0)
+            continue
+        if state.fault or state.refusal:
+            pause_s = min(pause_s * 2, RETRY_MAX_S)
+            is_over = wait(pause_s)
+            continue
+        pause_s = waited_s = LOOK_S
+        while not (is_over := wait(LOOK_S)) and waited_s < REPORT_S:
+            if forwarder.has_new():
+                break
+            waited_s += LOOK_S
+    if not (forwarder.state.fault or forwarder.state.refusal) and forwarder.has_new():
+        forwarder.forward()
+
+
+@contextmanager
+def sending(what: Sending) -> Iterator[None]:
+    """Send records in a process of its own while the block runs."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_work, args=(theirs, what), name="plant", daemon=True)
+    with signals_blocked():
+        process.start()
+    theirs.close()
+    try:
+        yield
+    finally:
+        ours.close()  # it then sends what is left
+        process.join(_END_S)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+
+
+def _work(channel: Connection, what: Sending) -> None:
+    with suppress(OSError, AttributeError):
+        os.nice(10)  # units come first
+
+    def wait(limit_s: float) -> bool:
+        """True as soon as the station has ended; a killed one closes the channel too."""
+        return channel.poll(limit_s)
+
+    is_over = False
+    while not is_over:
+        try:
+            with closing(what.open()) as forwarder:
+                keep_sending(forwarder, wait)
+            is_over = True
+        except FlasherError as error:
+            _LOG.warning("nothing is sent to the plant: %s", error)
+            is_over = wait(RETRY_MAX_S)

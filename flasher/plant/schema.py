@@ -1,0 +1,117 @@
+"""Tables of the plant's database: the stations' chains, what their rows refer to, and traces.
+
+The runs are beside them in tables of the station's schema, so that reports and pages read both.
+Only the function `plant_bring` fills those (`functions`); no station has a right to them. A run's
+id there is the time of its begin in microseconds, or the next free number: the order of ids is the
+order of runs, whenever a station could be reached.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    Column,
+    DateTime,
+    Float,
+    Identity,
+    Index,
+    LargeBinary,
+    MetaData,
+    PrimaryKeyConstraint,
+    Table,
+    Text,
+    Uuid,
+    func,
+)
+from sqlalchemy.dialects.postgresql import JSON
+
+from flasher.station.records import schema as station_schema
+
+PLANT_SCHEMA: Final = "1"
+"""The newest Alembic revision in `migrations.versions`."""
+VERSION_TABLE: Final = "plant_version"
+STATION_TABLES: Final = tuple(
+    table
+    for table in station_schema.metadata.sorted_tables
+    if table is not station_schema.audit  # a view of `chain_row`
+)
+
+metadata: Final = MetaData()
+
+plant_station: Final = Table(
+    "plant_station",
+    metadata,
+    Column("role", Text, primary_key=True),
+    Column("name", Text, nullable=False, unique=True),
+    Column("records_id", Text),
+    Column("station", Uuid, unique=True),
+    Column("entered_at", DateTime(timezone=True)),
+    Column("reported_at", DateTime(timezone=True)),
+    Column("version", Text, nullable=False, server_default=""),
+    Column("unsent", BigInteger),
+    Column("oldest_unsent_at", Text),
+    Column("clock_offset_s", Float),
+    Column("disk_free_bytes", BigInteger),
+    Column("refusal", Text, nullable=False, server_default=""),
+)
+"""A station that may send, by its role, and what it reported last. `station` identifies the chain
+of a station in its records; it is set when the station first connects."""
+
+chain_row: Final = Table(
+    "chain_row",
+    metadata,
+    Column("id", BigInteger, Identity(always=True), unique=True, nullable=False),
+    Column("station", Uuid, nullable=False),
+    Column("number", BigInteger, nullable=False),
+    Column("at", Text, nullable=False),
+    Column("event", Text, nullable=False),
+    Column("run_number", BigInteger),
+    Column("data", Text, nullable=False),
+    Column("previous_hash", Text, nullable=False),
+    Column("hash", Text, nullable=False, unique=True),
+    Column("signature", Text, nullable=False),
+    Column("content", JSON),
+    Column("arrived_at", DateTime(timezone=True), nullable=False, server_default=func.now()),
+    Column("station_id", BigInteger),
+    Column("run_id", BigInteger),
+    PrimaryKeyConstraint("station", "number"),
+    Index("chain_row_of_number", "station", "run_number"),
+    Index("ix_chain_row_run_id", "run_id"),
+    Index("chain_row_by_time", "station_id", "at"),
+    Index("chain_row_by_event", "event", "id"),
+)
+"""The stations' audit rows as they were signed. `run_number` is the run's id at the station.
+`content` of the end of a run: the rows of the run as JSON, whose digests the audit row states.
+`station_id` and `run_id` are ids of this database, set by `plant_bring`."""
+
+shared_part: Final = Table(
+    "shared_part",
+    metadata,
+    Column("station", Uuid, nullable=False),
+    Column("sha256", Text, nullable=False),
+    Column("content", Text, nullable=False),
+    PrimaryKeyConstraint("station", "sha256"),
+    CheckConstraint(
+        "sha256 = encode(sha256(convert_to(content, 'UTF8')), 'hex')", name="part_is_whole"
+    ),
+)
+"""Rows that many runs of a station refer to (recipe, operator, images) by their digest."""
+
+trace: Final = Table(
+    "trace",
+    metadata,
+    Column("sha256", Text, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    CheckConstraint("sha256 = encode(sha256(data), 'hex')", name="trace_is_whole"),
+)
+"""Attachments of runs, once each."""
+
+OWN_PARTS: Final = (
+    "run", "unit", "targets", "steps", "measurements", "writes", "attachments",
+)  # fmt: skip
+"""Parts of a run in `chain_row.content`."""
+SHARED_PARTS: Final = ("station", "socket", "operator", "lot", "recipe", "artifacts")
+"""Parts of a run in `shared_part`."""

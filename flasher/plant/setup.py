@@ -1,0 +1,222 @@
+"""Creates the plant's database, its roles, and the stations that may send to it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import datetime
+from importlib import import_module
+from typing import Final
+from uuid import uuid4
+
+from sqlalchemy import Connection, inspect, select, text
+from sqlalchemy.dialects.postgresql import insert
+
+from flasher.errors import ErrorCode, UsageError
+from flasher.plant import functions
+from flasher.plant.central import Central, plant_location
+from flasher.plant.schema import (
+    PLANT_SCHEMA,
+    STATION_TABLES,
+    VERSION_TABLE,
+    metadata,
+    plant_station,
+)
+from flasher.protocol.text import printable
+from flasher.station.records import schema as station_schema
+from flasher.station.records.database import pin_search_path
+from flasher.station.records.model import utc_text
+
+STATIONS: Final = "flasher_stations"
+"""Role with the rights of a station; each station's own role is a member."""
+READERS: Final = "flasher_readers"
+"""Role with the right to read everything."""
+MIGRATIONS: Final = "flasher.plant:migrations"
+_CHANGE_LIMIT_S: Final = 3600.0
+_LOCK: Final = 7053
+
+
+@dataclass(frozen=True)
+class StationRole:
+    """A station and its role."""
+
+    role: str
+    station: str
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What `setup` did."""
+
+    is_new: bool
+    """True if the database was empty before."""
+    created: tuple[StationRole, ...]
+    """Roles that were created; they have no password yet."""
+    stations: tuple[StationRole, ...]
+
+
+def role_of(station: str) -> str:
+    """Name of a station's role."""
+    return "flasher_" + (re.sub(r"[^a-z0-9]+", "_", station.lower()).strip("_") or "station")[:50]
+
+
+def create_database(url: str) -> bool:
+    """Create the database of a URL; False if it exists. Raises UsageError, RecordError."""
+    name = plant_location(url).url.database
+    if not name:
+        raise UsageError("The URL names no database.", remedy="Add /NAME to it, such as /flasher.")
+    with closing(Central(url, database="postgres")) as server, server.outside_transaction() as own:
+        known = text("SELECT 1 FROM pg_database WHERE datname = :name")
+        if own.execute(known, {"name": name}).first() is not None:
+            return False
+        may = text("SELECT rolcreatedb OR rolsuper FROM pg_roles WHERE rolname = current_user")
+        if not own.execute(may).scalar_one():
+            raise UsageError(
+                f"There is no database {printable(name)}, and this user may not create it.",
+                where=server.shown,
+                remedy="An administrator of the server runs what `flasher plant init --print`"
+                " prints.",
+            )
+        own.exec_driver_sql(f"CREATE DATABASE {_quoted(own, name)}")
+    return True
+
+
+def setup(
+    url: str, stations: Sequence[str], now: datetime, *, renewed: Sequence[str] = ()
+) -> Setup:
+    """Create or upgrade the tables, and the roles of `stations`. `renewed`: stations that send from
+    new records from now on. Raises UsageError, RecordError.
+    """
+    with (
+        closing(Central(url, statement_limit_s=_CHANGE_LIMIT_S)) as central,
+        central.writing() as connection,
+    ):
+        connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        pin_search_path(connection)
+        is_new = _bring_up_to_date(connection, central, now)
+        for role in (STATIONS, READERS):
+            _make(connection, role)
+        _execute(connection, *functions.FUNCTIONS)
+        database = connection.execute(text("SELECT current_database()")).scalar_one()
+        quoted = [_quoted(connection, each) for each in (database, STATIONS, READERS)]
+        _execute(connection, functions.rights(*quoted))
+        made, named = [], []
+        for station in dict.fromkeys((*stations, *renewed)):
+            role = _add_station(connection, station)
+            named.append(StationRole(role, station))
+            if _make(connection, role, logs_in=True):
+                made.append(StationRole(role, station))
+            connection.exec_driver_sql(
+                f"GRANT {_quoted(connection, STATIONS)} TO {_quoted(connection, role)}"
+            )
+            _check_role(connection, role)
+        for station in renewed:
+            connection.execute(
+                plant_station.update()
+                .where(plant_station.c.name == station)
+                .values(station=None, records_id=None, entered_at=None)
+            )
+    return Setup(is_new, tuple(made), tuple(named))
+
+
+def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -> bool:
+    """Create all tables, or run missing migrations; True if they were created."""
+    tables = inspect(connection).get_table_names()
+    if VERSION_TABLE in tables:
+        _migrate(connection, central)
+        return False
+    if tables:
+        raise UsageError(
+            f"The database {central.location.shown} holds other data.",
+            cause=f"it has the table {printable(tables[0])}",
+            remedy="Name a database of its own for the plant; init creates it.",
+            code=ErrorCode.RECORDS,
+        )
+    station_schema.metadata.create_all(connection, STATION_TABLES)
+    metadata.create_all(connection)
+    _execute(connection, *functions.FUNCTIONS, functions.ONCE)
+    # As in a station's records: pages check this version.
+    version = station_schema.SCHEMA_VERSION
+    connection.execute(
+        station_schema.schema_info.insert().values(
+            version=version, created_at=utc_text(now), records_id=uuid4().hex
+        )
+    )
+    connection.execute(station_schema.alembic_version.insert().values(version_num=str(version)))
+    _alembic(connection, "stamp")
+    return True
+
+
+def _migrate(connection: Connection, central: Central) -> None:
+    query = text(f"SELECT version_num FROM {VERSION_TABLE}")  # noqa: S608  a constant
+    found = str(connection.execute(query).scalar_one_or_none())
+    if found.isdecimal() and int(found) > int(PLANT_SCHEMA):
+        raise UsageError(
+            f"The plant's database has schema {found}; this flasher has schema {PLANT_SCHEMA}.",
+            where=central.location.shown,
+            cause="a newer flasher made it",
+            remedy="Use that newer flasher.",
+            code=ErrorCode.RECORDS_VERSION,
+        )
+    _alembic(connection, "upgrade")
+
+
+def _alembic(connection: Connection, action: str) -> None:
+    command, config = import_module("alembic.command"), import_module("alembic.config").Config()
+    config.set_main_option("script_location", MIGRATIONS)
+    config.attributes["connection"] = connection
+    getattr(command, action)(config, PLANT_SCHEMA)
+
+
+def _add_station(connection: Connection, name: str) -> str:
+    """Register a station; returns its role. Raises UsageError."""
+    table = plant_station.c
+    role = role_of(name)
+    connection.execute(insert(plant_station).values(role=role, name=name).on_conflict_do_nothing())
+    query = select(table.name).where(table.role == role)
+    found = connection.execute(query).scalar_one_or_none()
+    if found != name:
+        raise UsageError(
+            f"The station {printable(name)} would have the role {role} of the station"
+            f" {printable(str(found))}.",
+            remedy="Give the stations names that differ in letters or digits.",
+        )
+    return role
+
+
+def _make(connection: Connection, role: str, *, logs_in: bool = False) -> bool:
+    """Create a role; False if it exists."""
+    known = text("SELECT 1 FROM pg_roles WHERE rolname = :role")
+    if connection.execute(known, {"role": role}).first() is not None:
+        return False
+    word = "LOGIN" if logs_in else "NOLOGIN"
+    connection.exec_driver_sql(f"CREATE ROLE {_quoted(connection, role)} {word}")
+    return True
+
+
+def _check_role(connection: Connection, role: str) -> None:
+    """Check that a station's role has no further rights. Raises UsageError."""
+    query = text(
+        "SELECT rolsuper OR rolbypassrls OR rolcreaterole OR rolreplication OR"
+        " pg_has_role(:role, (SELECT relowner FROM pg_class WHERE oid = 'chain_row'::regclass),"
+        " 'MEMBER') OR pg_has_role(:role, :readers, 'MEMBER')"
+        " FROM pg_roles WHERE rolname = :role"
+    )
+    if connection.execute(query, {"role": role, "readers": READERS}).scalar_one():
+        raise UsageError(
+            f"The role {printable(role)} has more rights than a station may have.",
+            cause="it is a superuser, the owner of the records, a reader, or may make roles",
+            remedy="Take these rights away, or name the station differently.",
+        )
+
+
+def _quoted(connection: Connection, name: str) -> str:
+    return str(connection.dialect.identifier_preparer.quote(name))
+
+
+def _execute(connection: Connection, *statements: str) -> None:
+    """Execute SQL that may contain %."""
+    for statement in statements:
+        connection.execution_options(no_parameters=True).exec_driver_sql(statement)

@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.plant.factory import Plant, Sender
+from tests.station.postgres import Server
+
+
+@pytest.fixture
+def plant(postgres: Server, tmp_path: Path) -> Plant:
+    """A plant's database for the stations line-2 and line-3, with nothing in it."""
+    return Plant(postgres, tmp_path)
+
+
+@pytest.fixture
+def sender(plant: Plant) -> Iterator[Sender]:
+    """Line-2 with its forwarder."""
+    made = plant.sender("line-2")
+    yield made
+    made.close()
