@@ -115,6 +115,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("manifest", "create", Path("image.bin"), "-t", "obc"),
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),
         ("trust", "show"),
+        ("plant", "init", "--database", "postgresql://x@h/plant", "--station", "line-2", "--print"),
         ("release", "build", Path("bike.wfw"), "--image", "obc=stated.bin", "--product", "X",
          "--counter", "1"),
         ("explain", Path("upgrade.log")),

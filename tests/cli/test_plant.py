@@ -1,0 +1,154 @@
+"""`flasher plant`: database and roles, the state of the stations, sending."""
+
+from __future__ import annotations
+
+import io
+import json
+import sqlite3
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ExitCode
+from flasher.plant.process import Sending, sending
+from tests.cli.conftest import Flasher
+from tests.cli.station_threads import ThreadPort
+from tests.cli.test_schema import hold_output
+from tests.plant.conftest import plant, sender
+from tests.plant.factory import PASSWORD, Plant, Sender
+from tests.schema_document import SCHEMA
+from tests.station.factory import USUAL, write_recipe
+from tests.station.postgres import Server
+
+__all__ = ["plant", "sender"]
+pytestmark = pytest.mark.slow
+STATION = """\
+name = "line-2"
+plant = "{plant}"
+
+[[socket]]
+name = "A"
+mock = {{ bad = 0.0, seed = 7 }}
+"""
+
+
+def test_init_creates_what_is_missing_and_prints_the_rest(
+    flasher: Flasher, postgres: Server
+) -> None:
+    url = postgres.url("plant_by_command").replace("+psycopg", "")
+    of_role = url.replace("postgres@", "flasher_line_8@")
+    run = flasher("plant", "init", "--database", url, "--station", "line 8")
+    assert run.code == ExitCode.OK
+    assert run.out.splitlines() == [
+        "created the database plant_by_command",
+        "created the tables",
+        "line 8: created its role, flasher_line_8",
+        "-- in psql, a password for each new role (stations read theirs from ~/.pgpass):",
+        "\\password flasher_line_8",
+        "# in pg_hba.conf, above lines that allow more:",
+        "hostssl plant_by_command flasher_line_8 samenet scram-sha-256",
+        "# in the station file of line 8:",
+        f'plant = "{of_role}?sslmode=verify-full"',
+    ]
+    again = flasher("plant", "init", "--database", url, "--station", "line 8", "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), again.out, again.code)
+    assert again.document["is_new"] is False
+    assert not any("password" in line for line in again.document["to_run"])
+
+
+def test_status_and_send(flasher: Flasher, plant: Plant) -> None:
+    url = plant.url("flasher_desk")
+    never = flasher("plant", "status", "--database", url)
+    assert never.out.splitlines() == [
+        "line-2: has never connected", "line-3: has never connected",
+    ]  # fmt: skip
+    made = plant.sender("line-2")
+    made.bench.make()
+    made.close()
+    file = made.folder / "station.toml"
+    keys = 'keys = "keys"\n'
+    file.write_text(keys + STATION.format(plant=plant.url("flasher_line_2")), encoding="utf-8")
+    sent = flasher("plant", "send", "--sockets", file)
+    assert (sent.code, sent.out) == (ExitCode.OK, "everything is sent: 4 rows\n")
+    run = flasher("plant", "status", "--database", url)
+    assert run.code == ExitCode.OK
+    first, row, *_ = run.out.splitlines()
+    assert first.startswith("line-2: reported ")
+    assert row.startswith("  last row:  4, of 2026-05-17T09:00:08")
+    both = flasher("plant", "status", "--database", url, "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), both.out, both.code)
+    assert PASSWORD not in both.out + run.out + sent.out + sent.err
+
+
+def test_a_refused_chain_is_named_by_send_and_by_status(
+    flasher: Flasher, plant: Plant, sender: Sender
+) -> None:
+    sender.bench.make()
+    sender.close()
+    file = sender.folder / "station.toml"
+    text = STATION.format(plant=plant.url("flasher_line_3"))
+    file.write_text(text, encoding="utf-8")
+    run = flasher("plant", "send", "--sockets", file)
+    assert run.code == ExitCode.USAGE
+    assert "refuses this station's audit trail, foreign" in run.err
+    assert PASSWORD not in run.err
+    status = flasher("plant", "status", "--database", plant.url("flasher_desk"))
+    assert status.code == ExitCode.VERIFICATION
+    assert "  REFUSED: foreign: the user flasher_line_3 is not the user of station line-2" in (
+        status.out.splitlines()
+    )
+
+
+def test_a_station_file_without_a_plant_says_what_to_add(flasher: Flasher, tmp_path: Path) -> None:
+    file = tmp_path / "station.toml"
+    file.write_text(STATION.replace('plant = "{plant}"\n', "").format(), encoding="utf-8")
+    run = flasher("plant", "send", "--sockets", file)
+    assert run.code == ExitCode.USAGE
+    assert "names no plant" in run.err
+
+
+def test_a_server_that_is_away_is_named_without_the_password(flasher: Flasher) -> None:
+    run = flasher("plant", "status", "--database", f"postgresql://x:{PASSWORD}@127.0.0.1:1/plant")
+    assert run.code == ExitCode.USAGE
+    assert "The plant's database cannot be read" in run.err
+    assert PASSWORD not in run.err
+
+
+def test_a_station_sends_while_it_runs(
+    flasher: Flasher, plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The forwarder is a real process."""
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    file = tmp_path / "station.toml"
+    text = 'keys = "keys"\n' + STATION.format(plant=plant.url("flasher_line_2"))
+    file.write_text(text, encoding="utf-8")
+    recipe = write_recipe(tmp_path, USUAL)
+    words = ("station", "run", "--recipe", recipe, "--sockets", file, "--units", "2")
+    run = flasher(*words, "--mock-speed", "0", "--operator", "jo")
+    assert run.code == ExitCode.OK, run.err
+    assert plant.rows("SELECT state, count(*) FROM run GROUP BY state") == [("PASS", 2)]
+    with closing(sqlite3.connect(tmp_path / "records.sqlite")) as records:
+        hashes = records.execute("SELECT hash FROM audit ORDER BY number").fetchall()
+    assert plant.rows("SELECT hash FROM chain_row ORDER BY number") == hashes
+
+
+def test_a_station_without_the_server_passes_its_units(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    file = tmp_path / "station.toml"
+    text = STATION.format(plant="postgresql://x@127.0.0.1:1/plant")
+    file.write_text('keys = "keys"\n' + text, encoding="utf-8")
+    recipe = write_recipe(tmp_path, USUAL)
+    words = ("station", "run", "--recipe", recipe, "--sockets", file, "--units", "1")
+    run = flasher(*words, "--mock-speed", "0", "--operator", "jo")
+    assert run.code == ExitCode.OK, run.err
+
+
+def test_the_process_ends_with_a_station_that_had_no_records(tmp_path: Path) -> None:
+    with sending(Sending("postgresql://x@127.0.0.1:1/p", "line-2", str(tmp_path / "no"), None)):
+        pass

@@ -1,0 +1,100 @@
+# ruff: noqa: S608, ISC004  all of this SQL is written here
+"""Somebody who has a station's password changes, deletes and reads nothing, and writes only what
+continues that station's own chain.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import psycopg
+import pytest
+
+from flasher.plant.functions import REFUSED
+from tests.plant.factory import Plant
+
+_ROW = "INSERT INTO chain_row (station, number, at, event, data, previous_hash, hash, signature)"
+_MINE = "plant_my_station()"
+_THEIRS = "'{theirs}'::uuid"
+_HASH = "repeat('a', 64)"
+DENIED, POLICY = "42501", "42501"
+ATTEMPTS = {
+    "read the records": ("SELECT * FROM run", DENIED),
+    "read the chains": ("SELECT * FROM chain_row", DENIED),
+    "read the audit trail": ("SELECT * FROM audit", DENIED),
+    "read traces": ("SELECT * FROM trace", DENIED),
+    "read other stations": ("SELECT * FROM plant_station", DENIED),
+    "change a run": ("UPDATE run SET state = 'PASS'", DENIED),
+    "change a row of the chain": ("UPDATE chain_row SET data = ''", DENIED),
+    "delete a run": ("DELETE FROM run", DENIED),
+    "delete rows of the chain": ("DELETE FROM chain_row", DENIED),
+    "empty the chains": ("TRUNCATE chain_row", DENIED),
+    "empty the runs": ("TRUNCATE run CASCADE", DENIED),
+    "delete traces": ("DELETE FROM trace", DENIED),
+    "add a run beside the chain": (
+        "INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W2605099')", DENIED,
+    ),
+    "become another station": (f"UPDATE plant_station SET station = {_MINE}", DENIED),
+    "enter as another station": ("SELECT plant_enter('{records}', 'line-3')", REFUSED),
+    "send from other records": ("SELECT plant_enter('other', 'line-2')", REFUSED),
+    "write the chain of another station": (
+        f"{_ROW} VALUES ({_THEIRS}, 99, '', 'sign-in', '', {_HASH}, {_HASH}, '')", REFUSED,
+    ),
+    "write parts for another station": (
+        f"INSERT INTO shared_part VALUES ({_THEIRS}, encode(sha256('x'), 'hex'), 'x')", POLICY,
+    ),
+    "fork the own chain": (
+        f"{_ROW} VALUES ({_MINE}, 2, '', 'sign-in', '', {_HASH}, {_HASH}, '')", REFUSED,
+    ),
+    "leave rows out": (
+        f"{_ROW} VALUES ({_MINE}, 99, '', 'sign-in', '', {_HASH}, {_HASH}, '')", REFUSED,
+    ),
+    "add a row with a false hash": (
+        f"{_ROW} VALUES ({_MINE}, 5, '', 'sign-in', '', '{{head}}', {_HASH}, '')", REFUSED,
+    ),
+    "overwrite a row": (
+        f"{_ROW} VALUES ({_MINE}, 4, '', 'sign-in', '', {_HASH}, {_HASH}, '')"
+        " ON CONFLICT (station, number) DO UPDATE SET data = 'x'", DENIED,
+    ),
+    "store another trace under a hash": (
+        f"INSERT INTO trace VALUES ({_HASH}, 'x')", "23514",
+    ),
+    "take the checks away": ("ALTER TABLE chain_row DISABLE TRIGGER ALL", DENIED),
+    "take row level security away": ("ALTER TABLE chain_row DISABLE ROW LEVEL SECURITY", DENIED),
+    "replace a function": (
+        "CREATE OR REPLACE FUNCTION plant_my_station() RETURNS uuid LANGUAGE sql AS"
+        " 'SELECT gen_random_uuid()'", DENIED,
+    ),
+    "hide a table": ("CREATE TEMPORARY TABLE plant_station (role text)", DENIED),
+    "add a run by the inner function": ("SELECT plant_add_run('{{}}', '{{}}')", DENIED),
+    "become the owner": ("SET ROLE postgres", DENIED),
+    "make roles": ("CREATE ROLE another SUPERUSER", DENIED),
+}  # fmt: skip
+
+
+def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
+    sender, other = plant.sender("line-2"), plant.sender("line-3")
+    for each in (sender, other):
+        each.bench.make()
+        each.send()
+        each.close()
+    ((theirs,),) = plant.rows("SELECT station FROM plant_station WHERE name = 'line-3'")
+    ((records,),) = plant.rows("SELECT records_id FROM plant_station WHERE name = 'line-2'")
+    query = "SELECT hash FROM chain_row c JOIN plant_station p USING (station)"
+    ((head,),) = plant.rows(query + " WHERE name = 'line-2' ORDER BY number DESC LIMIT 1")
+    before = _everything(plant)
+    found = {}
+    with plant.connect("flasher_line_2") as attacker:
+        attacker.autocommit = True
+        for name, (statement, _) in ATTEMPTS.items():
+            known = {"theirs": theirs, "records": records, "head": head}
+            with pytest.raises(psycopg.Error) as caught:
+                attacker.execute(statement.format(**known).encode())
+            found[name] = caught.value.sqlstate
+    assert found == {name: state for name, (_, state) in ATTEMPTS.items()}
+    assert _everything(plant) == before
+
+
+def _everything(plant: Plant) -> dict[str, list[tuple[Any, ...]]]:
+    tables = ("chain_row", "shared_part", "trace", "plant_station", "run", "unit", "station")
+    return {table: plant.rows(f"SELECT * FROM {table} ORDER BY 1, 2") for table in tables}
