@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.profile_time import limits_of
 from flasher.conformance.results import CaseLimitReached, DeviceCrashed, RunStopped, TraceEntry
-from flasher.conformance.subject import BusPort
+from flasher.conformance.subject import SIMULATED_BUS, BusPort
 from flasher.conformance.waits import Waits
 from flasher.conformance.wire import (
     UPDATE,
@@ -52,7 +52,7 @@ _UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE
 _NO_READ: Final = re.compile(rb"\x55\xaa[^\x11\x0c]", re.DOTALL)
 """Start of a message that is neither read nor report."""
 _POLL_S: Final = 0.2
-"""Longest single wait, so that a stop request is noticed soon."""
+"""Longest single wait in real time, so that a stop request is noticed soon."""
 
 
 class FaultKind(Enum):
@@ -125,6 +125,7 @@ class BusTester:
         self.left_at = self.began_at
         """End of the last frame sent."""
         self._stopped = stopped
+        self._poll_s = inf if port.timestamp_source == SIMULATED_BUS else _POLL_S
         self._stall_s = self.waits.stall_s
         self._stalled_s = 0.0
         self._left_port_at = self.began_at
@@ -295,7 +296,7 @@ class BusTester:
     # -- inside -----------------------------------------------------------------------------------
 
     def _pump(self, deadline: float) -> None:
-        """Receive one frame, or let time pass until `deadline` or for `_POLL_S`."""
+        """Receive one frame, or let time pass until `deadline` or for `_poll_s`."""
         port = self.port
         now = port.now()
         if now >= self.ends_at:
@@ -305,7 +306,7 @@ class BusTester:
         if self._stopped():
             raise RunStopped("the run was stopped")
         self._note_stall(now - self._left_port_at)
-        until = float(min(deadline, self.ends_at, now + _POLL_S))
+        until = float(min(deadline, self.ends_at, now + self._poll_s))
         try:
             arrival = port.receive(until)
         except DeviceCrashed:

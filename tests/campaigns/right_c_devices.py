@@ -11,16 +11,19 @@ import random
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from flasher.conformance.dut.subject import CompiledSubject, open_subject
+from flasher.conformance.dut.process import BootloaderProcess
+from flasher.conformance.dut.subject import CompiledSubject
 from flasher.conformance.profile import ConformanceProfile, Limits, Value
+from tests.campaigns.right_c_in_process import CALLS, LoadedBootloader
 
 _SOURCES: Final = Path(__file__).parent / "right_c"
+_IN_PROCESS: Final = _SOURCES.with_name("right_c_in_process.c")
 _DUT: Final = Path(__file__).parents[2] / "flasher" / "conformance" / "dut"
 _LIMITS: Final = Limits()
 _US: Final = 1_000_000
@@ -59,13 +62,13 @@ class RightCDevice:
         }
 
     @contextmanager
-    def subject(self) -> Iterator[CompiledSubject]:
-        """It on its bench."""
-        program = _build(self.choices, self.boot_version)
-        with open_subject(str(program), self.target, None, good_image=None, second_image=None) as (
-            made,
-            _,
-        ):
+    def subject(
+        self, kind: type[BootloaderProcess] = LoadedBootloader
+    ) -> Iterator[CompiledSubject]:
+        """It on its bench, loaded into this process or as users run theirs."""
+        path = _build(self.choices, self.boot_version, is_library=kind is LoadedBootloader)
+        with closing(kind(str(path))) as process:
+            made = CompiledSubject(process, self.target)
             for ability in _BARE if self.is_bare else ():
                 setattr(made, ability, False)
             yield made
@@ -308,17 +311,21 @@ def _stated(choices: Choices) -> dict[str, Value]:
 # -- building --------------------------------------------------------------------------------------
 
 
-def _build(choices: Choices, boot_version: str) -> Path:
-    """The program of these choices; one that exists is taken."""
+def _build(choices: Choices, boot_version: str, *, is_library: bool) -> Path:
+    """The program or library of these choices; one that exists is taken."""
     macros = [f"-D{name}={value}" for name, value in choices.items()]
     macros.append(f'-DBOOT_VERSION="{boot_version}"')
     sources = [*sorted(_SOURCES.glob("*.c")), _DUT / "flasher_dut_process.c"]
     command = ["cc", "-std=c11", "-O1", "-Wall", "-Wextra", f"-I{_DUT}", *macros]
-    contents = b"".join(path.read_bytes() for path in sorted(_SOURCES.iterdir()))
+    if is_library:
+        sources.append(_IN_PROCESS)
+        wrapped = ",".join(f"--wrap={name}" for name in CALLS)
+        command += ["-shared", "-fPIC", "-Dmain=bootloader_main", f"-Wl,-z,now,{wrapped}"]
+    contents = b"".join(path.read_bytes() for path in sorted(_SOURCES.iterdir()) + sources)
     name = hashlib.sha256(repr(command).encode() + contents).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / "right_c"
     folder.mkdir(exist_ok=True)
-    program = folder / name
+    program = folder / f"{name}{'.so' if is_library else ''}"
     if not program.exists():
         made = program.with_suffix(f".{os.getpid()}")
         command += [*map(str, sources), "-o", str(made)]

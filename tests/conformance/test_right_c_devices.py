@@ -10,12 +10,14 @@ import shutil
 import pytest
 
 from flasher.conformance.catalogue import Selection
+from flasher.conformance.dut.process import BootloaderProcess
 from flasher.conformance.explore import Explorer
 from flasher.conformance.init import ask_device
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from tests.campaigns.right_c_devices import right_c_device
+from tests.campaigns.right_c_in_process import LoadedBootloader
 from tests.campaigns.right_devices import faults_of
 from tests.loops import each
 
@@ -53,6 +55,15 @@ def test_a_seed_makes_the_same_device_again() -> None:
 )
 def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
     assert faults_of(seed, Selection(cases=(case_id,)), make=right_c_device) == []
+
+
+def test_a_bootloader_that_is_loaded_into_this_process_behaves_as_its_program() -> None:
+    device, found = right_c_device(19), []
+    for kind in (LoadedBootloader, BootloaderProcess):
+        with device.subject(kind) as subject:
+            report = run(subject, device.profiles["fitting"], selection=Selection(quick=True))
+        found.append([(result.verdict, result.trace) for result in report.results])
+    assert found[0] == found[1]
 
 
 def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> None:
@@ -138,6 +149,9 @@ def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without
         (9, "fitting", "power update=300 end"),
         (9, "fitting", "reset cut=1 update=384 packet"),
         (18, "fitting", "reset update-reset update=384 packets=all"),
+        # A pause counts from the packet, whose ACK comes 0.5 s later.
+        (24, "fitting", "reset update=good packet update=good update=300 update=good"),
+        (24, "default", "reset update=128 packets=4 packet-zero end-mark packet-start"),
     ),
 )
 def test_a_walk_finds_nothing(seed: int, profile: str, steps: str) -> None:

@@ -413,3 +413,10 @@ def test_walks_know_that_a_pause_may_count_from_the_last_packet_stored() -> None
     explorer = Explorer(subject(CountsFromPackets, device), profile_of_mock(device), seed="1")
     steps = ["reset", "update=128", "packet", "wait=1", "packet-again", "wait=1"]
     assert explorer.replay([*steps, "packet-mode"]).finding is None
+
+
+def test_walks_know_that_a_pause_may_end_while_they_wait() -> None:
+    device = dataclasses.replace(MOCK_PROFILE, transfer_timeout_s=2.5)
+    explorer = Explorer(subject(CountsFromPackets, device), profile_of_mock(device), seed="1")
+    steps = ["reset", "update=128", "packet", "wait=1", "wait=0.3", "wait=2"]
+    assert explorer.replay(steps).finding is None

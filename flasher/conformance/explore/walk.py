@@ -123,7 +123,9 @@ class Walk:
         self._announced = 0
         """Boot versions of the burst so far."""
         self._stored_at = bench.now
-        """Time of the last request transfer or stored packet, from which a pause may count."""
+        """Time of the last request transfer, or end of the last packet that was stored, from which
+        a pause may count.
+        """
 
     def take(self, name: str, argument: str = "") -> None:
         """Take a step of `STEPS`, or send an invalid message. Raises Violation and errors of the
@@ -170,9 +172,13 @@ class Walk:
                 self._await_start()
             elif self.has_application is None:
                 self.phase, self._may_restart = DevicePhase.UNCLEAR, True
-        pause_s = bench.now - self._stored_at
-        left_s = min(0.8 * bench.limit("pause_s"), bench.limit("pause_s") - bench.waits.settle_s)
-        may_end = bench.choice("tx_12") != "waits" and pause_s > left_s
+        self._apply_pause(bench.limit("pause_s") - bench.waits.settle_s)
+
+    def _apply_pause(self, begins_s: float = inf) -> None:
+        """A pause that ends a transfer may be over, from `begins_s` on."""
+        bench = self.bench
+        begins_s = min(0.8 * bench.limit("pause_s"), begins_s)
+        may_end = bench.choice("tx_12") != "waits" and bench.now - self._stored_at > begins_s
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = DevicePhase.UNCLEAR, True
 
@@ -261,6 +267,7 @@ class Walk:
         self._naks_due -= 1
 
     def _judge_version(self, reply: Received) -> None:
+        self._apply_pause()
         is_leftover = reply.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
@@ -290,7 +297,7 @@ class Walk:
 
     def _store(self) -> None:
         self._stored += 1
-        self._stored_at = self.bench.now
+        self._stored_at = self.bench.tester.left_at
         if self.phase is not DevicePhase.UNCLEAR:
             is_last = self._stored == packet_count(len(self._image))
             self.phase = DevicePhase.STORED if is_last else DevicePhase.TRANSFER
