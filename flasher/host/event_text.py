@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher import events
+from flasher.host.identity import WAY_BACK
 from flasher.i18n import text
 from flasher.wording import wording, wording_of
 
@@ -90,8 +91,10 @@ def progress_line(event: object) -> tuple[str, int] | None:
             return again, level
         case events.BootVersionSeen(name, version):
             return text("boot version: {name} {version}", name=name, version=version), 0
-        case events.CheckMade(_, verdict, sentence):
-            return f"check: {verdict}: {sentence}", 1 if verdict == "passed" else 0
+        case events.CheckMade(check, verdict, sentence):
+            # The way back must be known before the erase.
+            is_usual = verdict == "passed" and check != WAY_BACK
+            return f"check: {verdict}: {sentence}", 1 if is_usual else 0
         case events.AdapterBack():
             return text("the adapter is back"), 0
         case events.HostStalled(stalled_s):

@@ -27,6 +27,7 @@ from flasher.protocol.text import FirmwareVersion, printable
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_MINIMUM_CHARGE_PERCENT: Final = 5
 """An upgrade takes a minute or two; near 0 % the battery may switch itself off within it."""
+WAY_BACK: Final = "way-back"
 DEFAULT_IN_USE_MA: Final = 1000
 """Discharge current in mA: more than lights and displays use, less than the motor."""
 
@@ -42,6 +43,8 @@ class IdentityCheck(Enum):
     SAME_VERSION = "same-version"
     IN_USE = "in-use"
     CHARGE = "low-charge"
+    WAY_BACK = WAY_BACK
+    """An image of the version that runs now."""
     UNSIGNED = "unsigned"
     """Rules of the trust file: signatures before, counters with the device."""
 
@@ -149,6 +152,8 @@ class Identity:
     """Processor type of the device, for the plausibility check."""
     provenance: Provenance | None = None
     """Result of checking the image against the trust file; None without one."""
+    images_here: Mapping[str, str] | None = None
+    """Files of this computer by the firmware version inside; None where nobody looked."""
 
     def matches_bytes(self, image: Image) -> bool:
         """True if the manifest contains the SHA-256 of this image."""
@@ -264,6 +269,7 @@ def judge_device(
     else:
         yield _hardware(identity, answers.hardware_version)
         yield from _versions(image, identity, answers.firmware_version or "")
+        yield from _way_back(image, target, identity, answers.firmware_version or "")
         yield from _counter(identity, str(getattr(answers.version, "serial_number", "")))
     if answers.running is not None:
         yield from _state(identity, answers.running)
@@ -349,6 +355,35 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
     else:
         sentence = text("{new} is newer than {running}, which runs now", new=new, running=running)
         yield CheckResult(IdentityCheck.DOWNGRADE, CheckVerdict.PASSED, sentence)
+
+
+def _way_back(
+    image: Image, target: Target, identity: Identity, running: str
+) -> Iterator[CheckResult]:
+    """Report whether this computer has an image of the version that is replaced."""
+    files = identity.images_here
+    if files is None or not running or running == new_version(image, identity.release):
+        return
+    if running in files:
+        sentence = text(
+            "{file} on this computer has {running}, which runs now",
+            file=files[running],
+            running=running,
+        )
+        yield CheckResult(IdentityCheck.WAY_BACK, CheckVerdict.PASSED, sentence)
+        return
+    sentence = text(
+        "no image of {running}, which runs now, was found on this computer: there is no way back",
+        running=running,
+    )
+    if target.has_version_query:
+        sentence = text(
+            "no image of {running}, which runs now, was found on this computer: a backup of the "
+            "{node} before, with its memory, is a way back",
+            running=running,
+            node=target.node.name,
+        )
+    yield CheckResult(IdentityCheck.WAY_BACK, CheckVerdict.UNKNOWN, sentence)
 
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:

@@ -22,7 +22,14 @@ from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
 from flasher.history import Flash
 from flasher.host.event_text import progress_line, warning_text
-from flasher.host.identity import OF_STATE, DeviceAnswers, judge_device, new_version
+from flasher.host.identity import (
+    OF_STATE,
+    CheckResult,
+    DeviceAnswers,
+    IdentityCheck,
+    judge_device,
+    new_version,
+)
 from flasher.host.outcome import AGAIN
 from flasher.host.query import memory_bytes
 from flasher.i18n import text, with_value
@@ -38,6 +45,7 @@ from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
 from flasher.trace.watcher import MessageTable, Pulse, Watcher
+from flasher.way_back import images_here
 from flasher.web.bench_state import (
     Activity,
     Adapter,
@@ -144,6 +152,8 @@ class BenchController:
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
         self._has_new_files = threading.Event()
+        self._images_here: dict[str, str] = {}
+        """Files of this computer by the firmware version inside."""
         self._last_image: Path | None = None
         """Image that was dropped or selected last, since an upgrade began."""
         self._is_closing = self._ends_at_once = False
@@ -299,7 +309,9 @@ class BenchController:
         self._set(doing=Activity.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
-        for path in self._backend.images():
+        paths = self._backend.images()
+        self._images_here = images_here(self.state.target or BMS, paths)
+        for path in paths:
             if self._cancelled():
                 break
             offers.append(self._judged(path))
@@ -413,7 +425,7 @@ class BenchController:
         try:
             job = self._job(path, self.state.target)
             self._check_sample(job.plan.image)
-            self._check_device(job)
+            found = [*job.checks, *self._check_device(job)]
         except FlasherError as error:
             return Offer(path, refusal=error)
         image, provenance = job.plan.image, job.identity.provenance
@@ -424,7 +436,7 @@ class BenchController:
             job.plan.total_packets,
             job.plan.wire_s,
             image.sha256,
-            tuple(found.event for found in job.checks),
+            tuple(each.event for each in found),
             waived=job.waived,
             origin=text("the image is not signed") if provenance is None else provenance.text,
             warnings=() if provenance is None else provenance.warnings,
@@ -436,13 +448,14 @@ class BenchController:
         profile = self._backend.profile(target)
         rate = self._backend.bitrate_bps(self._adapter())
         name = visible(path.name)
-        return prepare(
+        job = prepare(
             path,
             profile,
             bitrate_bps=rate,
             at_power_up=self.state.is_rescue,
             waived=[waiver for waived, waiver in self.state.waived if waived == name],
         ).checked()
+        return replace(job, identity=replace(job.identity, images_here=self._images_here))
 
     def _check_sample(self, image: Image) -> None:
         """Refuse a firmware sample on a real bus; the upgrade checks again. Raises ImageError."""
@@ -450,13 +463,14 @@ class BenchController:
         if is_sample(image) and self._backend.is_physical(adapter):
             raise sample_error(image, adapter.name)
 
-    def _check_device(self, job: Job) -> None:
+    def _check_device(self, job: Job) -> list[CheckResult]:
         """Refuse an image of another device than the one that answered; the upgrade asks again.
-        Raises WrongDeviceError.
+        Return what is known of the way back. Raises WrongDeviceError.
         """
         bike = self.state.bike
         if bike is None or self.state.is_rescue or job.plan.target is not bike.target:
-            return
+            return []
+        way_back = []
         answers = (each.answer for each in bike.readings)
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         seen = DeviceAnswers(bike.version, running)
@@ -464,6 +478,9 @@ class BenchController:
             error = None if found.check in OF_STATE else refusal(job.plan, found)
             if error is not None:
                 raise error
+            if found.check is IdentityCheck.WAY_BACK:
+                way_back.append(found)
+        return way_back
 
     def upgrade(self, target: str, sha256: str) -> None:
         """Upgrade with the image of this digest, as chosen when the button was pressed. Raises

@@ -141,7 +141,8 @@ def test_a_right_manifest_lets_every_check_pass_and_says_so(bench: Workbench) ->
     assert "check: passed: by the manifest the image is for the BMS" in run.err
     assert "check: passed: the manifest lists hardware V1r2r0_20220512" in run.err
     assert f"check: passed: {NEW} is newer than {OLD}, which runs now" in run.err
-    assert "check: unknown" not in run.err
+    (unknown,) = [line for line in run.err.splitlines() if "check: unknown" in line]
+    assert "no image of" in unknown, "the way back is no rule of a manifest"
 
 
 @pytest.mark.parametrize(
@@ -322,3 +323,24 @@ def test_a_dry_run_says_what_the_image_says_of_the_target_and_asks_nobody(
     assert stage.heard == []
     run = bench.flash(stage, "--dry-run", manifest={"target": "obc"})
     assert run.code == ExitCode.WRONG_DEVICE
+
+
+# -- the way back ---------------------------------------------------------------------------------
+
+
+def test_an_image_to_go_back_to_is_named_before_anything_is_erased(
+    bench: Workbench, tmp_path: Path
+) -> None:
+    run = bench.flash(Stage())
+    assert f"check: unknown: no image of {OLD}, which runs now, was found" in run.err
+    assert run.err.index("no image of") < run.err.index("resetting the application")
+    old = tmp_path / "old.bin"
+    old.write_bytes(image_of(4, OLD).data)
+    run = bench.flash(Stage())
+    assert f"check: passed: {old} on this computer has {OLD}, which runs now" in run.err
+
+
+def test_the_version_that_is_flashed_again_needs_no_way_back(bench: Workbench) -> None:
+    stage = Stage()
+    assert bench.flash(stage).code == ExitCode.OK
+    assert "which runs now" not in bench.flash(stage).err

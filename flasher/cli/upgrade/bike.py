@@ -172,6 +172,7 @@ class BikeUpgrade:
         is_possible = wanted and Level(wanted) in possible_levels(part.target, options)
         return self.choices.job(
             part.opened,
+            part.path,
             profile,
             self.bus,
             allow_outside_vector=self.image.allow_outside_vector,

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Final
 
 import click
@@ -47,6 +48,7 @@ from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.settings.profile import Profile, load_profile
+from flasher.way_back import images_beside, images_here
 
 DOCUMENTS: Final = (UpgradeDocument, DryRunDocument, BikeDocument)
 _FLASH_EXAMPLES: Final = """\
@@ -199,6 +201,7 @@ class UpgradeChoices:
     def job(
         self,
         opened: api.OpenedImage,
+        path: str | Path,
         profile: Profile,
         bus: Bus,
         *,
@@ -208,7 +211,9 @@ class UpgradeChoices:
         power_up_timeout_s: float | None = None,
         skip_same_version: bool = False,
     ) -> api.Job:
-        """Prepare the upgrade of a device. Raises ImageError and UsageError."""
+        """Prepare the upgrade of a device with the image of a file. Raises ImageError and
+        UsageError.
+        """
         waived = [name for name in OF_DEVICE if self.allows(name)]
         waived += [OUTSIDE_VECTOR] * (allow_outside_vector or self.force)
         waived += [UNSIGNED] * self.allow_unsigned
@@ -224,6 +229,7 @@ class UpgradeChoices:
                 waived=self.waived_checks(),
                 skip_same_version=skip_same_version,
                 reports_unchecked=at_power_up,
+                images_here=images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES)),
             ),
             at_power_up=at_power_up,
             waived=waived,
@@ -352,6 +358,7 @@ class _Upgrade:
             self.bus = choose_adapter(self.bus, output)
         job = choices.job(
             opened,
+            self.image.image,
             profile,
             self.bus,
             allow_outside_vector=self.image.allow_outside_vector,

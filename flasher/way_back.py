@@ -1,0 +1,91 @@
+"""Images on this computer by the firmware version inside: the way back from an upgrade.
+
+Files are searched for the text of a version, not loaded: that takes milliseconds for a folder. An
+image that is flashed later is checked like any other.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from flasher.errors import FlasherError
+from flasher.files import read
+from flasher.history import FlashHistory
+from flasher.protocol.spec import Target
+from flasher.protocol.text import find_firmware_version, printable
+from flasher.release.places import SUFFIX as RELEASE_SUFFIX
+
+FILES_MAX: Final = 100
+"""Maximum number of files that are searched, the newest of a folder first."""
+_SIZE_MAX: Final = 8 * 1024 * 1024
+"""Maximum size of a searched file in bytes: more than the largest image as Intel HEX needs."""
+_TEXT_START: Final = {
+    b":": 9,  # Intel HEX: length, address and type
+    b"S1": 8,
+    b"S2": 10,
+    b"S3": 12,
+}
+"""Place of the first data digit in a record, by its beginning."""
+
+
+def images_here(target: Target, files: Iterable[Path]) -> dict[str, str]:
+    """Return the files with images for a target on this computer, by firmware version: those of its
+    upgrades that are still in their places, then `files`.
+    """
+    found: dict[str, str] = {}
+    with suppress(FlasherError, OSError):
+        for flash in FlashHistory().flashes()[0]:
+            began = flash.began
+            path = Path(began.folder) / began.image
+            version = began.image_version or ""
+            is_there = began.target == target.name and path.is_file()
+            if is_there and version in _versions(path, target):
+                found[version] = printable(str(path))
+    for path in files:
+        for version in _versions(path, target):
+            found.setdefault(version, printable(str(path)))
+    return found
+
+
+def images_beside(image: str | os.PathLike[str], suffixes: Iterable[str]) -> list[Path]:
+    """Return the possible images in the folder of an image, the newest first."""
+    wanted = {f".{suffix}" for suffix in suffixes}
+    found = []
+    with suppress(OSError):
+        for entry in os.scandir(Path(image).parent):
+            with suppress(OSError):
+                if Path(entry.name).suffix.lower() in wanted and entry.is_file():
+                    found.append((entry.stat().st_mtime, Path(entry.path)))
+    return [path for _, path in sorted(found, reverse=True)[:FILES_MAX]]
+
+
+def _versions(path: Path, target: Target) -> Iterator[str]:
+    """Yield the versions of a file's images for a target; an unreadable file has none."""
+    with suppress(FlasherError, OSError):
+        if path.suffix.lower() == RELEASE_SUFFIX:
+            from flasher.release.verify import open_package  # noqa: PLC0415  for releases alone
+
+            stated = open_package(path).statement.images.get(target)
+            if stated is not None and stated[1].firmware_version:
+                yield stated[1].firmware_version
+            return
+        version = find_firmware_version(_contents(read(path, _SIZE_MAX)))
+        if version is not None:
+            yield version
+
+
+def _contents(raw: bytes) -> bytes:
+    """Return the bytes of hexadecimal records; any other file as it is."""
+    if not raw.startswith((b":", b"S")):
+        return raw
+    data = []
+    for line in raw.splitlines():
+        start = _TEXT_START.get(line[:1]) or _TEXT_START.get(line[:2])
+        if start is not None:
+            with suppress(ValueError):
+                data.append(bytes.fromhex(line[start:-2].decode("ascii", "replace")))
+    return b"".join(data)
