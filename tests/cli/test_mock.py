@@ -667,7 +667,7 @@ def test_a_bootloader_that_crashes_is_reported_once_and_starts_again(
             host.interrupt()
 
     monkeypatch.setattr(host, "mock_listens", interrupt_at_last)
-    run = serve_bootloader("tests.conformance.test_subject:EndsAtOnce")
+    run = serve_bootloader("tests.conformance.wrong_bootloaders:EndsAtOnce")
     assert run.code == ExitCode.OK
     assert run.out.count("state:   bootloader: reset\n") >= 2
     assert run.err.splitlines()[1:] == [

@@ -12,7 +12,6 @@ from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, TraceEntry
 from flasher.conformance.runner import run
 from flasher.conformance.wire import Encoder, RawFrame, split
-from tests.peers.python_bootloader import PythonBootloader
 
 _BMS = Encoder("bms")
 _VERSION = b"\x55\xaa\x0c\x0b\xc1\x09BMSV1.0.0"
@@ -132,15 +131,9 @@ def test_messages_that_are_right_are_counted() -> None:
     assert _diagnosis(*frames).endswith(" correct messages: request transfer, ACK 1")
 
 
-class StartsAtZero(PythonBootloader):
-    """Its CRC starts with 0 in both directions."""
-
-    crc_start = 0
-
-
 @pytest.mark.slow
 def test_bring_up_fails_with_the_diagnosis_and_its_trace() -> None:
-    name = "tests.conformance.test_diagnosis:StartsAtZero"
+    name = "tests.conformance.wrong_bootloaders:StartsAtZero"
     with open_subject(name, "bms", None, good_image=None, second_image=None) as (subject, profile):
         report = run(subject, profile, selection=Selection(cases=("BR-01", "TX-01")))
     bring_up, other = report.results

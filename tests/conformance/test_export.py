@@ -22,56 +22,8 @@ from flasher.conformance.mock import MockSubject, model_of_profile, profile_of_m
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.runner import run
 from tests.cli.conftest import Flasher
-from tests.peers.python_bootloader import PythonBootloader
 
-_FLAWS = "tests.conformance.test_export:"
-
-
-class AcceptsAnyName(PythonBootloader):
-    def _act(self, mode: int, command: bytes, data: bytes) -> None:
-        if command == b"\xa1\x0b":
-            data = b"BMS_UPD" + data[7:]
-        super()._act(mode, command, data)
-
-
-class IgnoresAnEarlyEnd(PythonBootloader):
-    def _end(self) -> None:
-        if self._stored == -(-self._size // 128):
-            super()._end()
-
-
-class SpoilsSmallImages(PythonBootloader):
-    def _end(self) -> None:
-        if self._size == 128:
-            self.host.flash_erase(0x1000)
-            self.host.flash_write(0x1000, bytes(8))
-        super()._end()
-
-
-class WritesOldPacketsAgain(PythonBootloader):
-    def _store(self, data: bytes) -> None:
-        if data[1] <= self._stored:
-            self.host.flash_write(0x1000, bytes(8))
-        super()._store(data)
-
-
-class BootsSlowly(PythonBootloader):
-    """Announces itself 20 ms apart, which only a check of times finds."""
-
-    def tick(self, now_us: int) -> int | None:
-        due_at = super().tick(now_us)
-        if self._announced and self._stored < 0 and due_at is not None:
-            self._due_at = min(self._due_at, now_us + 20_000)
-            return self._due_at
-        return due_at
-
-
-class AcceptsPacketsBeyondTheLast(PythonBootloader):
-    def _store(self, data: bytes) -> None:
-        if data[1] > -(-self._size // 128):
-            self._send(b"\xc2\x02", data[1:3])
-        else:
-            super()._store(data)
+_FLAWS = "tests.conformance.wrong_bootloaders:"
 
 
 def exported(subject: str, case_id: str) -> ExportedTest:
@@ -134,7 +86,7 @@ def test_a_time_is_no_test_in_c() -> None:
 @pytest.mark.slow
 def test_what_needs_more_than_frames_is_no_test_in_c() -> None:
     with pytest.raises(NotExportableError, match="The frames alone do not show"):
-        exported("tests.conformance.test_subject:ClaimsToHandleErrors", "PW-04")
+        exported("tests.conformance.wrong_bootloaders:ClaimsToHandleErrors", "PW-04")
 
 
 @pytest.mark.slow

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +14,11 @@ from flasher.conformance.parallel import run_in_processes
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import RunObserver, SuiteOptions
 from tests.cli.conftest import Flasher
-from tests.peers.python_bootloader import PythonBootloader
 
 from .bench import PROFILE
 
 CASES = ("FR-02", "RS-01", "UP-03", "TX-01", "TX-03", "EN-02", "PW-02", "SP-01")
 WRONG = ("conformance", "-t", "bms", "--mock", "--variant", "accepts-early-end")
-
-
-class KillsItsSuite(PythonBootloader):
-    def start(self, host: object, cause: int) -> None:
-        os.kill(os.getppid(), signal.SIGKILL)
 
 
 def _without_times(document: dict[str, Any]) -> dict[str, Any]:
@@ -74,7 +66,7 @@ def test_a_stop_ends_all_processes() -> None:
 
 @pytest.mark.slow
 def test_a_process_that_is_killed_ends_the_run_and_nothing_passes(flasher: Flasher) -> None:
-    subject = f"{__name__}:KillsItsSuite"
+    subject = "tests.conformance.wrong_bootloaders:KillsItsSuite"
     line = ("conformance", "-t", "bms", "--subject", subject)
     ran = flasher(*line, "--jobs", "2", "--case", "RS-01", "--case", "TX-01")
     assert ran.code not in (0, 1)

@@ -62,7 +62,7 @@ def test_the_good_image_runs_after_a_replay(trace: Path) -> None:
 
 @pytest.mark.slow
 def test_a_crash_is_a_finding(flasher: Flasher, trace: Path) -> None:
-    subject = "tests.conformance.test_subject:Raises"
+    subject = "tests.conformance.wrong_bootloaders:Raises"
     ran = flasher("conformance", "replay", trace, "-t", "bms", "--subject", subject)
     assert ran.code == 12
     assert "ZeroDivisionError" in ran.out

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
-import signal
-import struct
 import subprocess
 import sys
-import zlib
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,7 +13,7 @@ from typing import Any
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.dut import CanFrame, Facts, Host
+from flasher.conformance.dut import Facts
 from flasher.conformance.dut.device import CompiledDevice
 from flasher.conformance.dut.pipes import ABI, FACTS, HEADER, PipeMessage
 from flasher.conformance.dut.subject import open_subject
@@ -25,189 +21,15 @@ from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import run
 from flasher.errors import UsageError
 from tests.cli.conftest import Flasher
-from tests.peers.python_bootloader import PythonBootloader
+
+from . import wrong_bootloaders
 
 _HERE = "tests.peers.python_bootloader:PythonBootloader"
-_FLAWS = "tests.conformance.test_subject:"
+_FLAWS = "tests.conformance.wrong_bootloaders:"
 _NULL = """
 void *flasher_dut_about(void) { return 0; }
 int flasher_dut_start, flasher_dut_receive, flasher_dut_tick, flasher_dut_next_frame;
 """
-
-
-class Hangs(PythonBootloader):
-    def receive(self, frame: object) -> None:
-        while self._stored == 2:
-            pass
-        super().receive(frame)  # type: ignore[arg-type]
-
-
-class Raises(PythonBootloader):
-    def _end(self) -> None:
-        self.host.log("about to divide")
-        self._size //= 0
-
-
-class WritesTwice(PythonBootloader):
-    def _store(self, data: bytes) -> None:
-        super()._store(data)
-        self.host.flash_write(0x1000, bytes(8))
-
-
-class ReadsOutside(PythonBootloader):
-    def _end(self) -> None:
-        self.host.flash_read(0xFFF0, 32)
-
-
-class EndsAtOnce(PythonBootloader):
-    def start(self, host: object, cause: int) -> None:
-        os._exit(3)
-
-
-class SaysNothing(PythonBootloader):
-    def next_frame(self) -> None:
-        return None
-
-
-class LogsForEver(PythonBootloader):
-    def _end(self) -> None:
-        while True:
-            self.host.log("x" * 4096)
-
-
-class EndsItsGroup(PythonBootloader):
-    """Receives the signal that `timeout` or a cancelled build sends to the process group."""
-
-    def _begin(self, size: int) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            os.kill(os.getpid(), number)
-        super()._begin(size)
-
-
-def raises() -> PythonBootloader:
-    raise RuntimeError("no hardware today")
-
-
-def returns_nothing() -> None:
-    pass
-
-
-NOT_CALLABLE = 5
-
-
-class StartsWhatIsTorn(PythonBootloader):
-    """Trusts a record that it writes before the packets."""
-
-    def _begin(self, size: int) -> None:
-        super()._begin(size)
-        self.host.flash_erase(0)
-        self.host.flash_write(0, bytes(8))
-
-    def _end(self) -> None:
-        self._send(b"\xc5\x02", bytes(2))
-        self._is_starting = True
-
-    def _is_whole(self) -> bool:
-        return self.host.flash_read(0, 8) == bytes(8)
-
-
-class WaitsForTheClock(PythonBootloader):
-    """Polls the time, as code without timers does."""
-
-    def _send(self, command: bytes, data: bytes) -> None:
-        began_at = self.host.now_us()
-        while self.host.now_us() < began_at + 1000:
-            pass
-        super()._send(command, data)
-
-
-class LosesComplete(PythonBootloader):
-    """Starts the application before its last answer has left."""
-
-    def _end(self) -> None:
-        super()._end()
-        self.host.start_application()
-
-
-class RecordsAfterComplete(PythonBootloader):
-    """Writes the record of an image as soon as complete has left the controller."""
-
-    def _end(self) -> None:
-        self._send(b"\xc5\x02", bytes(2))
-        self._start_application()
-
-    def tick(self, now_us: int) -> int | None:
-        is_due = self._is_starting and self._stored > 0
-        if is_due and not self._frames and not self.host.transmit_pending():
-            self._stored = 0
-            check = zlib.crc32(self.host.flash_read(0x1000, self._size))
-            self.host.flash_write(0, struct.pack("<IIII", 0x600DC0DE, self._size, check, 0))
-        due_us = super().tick(now_us)
-        return now_us + 100 if self._is_starting else due_us
-
-
-class SendsWithoutEnd(PythonBootloader):
-    """Always has another frame to send, with the number of pending frames, and never waits."""
-
-    def tick(self, now_us: int) -> None:
-        pass
-
-    def next_frame(self) -> CanFrame:
-        return CanFrame(0x725, bytes((self.host.transmit_pending(),)))
-
-
-class Restarts(PythonBootloader):
-    """Resets itself during a transfer."""
-
-    def _store(self, data: bytes) -> None:
-        if self._stored == 3:
-            self.host.reset()
-        super()._store(data)
-
-
-class ErasesForEach(PythonBootloader):
-    """Erases for 6 s for each update command before packet 1, and requests the transfer again."""
-
-    facts = dataclasses.replace(PythonBootloader.facts, erase_us=3_000_000)
-
-    def _begin(self, size: int) -> None:
-        self._size = 0
-        super()._begin(size)
-
-
-class ClaimsToHandleErrors(PythonBootloader):
-    """Ignores what the flash reports, like the bootloader for the older interface."""
-
-    facts = dataclasses.replace(PythonBootloader.facts, abi=2)
-
-
-class HandlesErrors(ClaimsToHandleErrors):
-    """Rejects an image that the flash does not hold."""
-
-    def start(self, host: Host, cause: int) -> None:
-        super().start(host, cause)
-        self._received = b""
-
-    def _begin(self, size: int) -> None:
-        super()._begin(size)
-        self._received = b""
-
-    def _store(self, data: bytes) -> None:
-        before = self._stored
-        super()._store(data)
-        if self._stored > before:
-            self._received += data[5:][: self._size - before * 128]
-
-    def _end(self) -> None:
-        if self.host.flash_read(0x1000, self._size) == self._received:
-            check = zlib.crc32(self._received)
-            record = struct.pack("<IIII", 0x600DC0DE, self._size, check, 0)
-            if self.host.flash_write(0, record) and self._is_whole():
-                self._send(b"\xc5\x02", bytes(2))
-                self._start_application()
-                return
-        self._nak()
-        self._stored, self._size, self._announced = -1, 0, 0
 
 
 def _run(subject: str, *cases: str) -> RunReport:
@@ -244,14 +66,6 @@ def test_one_that_ignores_errors_of_its_flash_fails_and_one_that_compares_passes
     assert report.ok, _failures(report)
 
 
-class RunsEachMillisecond(PythonBootloader):
-    """Names no due time, like a main loop without timers, and polls the time in each pass."""
-
-    def tick(self, now_us: int) -> int:
-        super().tick(now_us)
-        return self.host.now_us()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "cases", [("RS-01", "RS-05", "UP-04"), ("EN-02", "TX-12"), ("BU-02", "PW-02")]
@@ -278,14 +92,6 @@ def test_idle_passes_in_its_own_process_change_nothing(
         traces.append([result.trace for result in report.results])
     assert traces[0] == traces[1]
     assert calls[0] < calls[1] / 2
-
-
-class SaysNothingEachMillisecond(PythonBootloader):
-    def tick(self, now_us: int) -> int:
-        return now_us
-
-    def next_frame(self) -> None:
-        return None
 
 
 @pytest.mark.slow
@@ -357,12 +163,6 @@ def test_a_second_call_that_does_not_return_is_ended_sooner(
     assert "within 0.1 s of real time" in _failures(report)
 
 
-class PrintsForEver(PythonBootloader):
-    def _end(self) -> None:
-        while True:
-            os.write(1, b"x" * 4096)
-
-
 @pytest.mark.slow
 def test_a_bootloader_that_prints_without_end_is_ended_before_the_disk_is_full(
     monkeypatch: pytest.MonkeyPatch,
@@ -386,27 +186,12 @@ def test_a_crash_is_printed_whole_and_once(flasher: Flasher, tmp_path: Path) -> 
     assert junit.read_text("utf-8").count("\n  SUMMARY: message.c:70") == 2
 
 
-class IsSanitized(PythonBootloader):
-    """Ends like a program stopped by AddressSanitizer."""
-
-    def _end(self) -> None:
-        os.write(2, b"ERROR: AddressSanitizer: stack-buffer-overflow\nSUMMARY: message.c:70\n")
-        os.write(2, b"Shadow bytes around the buggy address:\n  0x10002bbe8e50: 00 00 f1\n")
-        os._exit(1)
-
-
 @pytest.mark.slow
 def test_the_report_of_a_sanitizer_is_told_without_its_dump() -> None:
     report = _run(_FLAWS + "IsSanitized", "EN-01")
     found = _failures(report) + report.not_upgradable + report.stopped
     assert "stack-buffer-overflow | SUMMARY: message.c:70)" in found
     assert "Shadow" not in found
-
-
-class ReadsForEver(PythonBootloader):
-    def _end(self) -> None:
-        while True:
-            self.host.flash_read(0, 0x1000)
 
 
 @pytest.mark.slow
@@ -466,7 +251,10 @@ def test_no_process_is_left_behind() -> None:
         ("missing", "There is no bootloader missing"),
         ("nowhere:make", "No module named 'nowhere'"),
         (_FLAWS + "nothing", "has no attribute 'nothing'"),
-        (_FLAWS + "raises", f"RuntimeError: no hardware today ({__file__}, line "),
+        (
+            _FLAWS + "raises",
+            f"RuntimeError: no hardware today ({wrong_bootloaders.__file__}, line ",
+        ),
         (_FLAWS + "returns_nothing", "it returns None, which has no `facts`"),
         (_FLAWS + "NOT_CALLABLE", "'int' object is not callable"),
         ("README.md", "not a program or shared library"),
@@ -478,6 +266,26 @@ def test_what_is_no_bootloader_is_said_at_once(subject: str, said: str) -> None:
         _run(subject, "RS-01")
     assert said in f"{raised.value} {raised.value.cause}"
     assert "Traceback" not in raised.value.cause
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "reported"),
+    [
+        ("import os; os._exit(3)", "does not start: the bootloader ended with status 3"),
+        ("while True: pass", "does not start: its module was not loaded within 0.5 s"),
+    ],
+)
+def test_a_module_that_does_not_load_is_refused(
+    module: str, reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.conformance.dut.process._SPAWNER_S", 0.5)
+    (tmp_path / "boot_module.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = _children()
+    with pytest.raises(UsageError, match=reported):
+        _run("boot_module:make", "RS-01")
+    assert _children() <= before
 
 
 def test_a_factory_is_not_to_be_built_from_c() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,8 @@ from flasher.simulate.plan import Plan
 from flasher.simulate.play import Player, Verdict, play
 from flasher.simulate.subject import SubjectBench, source_of
 from tests.loops import each
-from tests.peers.python_bootloader import PythonBootloader
+
+from . import wrong_bootloaders
 
 RIGHT = "tests.peers.python_bootloader:PythonBootloader"
 JOB = "job packets=3 ; subject"
@@ -28,84 +28,11 @@ ERASES = 3
 """Flash operations before the first packet of `JOB`: the record, and a sector."""
 
 
-class ReportsErrors(PythonBootloader):
-    """Its flash reports errors, which it handles by a restart."""
-
-    facts = replace(PythonBootloader.facts, abi=2)
-
-    def start(self, host: object, cause: int) -> None:
-        super().start(_Restarting(host), cause)  # type: ignore[arg-type]
-
-
-class _Restarting:
-    def __init__(self, host: object) -> None:
-        self._host = host
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._host, name)
-
-    def flash_erase(self, offset: int) -> None:
-        self._host.flash_erase(offset) or self._host.reset()  # type: ignore[attr-defined]
-
-    def flash_write(self, offset: int, data: bytes) -> None:
-        self._host.flash_write(offset, data) or self._host.reset()  # type: ignore[attr-defined]
-
-
-class IgnoresErrors(PythonBootloader):
-    facts = ReportsErrors.facts
-
-
-class ForgetsTheRecord(PythonBootloader):
-    """It starts what it received, until the power fails."""
-
-    def _end(self) -> None:
-        write = self.host.flash_write
-        self.host.flash_write = lambda _offset, _data: True  # type: ignore[method-assign,assignment]
-        super()._end()
-        self.host.flash_write = write  # type: ignore[method-assign]
-
-
-class TrustsTheRecord(PythonBootloader):
-    """It erases the record last, and does not check what it stands for."""
-
-    def _begin(self, size: int) -> None:
-        erase = self.host.flash_erase
-        offsets: list[int] = []
-
-        def note(offset: int) -> bool:
-            offsets.append(offset)
-            return True
-
-        self.host.flash_erase = note  # type: ignore[method-assign]
-        super()._begin(size)
-        self.host.flash_erase = erase  # type: ignore[method-assign]
-        for offset in reversed(offsets):
-            erase(offset)
-
-    def _is_whole(self) -> bool:
-        return self.host.flash_read(0, 4) != b"\xff" * 4
-
-
-class Crashes(PythonBootloader):
-    def _store(self, data: bytes) -> None:
-        super()._store(data)
-        self._size // (self._stored - 2)
-
-
-class Hangs(PythonBootloader):
-    def _store(self, data: bytes) -> None:
-        while True:
-            pass
-
-
-class Deaf(PythonBootloader):
-    def _take_messages(self) -> None:
-        pass
-
-
 @contextmanager
 def bench_of(what: type | str) -> Iterator[SubjectBench]:
-    bench = SubjectBench(what if isinstance(what, str) else f"{__name__}:{what.__name__}", "bms")
+    bench = SubjectBench(
+        what if isinstance(what, str) else f"{what.__module__}:{what.__name__}", "bms"
+    )
     try:
         yield bench
     finally:
@@ -148,13 +75,13 @@ def test_a_power_cut_in_any_flash_operation_leaves_no_more_than_an_empty_device(
 
 def test_flash_that_reports_errors_is_no_success() -> None:
     fault = "@end flash-fails count=9"
-    assert played(ReportsErrors, f"{JOB} ; {fault}").is_good
-    wrong = played(IgnoresErrors, f"{JOB} ; {fault}")
+    assert played(wrong_bootloaders.ReportsErrors, f"{JOB} ; {fault}").is_good
+    wrong = played(wrong_bootloaders.IgnoresErrors, f"{JOB} ; {fault}")
     assert "FALSE: success, and the device has none" in map(str, wrong.violations)
 
 
 def test_what_the_flash_holds_is_what_is_started_after_a_power_up() -> None:
-    with bench_of(ForgetsTheRecord) as bench:
+    with bench_of(wrong_bootloaders.ForgetsTheRecord) as bench:
         verdict = play(Plan.parse("job packets=3 ; subject application=none"), bench=bench)
     assert {*map(str, verdict.violations)} == {
         "FALSE: success, and the device has none",
@@ -164,7 +91,7 @@ def test_what_the_flash_holds_is_what_is_started_after_a_power_up() -> None:
 
 def test_a_start_of_half_an_image_is_found() -> None:
     plan = Plan.parse(f"{JOB} ; @flash2 restart")
-    with bench_of(TrustsTheRecord) as bench:
+    with bench_of(wrong_bootloaders.TrustsTheRecord) as bench:
         first, second = play(plan, bench=bench), play(plan, bench=bench)
     assert [*map(str, first.violations)] == [
         "SUBJECT: the bootloader started an incomplete application"
@@ -173,19 +100,19 @@ def test_a_start_of_half_an_image_is_found() -> None:
 
 
 def test_a_crash_names_the_call_and_what_the_bootloader_printed() -> None:
-    text = found(Crashes, "job packets=3 ; subject application=none")
+    text = found(wrong_bootloaders.Crashes, "job packets=3 ; subject application=none")
     assert text.startswith("SUBJECT: the bootloader ended with status 1 in flasher_dut_receive")
     assert "ZeroDivisionError" in text
 
 
 def test_a_call_that_does_not_return_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "WATCHDOG_S", 0.3)
-    text = found(Hangs, "job packets=3 ; subject application=none")
+    text = found(wrong_bootloaders.Hangs, "job packets=3 ; subject application=none")
     assert "did not return from flasher_dut_receive" in text
 
 
 def test_a_bootloader_that_takes_no_application_is_a_finding_in_each_plan() -> None:
-    text = found(Deaf, JOB)
+    text = found(wrong_bootloaders.Deaf, JOB)
     assert text.startswith("SUBJECT: its first upgrade, without faults, with -t bms, ends in ")
 
 
@@ -254,7 +181,7 @@ def test_a_violation_is_shrunk_and_replayed_by_its_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(campaign, "CANARY_RUNS", 60)
-    subject = f"{__name__}:TrustsTheRecord"
+    subject = "tests.simulate.wrong_bootloaders:TrustsTheRecord"
     assert main(["simulate", "--subject", subject, "--runs", "100"]) == ExitCode.PARTIAL
     line = next(each for each in capsys.readouterr().out.splitlines() if "replay: " in each)
     head, _, plan = line.partition(f"flasher simulate replay --subject {subject} ")

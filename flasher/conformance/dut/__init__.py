@@ -3,7 +3,7 @@
 `flasher_dut.h` documents the interface; `flasher_dut_process.c` makes a program of a bootloader in
 C that implements it. This module is the same interface for Python: `--subject MODULE:FACTORY` names
 a function without arguments that returns a `Bootloader`. It is called for every start of the
-device, since RAM is lost.
+device, since RAM is lost, each time in a new process; its module is loaded once for all of them.
 """
 
 from __future__ import annotations

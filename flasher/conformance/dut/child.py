@@ -1,20 +1,33 @@
-"""Main program of the child process of a bootloader that is a shared library or Python code; the
-counterpart of `flasher_dut_process.c`.
+"""Main program of the process of a bootloader that is a shared library or Python code, and of the
+spawner, which forks it; the counterpart of `flasher_dut_process.c`.
 """
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import importlib
 import os
+import signal
+import socket
 import sys
+import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
+from struct import Struct
 from typing import Any, ClassVar, Final, Never, cast
 
 from flasher.conformance.dut import Bootloader, CanFrame, Facts, SubjectError, pipes
 from flasher.conformance.dut.pipes import Pipe, PipeMessage
 
+FORK: Final = b"f"
+END: Final = Struct("<d")
+EXIT_CODE: Final = Struct("<i")
+"""Messages between suite and spawner, which begins with `FORK`: fork a process for the two files of
+its pipe; end it after so many seconds; how it ended.
+"""
+_WAIT_S: Final = 0.01
 _FUNCTIONS: Final = tuple(
     f"flasher_dut_{name}" for name in ("about", "start", "receive", "tick", "next_frame")
 )
@@ -171,13 +184,8 @@ class _Library:
 def _make(subject: str) -> Bootloader:
     if os.path.exists(subject):  # noqa: PTH110  as the suite has seen it
         return cast("Bootloader", _Library(subject))
-    name, _, attribute = subject.partition(":")
-    sys.path.insert(0, os.getcwd())  # noqa: PTH109  as for `python -m`
     try:
-        found = importlib.import_module(name)
-        for part in attribute.split("."):
-            found = getattr(found, part)
-        made = cast("Callable[[], Bootloader]", found)()
+        made = _factory(subject)()
     except (Exception, SystemExit) as error:  # whatever the code of a user raises
         last = traceback.extract_tb(error.__traceback__)[-1]
         is_its = last.filename != __file__ and not last.filename.startswith("<")
@@ -188,6 +196,14 @@ def _make(subject: str) -> Bootloader:
     return made
 
 
+def _factory(subject: str) -> Callable[[], Bootloader]:
+    name, _, attribute = subject.partition(":")
+    found = importlib.import_module(name)
+    for part in attribute.split("."):
+        found = getattr(found, part)
+    return cast("Callable[[], Bootloader]", found)
+
+
 def _next(pipe: Pipe) -> tuple[PipeMessage, bytes]:
     """Read the next message; ends the process when the suite has ended."""
     while (found := pipe.take()) is None:
@@ -196,7 +212,79 @@ def _next(pipe: Pipe) -> tuple[PipeMessage, bytes]:
     return found
 
 
-def serve(subject: str, pipe: Pipe) -> Never:
+def end_process(process: int, after_s: float) -> int:
+    """Wait `after_s` for the end of a child process, then kill it; return its exit code."""
+    give_up_at = time.perf_counter() + after_s
+    while not (ended := os.waitpid(process, os.WNOHANG))[0]:
+        if time.perf_counter() >= give_up_at:
+            os.kill(process, signal.SIGKILL)
+            ended = os.waitpid(process, 0)
+            break
+        time.sleep(_WAIT_S)
+    return os.waitstatus_to_exitcode(ended[1])
+
+
+def spawner_command(*words: str | int) -> list[str]:
+    """Command that runs `fork_each` with its arguments, and finds the modules that this process
+    finds.
+    """
+    program = (
+        "import sys; sys.path[:] = sys.argv[5:]; "
+        f"from {__name__} import fork_each; fork_each(sys.argv[1], *map(int, sys.argv[2:5]))"
+    )
+    return [sys.executable, "-c", program, *map(str, words), *sys.path]
+
+
+def fork_each(subject: str, is_program: int, control_fd: int, file_max_size: int) -> Never:
+    """Fork a process for each start that the suite asks for, until the suite has ended."""
+    import resource  # noqa: PLC0415  Windows has none, and no bootloader under test
+
+    # Inherited by the processes. The suite ends them.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (file_max_size, file_max_size))
+    sys.path.insert(0, os.getcwd())  # noqa: PTH109  as for `python -m`
+    if not os.path.exists(subject):  # noqa: PTH110  a library loads quickly, and may begin threads
+        with suppress(Exception, SystemExit):  # each start reports it
+            _factory(subject)
+    gc.freeze()  # else each process copies what the collector touches
+    suite = socket.socket(fileno=control_fd)
+    suite.send(FORK)
+    while True:
+        asked, files, _, _ = socket.recv_fds(suite, len(FORK), 2)
+        if not asked:
+            os._exit(0)
+        process = os.fork()
+        if not process:
+            suite.close()
+            _become_bootloader(subject, *files, is_program=bool(is_program))
+        for file in files:
+            os.close(file)
+        if not (asked := suite.recv(END.size)):
+            os._exit(0)
+        suite.send(EXIT_CODE.pack(end_process(process, *END.unpack(asked))))
+
+
+def _become_bootloader(subject: str, read_fd: int, write_fd: int, *, is_program: bool) -> Never:
+    try:
+        if not is_program:
+            _serve(subject, Pipe(read_fd, write_fd))
+        os.dup2(read_fd, 0)
+        os.dup2(write_fd, 1)
+        try:
+            os.execv(subject, [subject])  # noqa: S606  chosen by the user
+        except OSError as error:
+            raise SubjectError(f"this computer cannot run it: {error.strerror}") from error
+    except SubjectError as error:
+        os.write(2, str(error).encode(errors="replace"))
+    except BaseException:  # noqa: BLE001  the spawner goes on in its own process alone
+        os.write(2, traceback.format_exc(limit=-2).encode())
+    finally:
+        os._exit(1)
+
+
+def _serve(subject: str, pipe: Pipe) -> Never:
     """Run one start of the bootloader until it ends. `subject` is the path of a library or
     MODULE:FACTORY.
     """

@@ -5,14 +5,18 @@ from __future__ import annotations
 import os
 import select
 import signal
+import socket
+import subprocess
 import tempfile
-import traceback
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Final, Never
+from typing import Final
 
-from flasher.conformance.dut import Facts, SubjectError, pipes
+from flasher.conformance.dut import Facts, pipes
+from flasher.conformance.dut.child import END, EXIT_CODE, FORK, end_process, spawner_command
 from flasher.conformance.dut.pipes import Pipe, PipeMessage
 from flasher.conformance.results import LINE_JOINT
 from flasher.errors import FlasherError, UsageError, printable
@@ -21,7 +25,8 @@ WATCHDOG_S: Final = 5.0
 """A call that takes longer in real time counts as not returning."""
 _AFTER_HANG_S: Final = 0.5
 """The same once a call of this bootloader has not returned: most cases meet the same loop."""
-_WAIT_S: Final = 0.01
+_SPAWNER_S: Final = 10.0
+"""Real time in which a bootloader's module has to be loaded, and a process to end."""
 _OUTPUT_SIZE: Final = 65_536
 _LINES: Final = 80
 _LINE_SIZE: Final = 240
@@ -64,7 +69,10 @@ class BootloaderProcess:
                 remedy="Link it with flasher_dut_process.c, or as a shared library (.so).",
             )
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as this object
-        self._process: int | None = None
+        self._end: Callable[[float], int] | None = None
+        """Ends the process that runs, after some seconds, and returns its exit code."""
+        self._spawner: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket | None = None
         self._pipe = Pipe(-1, -1)
         self._poll = select.poll()
         self._watchdog_s = WATCHDOG_S
@@ -76,15 +84,13 @@ class BootloaderProcess:
 
     @property
     def is_running(self) -> bool:
-        return self._process is not None
+        return self._end is not None
 
     def start(self) -> Facts:
         """Start a process and return its facts. Raises BootloaderError, and UsageError when it does
         not speak the protocol.
         """
         self.kill()
-        if not self._is_program:  # loaded once, not in each process
-            from flasher.conformance.dut import child  # noqa: F401, PLC0415
         self._stderr.seek(0)
         self._stderr.truncate()
         read_fd, its_write_fd = os.pipe()
@@ -92,12 +98,10 @@ class BootloaderProcess:
         self._pipe = Pipe(read_fd, write_fd)
         try:
             if self._is_program and hasattr(os, "pidfd_open"):  # Linux
-                self._process = self._spawn(its_read_fd, its_write_fd)
+                self._end = partial(end_process, self._spawn(its_read_fd, its_write_fd))
             else:
-                self._process = os.fork()
-                if not self._process:
-                    self._pipe.close()
-                    self._become_bootloader(its_read_fd, its_write_fd)
+                self._fork(its_read_fd, its_write_fd)
+                self._end = self._end_forked
         finally:
             os.close(its_read_fd)
             os.close(its_write_fd)
@@ -140,17 +144,20 @@ class BootloaderProcess:
         except (BrokenPipeError, ValueError):
             raise self._died(doing) from None
 
-    def kill(self) -> int | None:
-        """Kill the process immediately, like a power cut. Returns its exit code, None without a
+    def kill(self) -> None:
+        """Kill the process immediately, like a power cut."""
+        self._end_after(0.0)
+
+    def _end_after(self, after_s: float) -> int:
+        """Kill the process if it has not ended after `after_s`; return its exit code, 0 without a
         process.
         """
-        process, self._process = self._process, None
-        if process is None:
-            return None
+        end, self._end = self._end, None
+        if end is None:
+            return 0
         self._poll.unregister(self._pipe.read_fd)
         self._pipe.close()
-        os.kill(process, signal.SIGKILL)  # until it is waited for, its number is its own
-        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        return end(after_s)
 
     def unusable(self, why: str, cause: str) -> UsageError:
         """Make the error for a subject that cannot be tested."""
@@ -166,6 +173,7 @@ class BootloaderProcess:
     def close(self) -> None:
         """Kill the process and discard its output."""
         self.kill()
+        self._end_spawner()
         self._stderr.close()
 
     def output(self) -> str:
@@ -197,34 +205,54 @@ class BootloaderProcess:
         resource.prlimit(process, resource.RLIMIT_FSIZE, (_FILE_MAX_SIZE, _FILE_MAX_SIZE))
         return process
 
-    def _become_bootloader(self, read_fd: int, write_fd: int) -> Never:
-        """Replace this child process by the bootloader."""
+    def _fork(self, read_fd: int, write_fd: int) -> None:
+        """Have a process forked by the spawner, which is started first if there is none: a fork of
+        this process, which holds all of the suite, takes several times as long, and copies locks of
+        its other threads.
+        """
+        if self._spawner is None:
+            self._control, control = socket.socketpair()
+            with control:
+                self._spawner = subprocess.Popen(  # noqa: S603  our own interpreter
+                    spawner_command(
+                        self.subject, int(self._is_program), control.fileno(), _FILE_MAX_SIZE
+                    ),
+                    stdin=subprocess.DEVNULL,
+                    stdout=self._stderr,
+                    stderr=self._stderr,
+                    pass_fds=[control.fileno()],
+                    process_group=0,  # the suite handles Ctrl-C and signals to its group
+                )
+            if not select.select([self._control], [], [], _SPAWNER_S)[0]:
+                self._spawner.kill()
+                self._pipe.close()
+                raise BootloaderError(f"its module was not loaded within {_SPAWNER_S:g} s")
+            self._control.recv(len(FORK))
+        assert self._control is not None  # noqa: S101  as the spawner
+        with suppress(ConnectionError):  # it has ended, which is seen at the pipe
+            socket.send_fds(self._control, [FORK], [read_fd, write_fd])
+
+    def _end_forked(self, after_s: float) -> int:
+        assert self._control is not None  # noqa: S101  as the spawner
+        self._control.settimeout(after_s + _SPAWNER_S)
+        with suppress(OSError):  # also TimeoutError
+            self._control.send(END.pack(after_s))
+            if answer := self._control.recv(EXIT_CODE.size):
+                return int(EXIT_CODE.unpack(answer)[0])
+        return self._end_spawner()
+
+    def _end_spawner(self) -> int:
+        """End the spawner; return its exit code if it has ended by itself, like its module."""
+        if self._spawner is None or self._control is None:
+            return 0
+        self._control.close()
         try:
-            # The suite handles Ctrl-C and signals to the process group, and ends this process.
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, signal.SIG_IGN)
-            import resource  # noqa: PLC0415  Windows has none, and no bootloader under test
-
-            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (_FILE_MAX_SIZE, _FILE_MAX_SIZE))
-            os.dup2(self._stderr.fileno(), _STDERR)
-            if self._is_program:
-                os.dup2(read_fd, _STDIN)
-                os.dup2(write_fd, _STDOUT)
-                try:
-                    os.execv(self.subject, [self.subject])  # noqa: S606  chosen by the user
-                except OSError as error:
-                    raise SubjectError(f"this computer cannot run it: {error.strerror}") from error
-            os.dup2(_STDERR, _STDOUT)  # what it prints is no message
-            from flasher.conformance.dut.child import serve  # noqa: PLC0415  only here
-
-            serve(self.subject, Pipe(read_fd, write_fd))
-        except SubjectError as error:
-            os.write(_STDERR, str(error).encode(errors="replace"))
-        except BaseException:  # noqa: BLE001  nothing of the suite may go on in this process
-            os.write(_STDERR, traceback.format_exc(limit=-2).encode())
+            return self._spawner.wait(_SPAWNER_S)
+        except subprocess.TimeoutExpired:
+            self._spawner.kill()
+            return self._spawner.wait()
         finally:
-            os._exit(1)
+            self._spawner = None
 
     def _next(self, doing: str) -> tuple[PipeMessage, bytes]:
         while (found := self._pipe.take()) is None:
@@ -241,11 +269,6 @@ class BootloaderProcess:
 
     def _died(self, doing: str) -> BootloaderError:
         """The error for a process that ended or sent invalid data, with its output as cause."""
-        assert self._process is not None  # noqa: S101  it was started
-        for _ in range(round(WATCHDOG_S / _WAIT_S)):  # its pipe is closed a little sooner
-            if os.waitid(os.P_PID, self._process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
-                break
-            select.select([], [], [], _WAIT_S)
-        status = self.kill() or 0
+        status = self._end_after(WATCHDOG_S)  # its pipe is closed a little sooner
         how = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
         return BootloaderError(f"the bootloader ended {how} in {doing}", cause=self.output())
