@@ -40,6 +40,10 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
         "image": CommandEntry(
             "upgrade.image:image", "convert and merge images: Intel HEX, S-record, raw binary"
         ),
+        "acceptance": CommandEntry(
+            "upgrade.acceptance:acceptance",
+            "try a new adapter and device step by step, with a report",
+        ),
         "history": CommandEntry(
             "upgrade.history:history", "list the upgrades made from this computer"
         ),

@@ -36,7 +36,9 @@ PRINTED: Final = {"printed": True}
 """Marks log records of printed output, so that -v does not print it twice."""
 
 
-CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station", "ui"})
+CHANGING: Final = frozenset(
+    {"flash", "rescue", "write", "conformance", "station", "ui", "acceptance"}
+)
 """Commands that change a device."""
 
 

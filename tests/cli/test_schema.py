@@ -86,6 +86,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image", "info", OBC),
         ("image", "convert", SAMPLES / "wmc.hex", "-o", Path("wmc.s19")),
         ("image", "merge", SAMPLES / "wmc.hex", f"{OBC}@0x8010000", "-o", Path("both.hex")),
+        ("acceptance", OBC, "-t", "obc", *MOCK[2:], "--yes", "--interrupt", "-o", Path("a.html")),
         ("help", "E402"),
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),
