@@ -203,12 +203,14 @@ class Bench:
         self.continued_at = found.at
         return found
 
-    def update_again(self, size_bytes: int) -> None:
+    def update_again(self, size_bytes: int, *, may_be_whole: bool = False) -> None:
         """Get request transfer after a transfer that was broken off or refused: from the waiting
-        bootloader, or from the old application where the device kept it (rs_03_old).
+        bootloader, or from the old application where the device kept it (rs_03_old) or, with
+        `may_be_whole`, had not erased it yet.
         """
         within_s = self.waits.burst_s + self.limit("start_s")
-        if self.profile.allows("rs_03_old", "kept") and self.application_runs(within_s):
+        may_run = may_be_whole or self.profile.allows("rs_03_old", "kept")
+        if may_run and self.application_runs(within_s):
             self.reset_to_bootloader()
         self.update(size_bytes)
 

@@ -420,3 +420,14 @@ def test_walks_know_that_a_pause_may_end_while_they_wait() -> None:
     explorer = Explorer(subject(CountsFromPackets, device), profile_of_mock(device), seed="1")
     steps = ["reset", "update=128", "packet", "wait=1", "wait=0.3", "wait=2"]
     assert explorer.replay(steps).finding is None
+
+
+@pytest.mark.slow
+def test_a_reset_may_come_before_anything_is_erased() -> None:
+    device = strained_device(2006)
+    given: dict[str, Value] = {**device.profiles["fitting"].given, "rs_03_old": "erased"}
+    given |= {"limits.version_spacing_tolerance_s": 0.005}
+    given |= {"limits.window_s": 0.0512, "limits.window_tolerance_s": 0.001}
+    with device.subject() as made:
+        report = run(made, ConformanceProfile(given), selection=Selection(cases=("TX-13",)))
+    assert report.results[0].verdict in HELD

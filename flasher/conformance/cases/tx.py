@@ -601,7 +601,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
             is_begun = restarts is None
     if restarts is not None and restarts.kind is Reply.BOOT_VERSION:
         bench.collect(bench.waits.burst_s)  # what is left of a burst it may not listen in
-        bench.update_again(len(image))
+        bench.update_again(len(image), may_be_whole=found.kind is Reply.BOOT_VERSION)
     bench.finish(image, 2 if is_begun else 1)
 
 
