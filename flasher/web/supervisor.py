@@ -446,20 +446,28 @@ def place_of(store: Store) -> Place:
 
 
 def open_supervisor(
-    url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
+    url: str,
+    folder: Path,
+    key_locations: KeyLocations,
+    shifts: Sequence[time],
+    kind: type[Store] = Store,
 ) -> SupervisorPages:
     """Open records read-only. Raises as `Store.open`."""
-    store = Store.open(
+    store = kind.open(
         url, station="pages", folder=folder, read_only=True, key_locations=key_locations
     )
     return SupervisorPages(store, shifts)
 
 
 def serve_supervisor(
-    url: str, folder: Path, key_locations: KeyLocations, shifts: Sequence[time]
+    url: str,
+    folder: Path,
+    key_locations: KeyLocations,
+    shifts: Sequence[time],
+    kind: type[Store] = Store,
 ) -> SupervisorPages:
     """Open records read-only, and update the daily sums while this process runs."""
-    supervisor = open_supervisor(url, folder, key_locations, shifts)
+    supervisor = open_supervisor(url, folder, key_locations, shifts, kind)
     rollup = Rollup(supervisor.store.database)
     Thread(
         target=rollup.keep_up, args=(lambda: datetime.now(UTC), sleep), name="sums", daemon=True

@@ -13,17 +13,19 @@ import pytest
 
 from flasher.errors import ExitCode
 from flasher.plant.process import Sending, sending
+from flasher.protocol.spec import BMS
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold_output
 from tests.plant.conftest import plant, sender
 from tests.plant.factory import PASSWORD, Plant, Sender
 from tests.schema_document import SCHEMA
-from tests.station.factory import USUAL, write_recipe
+from tests.station.factory import IMAGES, USUAL, write_recipe
 from tests.station.postgres import Server
 
 __all__ = ["plant", "sender"]
 pytestmark = pytest.mark.slow
+BMS_SHA256 = IMAGES[BMS].sha256
 STATION = """\
 name = "line-2"
 plant = "{plant}"
@@ -152,3 +154,31 @@ def test_a_station_without_the_server_passes_its_units(
 def test_the_process_ends_with_a_station_that_had_no_records(tmp_path: Path) -> None:
     with sending(Sending("postgresql://x@127.0.0.1:1/p", "line-2", str(tmp_path / "no"), None)):
         pass
+
+
+def test_what_reads_all_stations(flasher: Flasher, plant: Plant, sender: Sender) -> None:
+    sender.bench.make()
+    sender.send()
+    database = ("--database", plant.url("flasher_desk"))
+    units = flasher("plant", "units", "--image", "V1r0r4_20220512", *database)
+    assert units.out.splitlines()[1:] == [
+        "  W2605002, part BAT-36: bms, 2026-05-17, PASS", "1 unit",
+    ]  # fmt: skip
+    report = flasher("plant", "report", *database)
+    assert "1 unit" in report.out
+    verify = flasher("plant", "verify", *database)
+    assert verify.code == ExitCode.OK
+    first, row, last = verify.out.splitlines()
+    assert first == ("1 run and 1 trace of runs that passed agree with the signed audit trails")
+    assert row.startswith("  line-2: 4 rows to 2026-05-17T09:00:08.000000Z, signed with ")
+    assert "flasher station key" in last
+    for words in (("units", "--image", BMS_SHA256[:12]), ("report",), ("verify",)):
+        run = flasher("plant", *words, *database, "--json")
+        hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, run.code)
+    with plant.connect() as owner:
+        owner.execute("UPDATE step SET duration_s = 3")
+    changed = flasher("plant", "verify", *database)
+    assert changed.code == ExitCode.VERIFICATION
+    assert changed.out.startswith("line-2, run 1: what reports and pages show differs")
+    none = flasher("plant", "units", "--image", "V9", *database)
+    assert "No station has used an image V9" in none.err

@@ -11,8 +11,17 @@ from typing import Final
 
 from flasher.cli import values
 from flasher.cli.extras import need
-from flasher.cli.framework import group, option
+from flasher.cli.framework import group, option, option_set
 from flasher.cli.output import Output
+from flasher.cli.station.commands import (
+    DEFAULT_DESK,
+    PAGES,
+    Address,
+    PagesOptions,
+    ReportOptions,
+    address_of,
+    pages_options,
+)
 from flasher.errors import ExitCode
 
 _EXAMPLES: Final = """\
@@ -20,6 +29,10 @@ examples:
   flasher plant init --database postgresql://flasher_plant@plant-db/flasher --print
   flasher plant init --database postgresql://flasher_plant@plant-db/flasher --station line-2
   flasher plant status --database postgresql://reader@plant-db/flasher
+  flasher plant units --database postgresql://reader@plant-db/flasher --image V1r0r4_20220512
+  flasher plant report --database postgresql://reader@plant-db/flasher --since 2026-05-17
+  flasher plant pages --database postgresql://reader@plant-db/flasher
+  flasher plant verify --database postgresql://reader@plant-db/flasher
   flasher plant send --sockets sockets.toml
 """
 
@@ -94,6 +107,47 @@ def status(output: Output, database: str) -> int:
     the database refuses the records of one.
     """
     return _call("administration.status", output, database)
+
+
+@plant.action("verify")
+@_database_option
+def verify(output: Output, database: str) -> int:
+    """Examine every audit trail with its signatures, every run against its audit rows, and every
+    PASS against its trace. Exit code 10 if something was changed.
+    """
+    return _call("reading.verify", output, database)
+
+
+@plant.action("units")
+@_database_option
+@option(
+    "--image", metavar="SHA256|VERSION", required=True, brief=True,
+    help="SHA-256 of the image, its beginning, or its version",
+)  # fmt: skip
+def units(output: Output, database: str, image: str) -> int:
+    """List the units whose last transfer to a target was of this image, newest first."""
+    return _call("reading.units", output, database, image)
+
+
+@plant.action("report")
+@option_set("options", ReportOptions)
+@_database_option
+def report(output: Output, options: ReportOptions, database: str) -> int:
+    """Show units, yield, failures and times of all stations; write them to files."""
+    return _call("reading.report", output, options, database)
+
+
+@plant.action("pages")
+@option(
+    "--web", type=address_of, default=DEFAULT_DESK, metavar="[HOST:]PORT", panel=PAGES, brief=True,
+    help="address of the pages; a port alone: on this computer only",
+)  # fmt: skip
+@pages_options
+@_database_option
+def pages(output: Output, web: Address, pages: PagesOptions, database: str) -> int:
+    """Serve the supervisor pages over the records of all stations until Ctrl-C."""
+    need("The supervisor pages", "web")
+    return _call("reading.pages", output, web, pages, database)
 
 
 @plant.action("send")

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from flasher.cli.station.documents import StationReportDocument
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.stations import StationStatus
+from flasher.plant.verify import PlantExamination
+from flasher.station.records.overview import ImageRecord, InstalledUnit
 
 
 @dataclass(frozen=True)
@@ -35,5 +38,21 @@ class PlantSendDocument:
     state: ForwarderState
 
 
-DOCUMENTS: Final = (PlantInitDocument, PlantStatusDocument, PlantSendDocument)
+@dataclass(frozen=True)
+class PlantUnitsDocument:
+    """Units whose last transfer to a target was of an image."""
+
+    images: list[ImageRecord]
+    """The images that were asked for."""
+    units: list[InstalledUnit]
+
+
+DOCUMENTS: Final = (
+    PlantExamination,
+    PlantUnitsDocument,
+    StationReportDocument,
+    PlantInitDocument,
+    PlantStatusDocument,
+    PlantSendDocument,
+)
 LINES: Final[tuple[type, ...]] = ()

@@ -149,7 +149,7 @@ class Address:
     port: int
 
 
-def _address(text: str) -> Address:
+def address_of(text: str) -> Address:
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) < 65536):
         raise click.BadParameter("must be PORT or HOST:PORT")
@@ -165,7 +165,7 @@ def _mock_share_option(name: str, share: float, what: str) -> Decorator:
 
 # -- actions ---------------------------------------------------------------------------------------
 
-_PAGES: Final = "pages"
+PAGES: Final = "pages"
 DEFAULT_WEB: Final = "8740"
 DEFAULT_DESK: Final = "8741"
 _VIRTUAL: Final = "virtual units, for training and demonstration"
@@ -178,27 +178,27 @@ class PagesOptions:
     """Options of the pages: access and language."""
 
     web_password: Annotated[Path | None, _path_option(
-        "--web-password", panel=_PAGES,
+        "--web-password", panel=PAGES,
         help="a file with the password of the pages in its first line",
     )]  # fmt: skip
     web_certificate: Annotated[Path | None, _path_option(
-        "--web-certificate", panel=_PAGES,
+        "--web-certificate", panel=PAGES,
         help="serve the pages over TLS with this certificate (PEM)",
     )]  # fmt: skip
     web_key: Annotated[Path | None, _path_option(
-        "--web-key", panel=_PAGES, help="the key of the certificate (PEM)",
+        "--web-key", panel=PAGES, help="the key of the certificate (PEM)",
     )]  # fmt: skip
     web_insecure: Annotated[bool, option(
-        "--web-insecure", is_flag=True, panel=_PAGES,
+        "--web-insecure", is_flag=True, panel=PAGES,
         help="allow other computers without TLS: anyone on the network can read the traffic",
     )]  # fmt: skip
     language: Annotated[str | None, option(
-        "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
+        "--language", type=click.Choice(("en", "de", "zh")), panel=PAGES,
         help="language of the pages (default: the browser's)",
     )]  # fmt: skip
 
 
-_pages_options: Final = option_set("pages", PagesOptions)
+pages_options: Final = option_set("pages", PagesOptions)
 
 
 @station.action("check")
@@ -233,8 +233,8 @@ class RunOptions:
         "--lines", is_flag=True, help="print a line for each event, even on a terminal",
     )]  # fmt: skip
     web: Annotated[Address | None, option(
-        "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
-        panel=_PAGES, brief=True, show_default=False,
+        "--web", type=address_of, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
+        panel=PAGES, brief=True, show_default=False,
         help="serve the operator and supervisor pages (without a value: on this computer only, "
         f"port {DEFAULT_WEB})",
     )]  # fmt: skip
@@ -277,7 +277,7 @@ class RunOptions:
 
 @station.action("run", epilog=_RUN_NOTES)
 @option_set("options", RunOptions)
-@_pages_options
+@pages_options
 @_records_options
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
     """Flash units until Ctrl-C, or until all scans or virtual units are done."""
@@ -288,10 +288,10 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 
 @station.action("pages", epilog=_PAGES_NOTES)
 @option(
-    "--web", type=_address, default=DEFAULT_DESK, metavar="[HOST:]PORT", panel=_PAGES, brief=True,
+    "--web", type=address_of, default=DEFAULT_DESK, metavar="[HOST:]PORT", panel=PAGES, brief=True,
     help="address of the pages; a port alone: on this computer only",
 )  # fmt: skip
-@_pages_options
+@pages_options
 @_records_options
 def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOptions) -> int:
     """Serve the supervisor pages of records until Ctrl-C: runs, units, yield, causes, times,

@@ -60,7 +60,7 @@ def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
     look = {"unit": " rows", "desc": "examined", "unit_scale": True}
     with closing(open_to_read(records)) as store, Bar(output, **look) as bar:
         found = store.examine(incremental=not is_all, progress=bar.move_to)
-    for line in _problem_lines(found.problems):
+    for line in problem_lines(found.problems):
         output.result(printable(line))
     for line in found.unreached:
         output.result(printable(f"heads NOT REACHED: {line}"))
@@ -93,7 +93,7 @@ def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> i
     return output.document(found, exit_code=code)
 
 
-def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
+def problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
     """Format problems as lines: first those of the schema; equal problems share a line."""
     schema, others = "schema, ", []
     alike: dict[str, list[str]] = {}

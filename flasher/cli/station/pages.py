@@ -158,15 +158,21 @@ def _plant_check(store: Store, clock: StationClock) -> HealthCheck:
 # -- supervisor pages only ------------------------------------------------------------------------
 
 
-def serve(output: Output, address: Address, options: PagesOptions, records: RecordsOptions) -> int:
+def serve(
+    output: Output,
+    address: Address,
+    options: PagesOptions,
+    records: RecordsOptions,
+    kind: type[Store] = Store,
+) -> int:
     config = None if records.sockets is None else load_config(records.sockets)
     shifts = DEFAULT_SHIFTS if config is None else config.shifts
     badges = "" if config is None else config.badges
     people = BADGES.load(Path(badges)).person if badges else ()
-    with closing(open_to_read(records)) as store:  # fails before the pages are served
+    with closing(open_to_read(records, kind)) as store:  # fails before the pages are served
         place = place_of(store)
     pages = Pages(options.language)
-    answering = QueryProcesses(partial(serve_supervisor, *place, shifts))
+    answering = QueryProcesses(partial(serve_supervisor, *place, shifts, kind))
     routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     with (
         closing(answering),

@@ -39,9 +39,10 @@ class RecordsPlace:
         create: bool = True,
         read_only: bool = False,
         report: Callable[[str], None] = lambda _text: None,
+        kind: type[Store] = Store,
     ) -> Store:
         """Open the records as a station. Raises UsageError, RecordError."""
-        return Store.open(
+        return kind.open(
             self.url,
             station=station,
             folder=self.files,
@@ -75,9 +76,9 @@ def _path(text: str) -> Path | None:
     return Path(text) if text else None
 
 
-def open_to_read(options: RecordsOptions) -> Store:
+def open_to_read(options: RecordsOptions, kind: type[Store] = Store) -> Store:
     """Open the records for reading only. Raises UsageError, RecordError."""
-    return records_of(options).open(_READER, read_only=True)
+    return records_of(options).open(_READER, read_only=True, kind=kind)
 
 
 def the_station(names: tuple[str, ...]) -> str:

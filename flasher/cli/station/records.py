@@ -49,8 +49,10 @@ _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 # -- many runs ------------------------------------------------------------------------------------
 
 
-def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
-    with closing(open_to_read(records)) as store:
+def report(
+    output: Output, options: ReportOptions, records: RecordsOptions, kind: type[Store] = Store
+) -> int:
+    with closing(open_to_read(records, kind)) as store:
         wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
             "--csv": (options.csv, Report.to_csv),
             "--json-report": (options.json_report, Report.to_json),

@@ -61,7 +61,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class _Trail:
+class Trail:
     """One station's chain while it is examined."""
 
     station: str
@@ -130,7 +130,7 @@ class Examiner:
         self._unkept: list[str] = []
         self._unreached: list[str] = []
         self._since = since
-        self._trails_found: list[_Trail] = []
+        self._trails_found: list[Trail] = []
         self.examined: Examined | None = None
         """State for the next examination; None until this one is done, or if it found a problem."""
         self._traces = 0
@@ -205,7 +205,7 @@ class Examiner:
             yield from self._contents(contents, stated, changed)
         yield from _shared(changed)
         yield from _unused(connection)
-        yield from _same_traces(connection)
+        yield from same_traces(connection)
 
     def _examined_part(self, connection: Connection, records_id: str, now: datetime) -> Examined:
         run = schema.run.c
@@ -271,7 +271,7 @@ class Examiner:
                 yield _PlaceHeads(place, is_elsewhere=True, lasts=found)
 
     def _compare(
-        self, connection: Connection, trail: _Trail, each: _PlaceHeads, records_id: str
+        self, connection: Connection, trail: Trail, each: _PlaceHeads, records_id: str
     ) -> Iterator[Problem]:
         """Compare a chain with the heads that a place stores of it."""
         shown, place = printable(trail.station), each.place.shown
@@ -347,7 +347,7 @@ class Examiner:
 
     def _chain(
         self,
-        trail: _Trail,
+        trail: Trail,
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
     ) -> Iterator[Problem]:
@@ -461,7 +461,7 @@ class Examiner:
         self,
         run_id: int,
         digests: Mapping[str, str],
-        stated: _RunDigests,
+        stated: RunDigests,
         changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
         """Compare a run with its digests in the audit trail. `changed` collects shared rows."""
@@ -484,7 +484,7 @@ class Examiner:
     def _contents(
         self,
         contents: Mapping[int, Mapping[str, Any]],
-        stated: Mapping[int, _RunDigests],
+        stated: Mapping[int, RunDigests],
         changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
         """Check runs whose rows are already read."""
@@ -573,14 +573,14 @@ def _is_as_examined(connection: Connection, since: Examined) -> bool:
     return bool(connection.execute(runs).scalar_one() == since.runs)
 
 
-def _continued_trail(name: str, since: Examined | None) -> _Trail:
+def _continued_trail(name: str, since: Examined | None) -> Trail:
     """The state of a station's chain at the end of the last examination."""
     each = None if since is None else since.chains.get(name)
     if each is None:
-        return _Trail(name)
+        return Trail(name)
     restored = {number: range(first, last + 1) for number, (first, last) in each.restored.items()}
     stated = (each.version, each.schema)
-    return _Trail(
+    return Trail(
         name, each.rows, restored=restored, keys=list(each.keys), stated=stated,
         first=dict(each.first),
     )  # fmt: skip
@@ -645,7 +645,7 @@ def _shared(changed: Mapping[tuple[str, str], list[int]]) -> Iterator[Problem]:
         yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
 
 
-def _same_traces(connection: Connection) -> Iterator[Problem]:
+def same_traces(connection: Connection) -> Iterator[Problem]:
     run = schema.run.c
     of_pass = select(run.log_sha256).where(run.state == RunState.PASS.value)
     twice = of_pass.group_by(run.log_sha256).having(func.count() > 1)
@@ -662,7 +662,7 @@ _AUDIT_OF_RUNS: Final = (
 
 
 @dataclass
-class _RunDigests:
+class RunDigests:
     """Digests of a run that the audit trail records."""
 
     claim: Mapping[str, str] = field(default_factory=dict)
@@ -675,9 +675,9 @@ class _RunDigests:
         return bool(self.claim or self.ending)
 
 
-def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, _RunDigests]:
+def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, RunDigests]:
     """Digests in the intact audit rows of these runs."""
-    found: dict[int, _RunDigests] = defaultdict(_RunDigests)
+    found: dict[int, RunDigests] = defaultdict(RunDigests)
     for run_id, rows in grouped(connection, _AUDIT_OF_RUNS, "run_id", run_ids).items():
         for row in rows:
             digests = _table(chain.data_of(row["data"]).get("digests"))
@@ -690,7 +690,7 @@ def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, _RunDi
     return found
 
 
-def _segment_faults(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
+def _segment_faults(trail: Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
     shown = printable(trail.station)
     if isinstance(entry, HeadsFault):
         yield Problem(f"heads of {shown}, {entry.where}", entry.what)
@@ -700,7 +700,7 @@ def _segment_faults(trail: _Trail, place: str, entry: Checkpoint | HeadsFault) -
 
 
 def _without_accepted(
-    trail: _Trail, wrong: list[tuple[int, ChainHead]], accepted_at: Mapping[int, int]
+    trail: Trail, wrong: list[tuple[int, ChainHead]], accepted_at: Mapping[int, int]
 ) -> list[ChainHead]:
     """Differing heads without those of rows that an operator accepted as lost."""
     return [
@@ -713,7 +713,7 @@ def _without_accepted(
     ]
 
 
-def _differences(trail: _Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
+def _differences(trail: Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
     """Problems of heads that differ from the chain."""
     where = f"audit trail of {printable(trail.station)}"
     missing = [head for head in held if head.number > trail.end]

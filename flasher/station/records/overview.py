@@ -211,7 +211,9 @@ class Overview:
     # -- images -----------------------------------------------------------------------------------
 
     def images(self, wanted: str = "") -> tuple[ImageRecord, ...]:
-        """Images whose name contains `wanted` or whose SHA-256 begins with it, newest first."""
+        """Images whose name contains `wanted`, whose SHA-256 begins with it, or that have this
+        version, newest first.
+        """
         artifact = schema.artifact.c
         query = (
             select(
@@ -229,6 +231,7 @@ class Overview:
                 or_(
                     artifact.name.icontains(wanted, autoescape=True),
                     artifact.sha256.istartswith(wanted, autoescape=True),
+                    artifact.version == wanted,
                 )
             )
         with self._database.reading() as connection:

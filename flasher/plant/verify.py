@@ -1,0 +1,243 @@
+"""`flasher plant verify`: examines every chain, every run and every trace of a plant's database."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+from uuid import UUID
+
+from sqlalchemy import Connection, func, select
+
+from flasher.i18n import text
+from flasher.plant.schema import OWN_PARTS, SHARED_PARTS, chain_row, shared_part
+from flasher.plant.store import PlantStore
+from flasher.protocol.text import printable
+from flasher.station.records import chain, schema
+from flasher.station.records.examination import (
+    Examiner,
+    RunDigests,
+    Trail,
+    same_traces,
+)
+from flasher.station.records.model import Problem, RunDetails, RunId, WriteId
+from flasher.station.records.queries import details_of_content, is_whole
+from flasher.station.records.rows import batches
+from flasher.station.records.signatures import fingerprint
+
+_AT_ONCE: Final = 500
+_UNSENT: Final = (
+    select(schema.run.c.id)
+    .outerjoin(
+        chain_row, (chain_row.c.run_id == schema.run.c.id) & chain_row.c.content.is_not(None)
+    )
+    .where(chain_row.c.id.is_(None))
+    .order_by(schema.run.c.id)
+    .limit(_AT_ONCE)
+)
+"""Runs that no chain has."""
+
+
+@dataclass(frozen=True)
+class ExaminedStation:
+    """A station's chain in a plant's database."""
+
+    station: str
+    rows: int
+    last_at: str
+    """Time of the last row."""
+    keys: tuple[str, ...]
+    """Fingerprints of the keys that signed it, oldest first."""
+
+
+@dataclass(frozen=True)
+class PlantExamination:
+    """Result of an examination of a plant's database."""
+
+    problems: tuple[Problem, ...]
+    remarks: tuple[str, ...]
+    stations: tuple[ExaminedStation, ...]
+    runs: int
+    """Number of runs that were compared with their audit rows."""
+    traces: int
+    """Number of PASS that were compared with their traces."""
+
+
+class PlantExaminer(Examiner):
+    """Examines a plant's database once."""
+
+    def __init__(self, store: PlantStore, progress: Callable[[int, int], None]) -> None:
+        super().__init__(store.database, store.files, store.signer.key_locations, progress)
+        self._runs = 0
+
+    def examine_plant(self) -> PlantExamination:
+        """Examine everything. Raises RecordError."""
+        problems: list[Problem] = []
+        stations = []
+        with self._database.reading() as connection:
+            rows = select(func.count()).select_from(chain_row)
+            self._total = connection.execute(rows).scalar_one()
+            self._total += connection.execute(
+                select(func.count()).select_from(schema.run)
+            ).scalar_one()
+            for station in connection.execute(select(chain_row.c.station).distinct()).scalars():
+                trail, records_id = _begun(connection, station)
+                if _station_of(records_id, trail.station) != station:
+                    problems.append(
+                        Problem(f"chain {station}", "it is stored as that of another station")
+                    )
+                found = self._station(connection, station, trail, records_id)
+                shown = printable(trail.station)
+                problems += (
+                    replace(each, where=each.where if shown in each.where
+                            else f"{shown}, {each.where}", runs=())
+                    for each in found
+                )  # fmt: skip
+                last = select(chain_row.c.at).where(
+                    chain_row.c.station == station, chain_row.c.number == trail.end
+                )
+                stations.append(
+                    ExaminedStation(
+                        trail.station,
+                        trail.end,
+                        connection.execute(last).scalar_one_or_none() or "",
+                        tuple(map(_fingerprint, trail.keys)),
+                    )
+                )
+            problems += (
+                Problem(f"run {run_id}", "no station's audit trail has it: it was added", (run_id,))
+                for run_id in connection.execute(_UNSENT).scalars()
+            )
+            problems += same_traces(connection)
+        if self._nameless:
+            self._remarks.append(
+                f"{self._nameless} PASS of devices that report no serial number: their traces do"
+                " not identify the unit"
+            )
+        stations.sort(key=lambda each: each.station)
+        return PlantExamination(
+            tuple(problems), tuple(self._remarks), tuple(stations), self._runs, self._traces
+        )
+
+    def _station(
+        self, connection: Connection, station: UUID, trail: Trail, records_id: str
+    ) -> Iterator[Problem]:
+        """Examine a chain, then its runs."""
+        query = (
+            select(chain_row, chain_row.c.run_number)
+            .where(chain_row.c.station == station)
+            .order_by(chain_row.c.number)
+            .execution_options(yield_per=_AT_ONCE)
+        )
+        with connection.execute(query) as rows:
+            # The run's id at the station is what was signed.
+            signed = (dict(row) | {"run_id": row["run_number"]} for row in rows.mappings())
+            yield from self._chain(trail, signed, records_id)
+        ended = select(chain_row.c.run_number).where(
+            chain_row.c.station == station, chain_row.c.content.is_not(None)
+        )
+        numbers = connection.execute(ended.order_by(chain_row.c.number)).scalars().all()
+        for some in batches(numbers):
+            yield from self._some_runs(connection, station, some)
+
+    def _some_runs(
+        self, connection: Connection, station: UUID, numbers: Sequence[int]
+    ) -> Iterator[Problem]:
+        """Compare runs with their digests and traces, and with the tables that are read."""
+        query = select(chain_row).where(
+            chain_row.c.station == station, chain_row.c.run_number.in_(numbers)
+        )
+        rows = connection.execute(query.order_by(chain_row.c.number)).mappings().all()
+        stated: dict[int, RunDigests] = defaultdict(RunDigests)
+        contents: dict[int, dict[str, Any]] = {}
+        central: dict[int, int] = {}
+        missing: set[int] = set()
+        digests = {row["number"]: chain.data_of(row["data"]).get("digests", {}) for row in rows}
+        parts = _parts(connection, station, digests.values())
+        for row in rows:
+            number, of_row = row["run_number"], digests[row["number"]]
+            if row["event"] == chain.CLAIMED:
+                stated[number].claim = of_row
+            if row["content"] is None:
+                continue
+            stated[number].ending = of_row
+            central[number] = row["run_id"]
+            named = {name: parts.get(of_row.get(name, ""), _NOTHING) for name in SHARED_PARTS}
+            own = {name: row["content"].get(name) for name in OWN_PARTS}
+            if any(each is _NOTHING for each in named.values()) or None in own.values():
+                missing.add(number)
+                continue
+            content = own | named
+            content[chain.CLAIM] = chain.claim_of({"run": own["run"], "targets": own["targets"]})
+            contents[number] = content
+        for number in missing:
+            yield Problem(text("run {run_id}", run_id=number), "a part of it is missing")
+        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
+        yield from self._contents(contents, stated, changed)
+        for (part, _), of_runs in changed.items():
+            what = f"changed after it was recorded: {chain.NAMED[part]}"
+            yield Problem(text("run {run_id}", run_id=of_runs[0]), what)
+        yield from self._projected(connection, contents, central)
+        self._runs += len(contents)
+
+    def _projected(
+        self, connection: Connection, contents: Mapping[int, Any], central: Mapping[int, int]
+    ) -> Iterator[Problem]:
+        """Compare what reports and pages read with what the stations have signed."""
+        shown = chain.contents_of(connection, central.values())
+        for number, content in contents.items():
+            found = shown.get(central[number])
+            if found is None or not is_whole(found):
+                what = "reports and pages do not have it as a whole"
+            elif _without_ids(found) != _without_ids(content):
+                what = "what reports and pages show differs from what the station signed"
+            else:
+                continue
+            yield Problem(text("run {run_id}", run_id=number), what)
+
+
+_NOTHING: Final = object()
+
+
+def _parts(connection: Connection, station: UUID, digests: Any) -> Mapping[str, Any]:
+    """Shared parts of a station by their digest; `_NOTHING` for a missing one."""
+    wanted = {each[name] for each in digests for name in SHARED_PARTS if name in each}
+    found: dict[str, Any] = {}
+    for some in batches(wanted):
+        query = select(shared_part.c.sha256, shared_part.c.content).where(
+            shared_part.c.station == station, shared_part.c.sha256.in_(some)
+        )
+        for sha256, content in connection.execute(query):
+            found[sha256] = json.loads(content)
+    return found
+
+
+def _begun(connection: Connection, station: UUID) -> tuple[Trail, str]:
+    """The chain's station and records, as its first row states them."""
+    query = select(chain_row.c.data).where(chain_row.c.station == station, chain_row.c.number == 1)
+    data = chain.data_of(connection.execute(query).scalar_one_or_none() or "")
+    return Trail(str(data.get("station", station))), str(data.get("records", ""))
+
+
+def _station_of(records_id: str, name: str) -> UUID:
+    """As the function `plant_enter` computes it."""
+    return UUID(hashlib.sha256(f"{records_id} {name}".encode()).hexdigest()[:32])
+
+
+def _without_ids(content: Mapping[str, Any]) -> RunDetails:
+    details = details_of_content(content, content["recipe"])
+    return replace(
+        details,
+        run=replace(details.run, run_id=RunId(0)),
+        writes=tuple(replace(each, write_id=WriteId(0)) for each in details.writes),
+    )
+
+
+def _fingerprint(key: str) -> str:
+    try:
+        return fingerprint(key)
+    except ValueError:
+        return "none"
