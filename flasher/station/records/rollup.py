@@ -26,6 +26,7 @@ from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.protocol.text import printable
 from flasher.station.records import schema
+from flasher.station.records.chain import ENDINGS
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.filters import JUDGED, begun_in, counting, named_in
@@ -193,14 +194,14 @@ class Rollup:
                 if begun is None:
                     _recreate(sums)
                     begun = 0
-                last = _last_to_add(connection, begun, now)
+                last, has_more = _last_to_add(connection, begun, now)
                 if last > begun:
                     _Addition(sums, connection, begun, last).add()
                     sums.execute("DELETE FROM state")
                     content = json.dumps(_state(connection, last))
                     sums.execute("INSERT INTO state VALUES (?)", (content,))
             sums.execute("COMMIT")
-        return last == begun + _RUNS_AT_ONCE
+        return has_more
 
     def keep_up(self, now: Callable[[], datetime], wait: Callable[[float], object]) -> None:
         """Add missing runs forever, at intervals."""
@@ -286,6 +287,12 @@ def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
     records = select(info.records_id).where(info.records_id == found["records"])
     if any(connection.execute(query).first() is None for query in (is_same, records)):
         return None
+    # A station of a plant may send runs of days that were added before.
+    late = select(audit.id).where(
+        audit.id > found["audit"], audit.event.in_(ENDINGS), audit.run_id <= found["run"]
+    )
+    if connection.execute(late.limit(1)).first() is not None:
+        return None
     return int(found["run"])
 
 
@@ -296,8 +303,10 @@ def _recreate(sums: sqlite3.Connection) -> None:
         sums.execute(statement)
 
 
-def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
-    """Id of the last run that may be added: its day is over and every earlier run has ended."""
+def _last_to_add(connection: Connection, begun: int, now: datetime) -> tuple[int, bool]:
+    """Id of the last run of a batch that may be added: its day is over and every earlier run has
+    ended. True if more runs follow the batch.
+    """
     run = schema.run.c
     today = datetime.combine(now.astimezone(), time()).astimezone()
     over = utc_text(min(today, now - _SETTLED))
@@ -312,7 +321,12 @@ def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
         run.state == RunState.RUNNING.value, run.id > begun
     )
     first_running = connection.execute(running).scalar_one_or_none()
-    return min(last, begun + _RUNS_AT_ONCE, last if first_running is None else first_running - 1)
+    if first_running is not None:
+        last = min(last, first_running - 1)
+    # A plant's database leaves gaps between ids.
+    batch = select(run.id).where(run.id > begun).order_by(run.id).offset(_RUNS_AT_ONCE - 1)
+    end = connection.execute(batch.limit(1)).scalar_one_or_none()
+    return (last, False) if end is None or last < end else (end, True)
 
 
 class _Addition:
