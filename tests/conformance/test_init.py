@@ -252,7 +252,7 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
         ),
         (
             lambda: bench(LatePages("bms", capacity_bytes=3000)),
-            {"up_04_burst": "rejected", "device.buffer_bytes": 768},
+            {"up_04_burst": "rejected", "device.buffer_bytes": 896},
         ),
     ],
 )
@@ -277,7 +277,7 @@ def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
 @pytest.mark.slow
 def test_acknowledged_bytes_that_are_not_written_are_seen_though_the_flash_holds_the_same() -> None:
     paged = values(ask_device(bench(OldPages("bms", capacity_bytes=12288)), ConformanceProfile()))
-    assert paged["device.buffer_bytes"] == 768
+    assert paged["device.buffer_bytes"] == 896
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_c_in_process import LoadedBootloader
-from tests.campaigns.right_devices import faults_of
+from tests.campaigns.right_devices import HELD, faults_of
 from tests.loops import each
 
 pytestmark = [
@@ -93,13 +93,20 @@ def test_a_transfer_may_last_though_a_padded_update_command_is_rejected() -> Non
     assert verdict(13, "FR-07", given) in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART)
 
 
+def test_an_application_may_start_later_than_an_erase_ends() -> None:
+    given: dict[str, Value] = {"fr_01": "rejected", "limits.erase_s": 0.61, "limits.start_s": 17}
+    assert verdict(14, "FR-01", given | {"up_04_burst": "rejected"}) in HELD
+
+
 @each(
     "seed, changed, wanted",
     (
         # An update command before packet 1 is ignored.
         (1, {"BEFORE_FIRST": 0}, {"device.largest_image_bytes": 5824}),
         # The old application is erased with the first full page, of four packets.
-        (3, {}, {"rs_03_old": "either", "rs_03": "listens", "device.buffer_bytes": 256}),
+        (3, {}, {"rs_03_old": "either", "rs_03": "listens", "device.buffer_bytes": 384}),
+        # A packet is written after its ACK.
+        (14, {}, {"device.buffer_bytes": 128}),
         # The whole image is one page, written at end of transfer.
         (3, {"PAGE_BYTES": 8448}, {"rs_03_old": "either", "rs_03": None}),
         # The old application is kept until packet 1.

@@ -118,15 +118,13 @@ class Probe(PacketTransfer):
         if taken:
             bench.continued_at = bench.now
         else:
-            if reset and reply is None:  # by now the application was started
-                bench.reset_to_bootloader()
             lasts = bench.choice("up_08") == "starts_over" and not bench.is_pause_near(
                 bench.waits.settle_s
             )
-            if reset or reply is not None or lasts:
+            if reply is not None or (lasts and not reset):
                 bench.update(len(self.image))
             else:
-                bench.update_again(len(self.image))
+                bench.update_again(len(self.image), may_be_whole=reset)
         self.stored = 0
 
     def enter_after_rejected(self, *stimuli: Sequence[RawFrame]) -> None:

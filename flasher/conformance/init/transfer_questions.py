@@ -451,10 +451,9 @@ def buffer(session: InitSession) -> Findings:
     if why or not bench.subject.has_readback:
         yield why or "the bench has no readback"
         return
-    # The last packet may still be being written when its ACK arrives (PW-01).
-    held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
+    held = -(-lacking // PACKET_BYTES) * PACKET_BYTES
     seen = f"after ACK 1 to {total} at most {lacking} bytes were not in the flash"
     if not written:
         held = bench.number("largest_image_bytes")
         seen += ", none was in it: all of an image may be buffered"
-    yield KeyAnswer("device.buffer_bytes", held, f"{seen}; one packet may still be being written")
+    yield KeyAnswer("device.buffer_bytes", held, seen)
