@@ -8,6 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Final
+
+WAY_BACK: Final = "way-back"
+SETTINGS: Final = "settings"
+ALWAYS_SHOWN: Final = frozenset({WAY_BACK, SETTINGS})
+"""Checks that are shown when they pass too."""
+
 
 # -- the host -------------------------------------------------------------------------------------
 

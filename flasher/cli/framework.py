@@ -221,6 +221,13 @@ def _typed_options(ctx: click.Context, without: Callable[[str], bool]) -> Iterat
                 yield value
 
 
+def missing_option(name: str) -> click.MissingParameter:
+    """Create the error for an option that the running command needs with these others."""
+    ctx = click.get_current_context()
+    param = next(each for each in ctx.command.params if each.name == name)
+    return click.MissingParameter(ctx=ctx, param=param)
+
+
 # -- commands --------------------------------------------------------------------------------------
 
 

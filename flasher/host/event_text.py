@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 from flasher import events
-from flasher.host.identity import WAY_BACK
 from flasher.i18n import text
 from flasher.wording import wording, wording_of
 
@@ -92,8 +91,7 @@ def progress_line(event: object) -> tuple[str, int] | None:
         case events.BootVersionSeen(name, version):
             return text("boot version: {name} {version}", name=name, version=version), 0
         case events.CheckMade(check, verdict, sentence):
-            # The way back must be known before the erase.
-            is_usual = verdict == "passed" and check != WAY_BACK
+            is_usual = verdict == "passed" and check not in events.ALWAYS_SHOWN
             return f"check: {verdict}: {sentence}", 1 if is_usual else 0
         case events.AdapterBack():
             return text("the adapter is back"), 0

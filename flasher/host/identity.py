@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
-from flasher.events import CheckMade
+from flasher.events import WAY_BACK, CheckMade
 from flasher.host.options import firmware_version
 from flasher.host.table import Ending
 from flasher.i18n import text
@@ -27,7 +27,6 @@ from flasher.protocol.text import FirmwareVersion, printable
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_MINIMUM_CHARGE_PERCENT: Final = 5
 """An upgrade takes a minute or two; near 0 % the battery may switch itself off within it."""
-WAY_BACK: Final = "way-back"
 DEFAULT_IN_USE_MA: Final = 1000
 """Discharge current in mA: more than lights and displays use, less than the motor."""
 

@@ -215,6 +215,8 @@ class Profile:
     """Refuse an upgrade below this state of charge, unless a charger is connected."""
     in_use_ma: Annotated[int, NumberRange(ge=0, le=0x7FFF)] = Identity.in_use_ma
     """A larger discharge current means a vehicle in use."""
+    keep_settings: bool = False
+    """Save the settings before an upgrade, and restore those that changed and may be written."""
     frame_gap_s: Annotated[float, NumberRange(ge=0, le=1)] = UpgradeOptions.frame_gap_s
     """Silence between the frames of a message."""
     packet_gap_s: Annotated[float, NumberRange(ge=0, le=PACKET_GAP_MAX_S)] = (

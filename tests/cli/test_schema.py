@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import zipfile
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
@@ -104,6 +105,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("read", "--list"),
         ("write", "user-string-1", "RACK 7", "--yes", *MOCK),
         ("backup", "-o", Path("b.zip"), "--force", *MOCK),
+        ("backup", "restore", Path("kept.zip"), "--yes", "--mock", "--mock-speed", "0"),
         ("write", "--list"),
         ("monitor", "--mock", "--mock-speed", "0", "--duration", "3", "--raw"),
         ("profile", "show", "-t", "bms"),
@@ -147,6 +149,10 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", _press_ctrl_c)
     named = {str(word) for word in request.getfixturevalue("words")}
+    with zipfile.ZipFile("kept.zip", "w") as kept:
+        items = {"check-code": {"check_code": "00112233445566778899AABB"}}
+        inside = {"format": 1, "info": {"target": "bms", "items": items}}
+        kept.writestr("backup.json", json.dumps(inside))
     Path("bike.toml").write_text(f"[[target]]\ntarget = 'obc'\nimage = '{OBC}'\n", "utf-8")
     Path("right.toml").write_text("attempts = 5\n", "utf-8")
     Path("nothing.log").write_text("(1.0) can0 123#616263\n", "utf-8")

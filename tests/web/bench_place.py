@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Concatenate, ParamSpec
 
 from flasher.api import Job
+from flasher.cli.look.backup import backup_folder
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
 from flasher.cli.stop import Stop
-from flasher.cli.upgrade.bench_page import LastChoices, VirtualBikes, backup_folder
+from flasher.cli.upgrade.bench_page import LastChoices, VirtualBikes
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT

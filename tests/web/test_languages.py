@@ -20,7 +20,7 @@ from sqlalchemy import event
 
 from flasher.bus.bit_rate import bit_rate
 from flasher.bus.opening import open_bus
-from flasher.cli.upgrade.bench_page import backup_folder
+from flasher.cli.look.backup import backup_folder
 from flasher.protocol.spec import BMS
 from flasher.station.board import Board
 from flasher.station.certificate import proven, render_certificate

@@ -6,26 +6,40 @@ import datetime
 import hashlib
 import io
 import json
+import re
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from platformdirs import user_data_path
 
 from flasher import __version__
+from flasher.api import as_target
 from flasher.cli import values
 from flasher.cli.documents import as_json
 from flasher.cli.files import check_new, write_whole
-from flasher.cli.framework import command, option
+from flasher.cli.framework import argument, group, missing_option, option
 from flasher.cli.look.info import InfoDocument, info_document, silence_error
 from flasher.cli.look.memory import intel_hex, read_with_bar
 from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
-from flasher.errors import ExitCode, UsageError
+from flasher.cli.terminal import agrees, can_ask
+from flasher.errors import ErrorCode, ExitCode, UsageError, VerificationError
+from flasher.files import parse_json, read
 from flasher.host.query import READ_MEMORY
 from flasher.i18n import text
 from flasher.image.load import load
+from flasher.kept_settings import (
+    Setting,
+    SettingResult,
+    SettingState,
+    restore_settings,
+    settings_of_items,
+)
 from flasher.mock.store import AREA_START
 from flasher.procedures import DeviceInfo, two_devices_error
 from flasher.protocol.spec import Target
@@ -45,6 +59,7 @@ examples:
   flasher backup -t bms -o battery.zip --profile bench.toml
   flasher backup -t bms -o battery.zip --no-memory       its answers, without its memory
   flasher backup -t bms -o battery.zip --mock
+  flasher backup restore battery.zip -i socketcan -c can0
 
 The documents let a tool read memory by address, and give no addresses. They come from
 application_area in the profile (flasher.toml), or from an image like the one that runs; none is
@@ -52,6 +67,19 @@ guessed, since an address that does not exist may crash a device.
 
 FILE is a zip archive, written whole or not at all: memory.hex (Intel HEX; the CRC of each message
 was right) and backup.json (identity, state, faults, history, strings).
+"""
+
+
+_BACKUP_MAX: Final = 64 * 1024 * 1024
+"""Maximum size of a backup in bytes."""
+_RESTORE_EXAMPLES: Final = """\
+examples:
+  flasher backup restore battery.zip -i socketcan -c can0
+  flasher backup restore battery.zip --yes --mock
+
+Exit code 10 when a setting is not confirmed or reads back differently, 6 for a unit with another
+serial number. Serial number, model and production information are only compared: the manufacturer
+writes them, by flasher write.
 """
 
 
@@ -100,7 +128,16 @@ class DataInBackup:
     """Document of `flasher info --json`."""
 
 
-DOCUMENTS: Final = (BackupDocument,)
+@dataclass(frozen=True)
+class RestoredDocument:
+    """Settings of a device after `backup restore`."""
+
+    target: str
+    file: str
+    settings: list[SettingResult]
+
+
+DOCUMENTS: Final = (BackupDocument, RestoredDocument)
 
 
 @dataclass(frozen=True)
@@ -116,16 +153,18 @@ class DeviceBackup:
 DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, text("the device model"))
 
 
-@command(
+@group(
+    runs_alone=True,
     epilog=_EXAMPLES,
     exit_codes=(
-        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.WRONG_DEVICE, ExitCode.INTERRUPTED,
+        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.WRONG_DEVICE, ExitCode.VERIFICATION,
+        ExitCode.INTERRUPTED,
     ),
 )  # fmt: skip
-@target_option()
+@target_option(required=False)
 @option(
-    "-o", _OUTPUT, "file", metavar="FILE", type=values.FilePath("zip", gives=Path), required=True,
-    panel="backup", help="the archive to write",
+    "-o", _OUTPUT, "file", metavar="FILE", type=values.FilePath("zip", gives=Path),
+    panel="backup", brief=True, help="the archive to write",
 )  # fmt: skip
 @option(
     "--image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES), panel="backup",
@@ -138,19 +177,21 @@ DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, text("the 
 @recording_options
 def backup(
     output: Output,
-    target: Target,
+    target: Target | None,
     bus: Bus,
     recorded: RecordingOptions,
     *,
-    file: Path,
+    file: Path | None,
     image: str | None,
     no_memory: bool,
     force: bool,
     profile: str | None,
 ) -> int:
     """Save the application's memory of a device, and all its answers, to a file. Nothing is written
-    to the device. The documents let a tool read the BMS only.
+    to the device. The documents let a tool read the BMS only. `restore` writes settings back.
     """
+    if target is None or file is None:
+        raise missing_option("target" if target is None else "file")
     if READ_MEMORY.receiver is not target.node:
         raise UsageError(
             f"The {target.node.name} has nothing to back up: the documents give no way to read its "
@@ -179,6 +220,86 @@ def backup(
             "these may not be the addresses of the application"
         )
     return output.document(document)
+
+
+@backup.action("restore", epilog=_RESTORE_EXAMPLES)
+@argument("file", metavar="FILE", type=values.FilePath("zip", gives=Path))
+@option("-y", "--yes", is_flag=True, panel="restore", brief=True, help="do not ask")
+@option(
+    "--force", is_flag=True, panel="restore", brief=True,
+    help="write them to a unit with another serial number too",
+)  # fmt: skip
+@bus_options()
+@recording_options
+def restore(
+    output: Output, bus: Bus, recorded: RecordingOptions, *, file: Path, yes: bool, force: bool
+) -> int:
+    """Write the settings of a backup back, those that changed and that a tool may write: user
+    strings and check code. Each is read back. Memory is not written: flash memory.hex for that.
+    """
+    target, settings = _settings_of_file(file, bus)
+    if not yes and not can_ask():
+        raise UsageError(
+            "Writing settings needs a confirmation, and there is no terminal to ask.",
+            remedy="Add --yes.",
+            code=ErrorCode.NOT_CONFIRMED,
+        )
+    node = target.node.name
+    if not yes and not agrees(
+        f"Write the settings of {printable(str(file))} to the {node}?",
+        interrupted="nothing was sent.",
+    ):
+        output.progress("nothing was written")
+        return output.document(
+            RestoredDocument(target.name, str(file), []), exit_code=ExitCode.INTERRUPTED
+        )
+    with recorded_device(recorded, bus, output, target) as (device, record):
+        results = list(restore_settings(device, settings, allow_other_unit=force))
+        failed = [each for each in results if each.state is SettingState.NOT_RESTORED]
+        error = None
+        if failed:
+            error = VerificationError(
+                f"{len(failed)} of {len(results)} settings of the {node} were not restored.",
+                where=f"{failed[0].name}: {failed[0].detail}",
+                remedy="Run the same command again.",
+                code=ErrorCode.WRITE_DIFFERS,
+            )
+            record.failed(error)
+    output.table((each.name, each.state.value.replace("_", " "), each.detail) for each in results)
+    document = RestoredDocument(target.name, str(file), results)
+    return output.document(document) if error is None else output.failure(error, document)
+
+
+def _settings_of_file(file: Path, bus: Bus) -> tuple[Target, dict[str, Setting]]:
+    """Read the target and the settings of a backup. Raises UsageError."""
+    raw = read(file, _BACKUP_MAX, what="backup")
+    try:
+        target, items = _inside(raw)
+        return target, settings_of_items(items, target, bus.dialect)
+    except (
+        zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError,
+        LookupError, TypeError, AttributeError,
+    ) as error:  # fmt: skip
+        raise UsageError(
+            f"{printable(str(file))} is no backup of flasher, or is damaged.",
+            cause=printable(str(error)),
+            remedy="Name an archive that flasher backup, a flash with --keep-settings or the page "
+            "has written.",
+            code=ErrorCode.FILE_NOT_READ,
+        ) from error
+
+
+def _inside(raw: bytes) -> tuple[Target, dict[str, Any]]:
+    """Return the target and the items of a backup. Raises errors of zipfile and JSON, ValueError
+    and LookupError.
+    """
+    with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+        if archive.getinfo(_DATA).file_size > _BACKUP_MAX:
+            raise ValueError(f"{_DATA} in it is too large")
+        inside = parse_json(archive.read(_DATA))
+    if inside["format"] != FORMAT:
+        raise ValueError(f"its format is {inside['format']!a}")
+    return as_target(inside["info"]["target"]), inside["info"]["items"]
 
 
 def _address_range(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:
@@ -243,6 +364,34 @@ def backup_of(
         not_in_it=not_in_it | info.unanswered,
     )
     return DeviceBackup(document, archive, running)
+
+
+def backup_folder() -> Path:
+    """Folder of the backups that flasher makes by itself."""
+    return user_data_path("flasher", appauthor=False) / "backups"
+
+
+def own_backup_path(found: DeviceInfo) -> Path:
+    """Path of a new backup in that folder, named by device, serial number and time. Raises
+    UsageError if the folder cannot be created.
+    """
+    folder = backup_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            text(
+                "Cannot create the folder for backups: {value}.", value=error.strerror or str(error)
+            ),
+            where=printable(str(folder)),
+            remedy=text("Make room, or create the folder by hand."),
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        ) from error
+    version = found.version
+    serial = "" if version is None else re.sub(r"[^A-Za-z0-9]+", "-", str(version.serial_number))
+    at = f"{datetime.datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    name = "-".join(each for each in (found.target.name, serial.strip("-"), at) if each)
+    return folder / f"{name}.zip"
 
 
 def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> bytes:

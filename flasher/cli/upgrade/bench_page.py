@@ -4,40 +4,37 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
 import click
-from platformdirs import user_data_path, user_state_path
+from platformdirs import user_state_path
 
 from flasher.api import CallOptions, Connection, Job, connect
 from flasher.bus.opening import bus_config
 from flasher.bus.physical import is_physical
 from flasher.cli.adapters import describe_adapter, detect_until, slcan_ports, with_adapter
 from flasher.cli.files import write_whole
-from flasher.cli.look.backup import DEVICE_MODEL, backup_of
+from flasher.cli.look.backup import DEVICE_MODEL, backup_folder, backup_of, own_backup_path
 from flasher.cli.options import Bus, holder
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, recording
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
-from flasher.errors import ErrorCode, FlasherError, UsageError
+from flasher.errors import FlasherError, UsageError
 from flasher.files import parse_json, read
 from flasher.history import Flash, FlashHistory, latest_left_open
 from flasher.host.options import DEFAULT_ATTEMPTS
 from flasher.i18n import text
-from flasher.procedures import DeviceInfo
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.settings.area import Area
@@ -128,16 +125,6 @@ class _Place:
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> Saved:
-        folder = backup_folder()
-        try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(
-                f"Cannot create the folder for backups: {error.strerror or error}.",
-                where=printable(str(folder)),
-                remedy="Make room, or create the folder by hand.",
-                code=ErrorCode.FILE_NOT_WRITTEN,
-            ) from error
         with (
             recording(RecordingOptions(), self.bus(adapter), self._output, target=BMS) as record,
             self.connect(adapter) as connection,
@@ -149,7 +136,7 @@ class _Place:
             data = b""
             if area is not None and found.is_there:
                 data = device.read_memory(area.start, area.end)
-            path = folder / _backup_name(found)
+            path = own_backup_path(found)
             made = backup_of(found, area, data, connection.name, path)
         write_whole(path, made.archive, "", is_private=True)
         document = made.document
@@ -199,19 +186,6 @@ class _Place:
     ) -> Callable[[object], None]:
         """Create the listener for events of an upgrade that begins."""
         return on_event
-
-
-def backup_folder() -> Path:
-    """Folder for backups made on the page."""
-    return user_data_path("flasher", appauthor=False) / "backups"
-
-
-def _backup_name(found: DeviceInfo) -> str:
-    """File name from device, serial number and time."""
-    version = found.version
-    serial = "" if version is None else re.sub(r"[^A-Za-z0-9]+", "-", str(version.serial_number))
-    at = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-    return "-".join(each for each in (found.target.name, serial.strip("-"), at) if each) + ".zip"
 
 
 @dataclass

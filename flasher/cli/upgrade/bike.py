@@ -150,7 +150,7 @@ class BikeUpgrade:
 
     def _check_options(self, target: Target | None) -> None:
         image, choices = self.image, self.choices
-        choices.check_signature_options()
+        choices.check_contradictions()
         given = [name for key, name in _OF_ONE_IMAGE.items() if getattr(image, key) is not None]
         given += ["--manifest"] * (choices.manifest is not None)
         given += ["-t"] * (target is not None)
@@ -265,6 +265,8 @@ class BikeUpgrade:
         upgrade_run = UpgradeRun(
             device.job, self.bus, recorded, output, partial(self._add_repair, device), self._again
         )
+        profile = self._profile(device.part.target)
+        upgrade_run.keeps_settings = self.choices.keeps_settings(profile)
 
         @contextmanager
         def watching(_: api.Connection, record: Recording) -> Iterator[api.CallOptions]:

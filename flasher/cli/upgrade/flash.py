@@ -14,7 +14,14 @@ import click
 from flasher import api
 from flasher.cli import values
 from flasher.cli.adapters import check_heard, choose_adapter
-from flasher.cli.framework import Decorator, command, option, option_set, rebuild_command_line
+from flasher.cli.framework import (
+    Decorator,
+    command,
+    missing_option,
+    option,
+    option_set,
+    rebuild_command_line,
+)
 from flasher.cli.options import (
     STANDARD_INPUT,
     Bus,
@@ -150,6 +157,15 @@ class UpgradeChoices:
         "--nak-next-is-ack", is_flag=True, panel="upgrade",
         help="for bootloaders that answer a repeated packet n with NAK n+1",
     )]  # fmt: skip
+    keep_settings: Annotated[bool, option(
+        "--keep-settings", is_flag=True, panel="upgrade",
+        help="save what may be written (user strings, check code) before the upgrade, and restore "
+        "what changed (default: keep_settings of the profile)",
+    )]  # fmt: skip
+    no_keep_settings: Annotated[bool, option(
+        "--no-keep-settings", is_flag=True, panel="upgrade",
+        help="do not, whatever the profile has",
+    )]  # fmt: skip
     in_session: Annotated[bool, option(
         "--in-session", is_flag=True, panel="upgrade",
         help="an upgrade of this device was broken off, and it may still wait in it: when it "
@@ -235,8 +251,17 @@ class UpgradeChoices:
             waived=waived,
         )
 
-    def check_signature_options(self) -> None:
+    def keeps_settings(self, profile: Profile) -> bool:
+        """True if the settings are saved and restored."""
+        return (profile.keep_settings or self.keep_settings) and not self.no_keep_settings
+
+    def check_contradictions(self) -> None:
         """Raise UsageError for options that contradict each other."""
+        if self.keep_settings and self.no_keep_settings:
+            raise UsageError(
+                "--keep-settings and --no-keep-settings contradict each other.",
+                remedy="Leave one of them out.",
+            )
         if self.require_signed and self.allow_unsigned:
             raise UsageError(
                 "--require-signed and --allow-unsigned contradict each other.",
@@ -293,9 +318,7 @@ def flash(
     if without:
         raise UsageError("--without needs --bike.", remedy="Add --bike, or leave --without out.")
     if target is None:
-        ctx = click.get_current_context()
-        missing = next(each for each in ctx.command.params if each.name == "target")
-        raise click.MissingParameter(ctx=ctx, param=missing)
+        raise missing_option("target")
     upgrade = _Upgrade(output, target, image, choices, bus, recorded)
     return upgrade.run(skip_same_version=skip_same_version)
 
@@ -375,7 +398,7 @@ class _Upgrade:
         for warning in opened.provenance.warnings if opened.provenance else ():
             output.error_line(f"warning: {warning}")
         if not choices.dry_run:
-            return self._carry_out(job)
+            return self._carry_out(job, profile)
         checks = [each.event for each in job.checks]
         for check in checks:
             output.result(text.check_line(check))
@@ -391,7 +414,7 @@ class _Upgrade:
 
     def _open(self) -> api.OpenedImage:
         choices = self.choices
-        choices.check_signature_options()
+        choices.check_contradictions()
         with self.image.advice():
             return api.open_image(
                 self.image.source,
@@ -401,7 +424,7 @@ class _Upgrade:
                 **self.image.options(force=choices.force),
             )
 
-    def _carry_out(self, job: api.Job) -> int:
+    def _carry_out(self, job: api.Job, profile: Profile) -> int:
         output = self.output
         ctx = click.get_current_context()
         name, replaced = str(ctx.info_name), _image_again(ctx)
@@ -410,6 +433,7 @@ class _Upgrade:
         )
         again = shlex.join(["flasher", *words])
         upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
+        upgrade_run.keeps_settings = self.choices.keeps_settings(profile)
         result = upgrade_run.write_planned(
             lambda: self._connect(at_power_up=job.options.at_power_up),
             lambda connection, record: self._watching(upgrade_run.job, connection, record),

@@ -15,6 +15,7 @@ from flasher.api import CallOptions, Connection, Job
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
+from flasher.cli.upgrade.settings import SavedSettings, compare_settings, save_settings
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import (
@@ -46,6 +47,7 @@ class UpgradeRun:
     """Completes an error before it is recorded."""
     again: str = ""
     """Command that repeats the upgrade after this program was killed; empty for the page."""
+    keeps_settings: bool = False
     checks: list[CheckMade] = field(default_factory=list)
     record: Recording | None = None
     document: UpgradeDocument | None = None
@@ -59,6 +61,7 @@ class UpgradeRun:
     """Name in the history; None before the start."""
     _serial_number: str | None = None
     _result: Result | None = None
+    _saved: SavedSettings | None = None
 
     def write_planned(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
@@ -110,18 +113,11 @@ class UpgradeRun:
 
                         if left is not None:
                             on_event(left)
-                        device = connection.device(plan.target, dialect=self.bus.dialect)
-                        result = job.run(
-                            device,
-                            taps=record.taps,
-                            on_event=on_event,
-                            cancelled=watch.get("cancelled"),
-                            hung_up=watch.get("hung_up"),
-                        )
+                        result = self._run(connection, record, watch, on_event)
                     self.took_s = connection.clock.now() - began_at
             except FlasherError as failure:
                 self.error = failure
-                self.on_failure(failure)
+                self._failed(failure)
                 raise
             self._result = result
             self.error = error = result.error()
@@ -131,9 +127,40 @@ class UpgradeRun:
             record.facts["outcome"] = document.outcome
             record.facts["verification"] = document.verification
             if error is not None:
-                self.on_failure(error)
+                self._failed(error)
                 record.failed(error)
         return result
+
+    def _run(
+        self,
+        connection: Connection,
+        record: Recording,
+        watch: CallOptions,
+        on_event: Callable[[object], None],
+    ) -> Result:
+        """Run the upgrade, with the settings saved before and compared after it."""
+        device = connection.device(self.job.plan.target, dialect=self.bus.dialect)
+        calls: CallOptions = {"taps": record.taps, "cancelled": watch.get("cancelled")}
+        if self.keeps_settings:
+            self._saved = save_settings(device, on_event, **calls)
+        result = self.job.run(
+            device,
+            taps=record.taps,
+            on_event=on_event,
+            cancelled=watch.get("cancelled"),
+            hung_up=watch.get("hung_up"),
+        )
+        if self._saved is not None and result.outcome.ok:
+            compare_settings(device, self._saved, on_event, **calls)
+        return result
+
+    def _failed(self, error: FlasherError) -> None:
+        """Complete an error, with the command that restores the settings."""
+        self.on_failure(error)
+        if self._saved is not None:
+            command = self._saved.command
+            error.remedy = f"{error.remedy} Its settings are saved, and can be written back after "
+            error.remedy += f"that: `{command}`."
 
     # -- the history -------------------------------------------------------------------------------
 
