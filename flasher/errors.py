@@ -17,6 +17,10 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import ClassVar, Final, Self
 
+from flasher.builds import is_whole
+
+_NEW: Final = "flasher-env"
+"""Environment that a message proposes where no package can be added to this build."""
 _PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
 """Matches from the user to the last @ of a URL: a password may contain an @."""
 _NO_PORT: Final = re.compile(r"(:/+[^\s:/@]*):(?!\d+\b|\*+@)[^\s/@]+")
@@ -156,17 +160,35 @@ def did_you_mean(
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs packages into the running Python, quoted for the shell."""
-    words = [sys.executable, "-m", "pip", "install", *requirements]
-    if os.name == "nt":
+    """Return the command that installs packages into the running Python, quoted for the shell;
+    where that cannot be, into a new environment, with the wheel of this version, which is here.
+    """
+    is_windows, whole = os.name == "nt", is_whole()
+    if whole and not any(each.startswith(_wheel()) for each in requirements):
+        requirements = (_wheel(), *requirements)
+    python = sys.executable
+    if whole:
+        python = rf"{_NEW}\Scripts\python" if is_windows else f"{_NEW}/bin/python"
+    words = [python, "-m", "pip", "install", *requirements]
+    before = f"{'py' if is_windows else 'python3'} -m venv {_NEW} && " if whole else ""
+    if is_windows:
         from subprocess import list2cmdline  # noqa: PLC0415  slow, and for this alone
 
-        return list2cmdline(words)
-    return shlex.join(words)
+        return before + list2cmdline(words)
+    return before + shlex.join(words)
+
+
+def _wheel() -> str:
+    from importlib.metadata import version  # noqa: PLC0415  for this alone
+
+    return f"./welling_flasher-{version('welling-flasher')}-py3-none-any.whl"
 
 
 def how_to_install(extra: str) -> str:
     """Return the remedy for missing packages of an extra of flasher."""
+    if is_whole():
+        command = install_command(f"{_wheel()}[{extra}]")
+        return f"This build cannot be extended. In the folder with the wheel: {command}"
     command = install_command("-c", ".ci/constraints.txt", f".[{extra}]")
     return f"In the checkout: {command}"
 

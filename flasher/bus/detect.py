@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from flasher.builds import module_command
 from flasher.bus.inspect_interface import SYSFS, look_up
 
 LIMIT_S: Final = 4.5
@@ -33,7 +34,7 @@ _LIFE_S: Final = 30.0
 """Time after which a detection process ends by itself if its parent was killed."""
 _SLICE_S: Final = 0.2
 """Interval at which a wait checks for cancellation."""
-_COMMAND: Final = (sys.executable, "-m", "flasher.bus.detect")
+_COMMAND: Final = module_command("flasher.bus.detect")
 BUILT_IN: Final = frozenset({"virtual", "udp_multicast"})
 """Interfaces of python-can without an adapter; they always exist."""
 SOCKETCAN: Final = "socketcan"

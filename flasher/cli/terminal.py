@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
+from flasher.builds import SUFFIX, is_frozen, is_whole
 from flasher.errors import InterruptedByUserError
 
 _NO_WINDOW: Final = 10_000
@@ -43,12 +44,14 @@ def started_as() -> str:
         return shlex.join([sys.orig_argv[0], "-m", "flasher"])
     typed = sys.argv[0] if sys.argv else ""
     path = Path(typed)
-    if path.stem != "flasher" and path.suffix != ".pyz":
+    if path.stem != "flasher" and not is_whole():
         return _FROM_PATH  # it is a part of another program
+    if is_frozen() and os.sep not in typed:
+        return shlex.quote(typed)  # as the shell found it
     on_path = shutil.which(_FROM_PATH)
     if on_path is not None and path.exists() and Path(on_path).samefile(path):
         return _FROM_PATH
-    if path.suffix == ".pyz" and not os.access(path, os.X_OK):
+    if path.suffix == SUFFIX and not os.access(path, os.X_OK):
         return shlex.join([sys.orig_argv[0], typed])
     return shlex.quote(typed if os.sep in typed else f".{os.sep}{typed}")
 

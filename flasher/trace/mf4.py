@@ -16,12 +16,13 @@ from struct import Struct
 from tempfile import TemporaryFile
 from typing import IO, Final
 
+from flasher.builds import module_command
 from flasher.protocol.frame import Frame
 from flasher.python_can import can, load_mf4
 from flasher.trace.bounds import UnfitError
 from flasher.trace.recorder import frame_of, is_classic
 
-_COMMAND: Final = (sys.executable, "-m", "flasher.trace.mf4")
+_COMMAND: Final = module_command("flasher.trace.mf4")
 _RECORD: Final = Struct("<BdIB")
 """Kind, time in seconds, CAN id, size of what follows: the data, or the reason of the end."""
 _END: Final = 1 << 7

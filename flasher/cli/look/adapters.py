@@ -17,9 +17,10 @@ from flasher.bus.detect import (
 )
 from flasher.cli.adapters import describe_adapter, detect_adapters, interface_of, slcan_ports
 from flasher.cli.framework import command, option
+from flasher.cli.look.udev import udev_rules
 from flasher.cli.output import Output
 from flasher.cli.values import interface_names
-from flasher.errors import ExitCode, install_command
+from flasher.errors import ExitCode, UsageError, install_command
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 
@@ -27,6 +28,7 @@ _EXAMPLES: Final = """\
 examples:
   flasher adapters
   flasher adapters --network            listens for socketcand servers too, 4 s
+  flasher adapters --udev | sudo tee /etc/udev/rules.d/60-flasher.rules
   flasher adapters --json | jq -r '.adapters[].arguments | join(" ")'
 
 Opens no adapter and no serial port. Where one adapter alone is found, commands that only look use
@@ -82,10 +84,22 @@ DOCUMENTS: Final = (AdaptersDocument,)
     "--network", is_flag=True, brief=True,
     help="listen for socketcand servers on the network too",
 )  # fmt: skip
-def adapters(output: Output, *, network: bool) -> int:
+@option(
+    "--udev", is_flag=True,
+    help="print the udev rules that let users open adapters, for a file in /etc/udev/rules.d",
+)  # fmt: skip
+def adapters(output: Output, *, network: bool, udev: bool) -> int:
     """List the adapters of this computer, each with the arguments that select it, and the back ends
     that cannot list theirs.
     """
+    if udev and output.json_wanted:
+        raise UsageError(
+            "--udev prints a file of rules, not a JSON document.", remedy="Leave out --json."
+        )
+    if udev:
+        for line in udev_rules(WELLING):
+            output.result(line)
+        return ExitCode.OK
     detected, serial = detect_adapters(on_network=network), slcan_ports()
     document = adapters_document(detected, serial, on_network=network)
     if detected.found:

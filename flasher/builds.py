@@ -1,0 +1,32 @@
+"""How this flasher was packed: for pip, or whole, with its packages, as one file or a folder."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Final
+
+SUFFIX: Final = ".pyz"
+"""File name ending of the build in one file, which a Python runs."""
+
+
+def is_frozen() -> bool:
+    """True in the folder that PyInstaller makes, which contains a Python of its own."""
+    return bool(getattr(sys, "frozen", False))
+
+
+def is_whole() -> bool:
+    """True for a build to which pip can add no package."""
+    return is_frozen() or _program().suffix == SUFFIX
+
+
+def module_command(module: str) -> tuple[str, ...]:
+    """Return the command that runs a module of flasher in a process of its own; what contains
+    flasher whole understands Python's `-m` for it (`flasher_start`).
+    """
+    program = () if is_frozen() or not is_whole() else (str(_program().absolute()),)
+    return (sys.executable, *program, "-m", module)
+
+
+def _program() -> Path:
+    return Path(sys.argv[0] if sys.argv else "")
