@@ -125,7 +125,8 @@ def restore_settings(
             remedy="A device in its bootloader needs an upgrade first: see flasher info.",
         )
     serials = [
-        ", ".join(each[_SERIAL].shown.values()) if _SERIAL in each else "" for each in (before, now)
+        ", ".join(each[_SERIAL].shown.values()) if _SERIAL in each else "(not answered)"
+        for each in (before, now)
     ]
     if serials[0] != serials[1] and not allow_other_unit:
         raise WrongDeviceError(

@@ -105,7 +105,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("read", "--list"),
         ("write", "user-string-1", "RACK 7", "--yes", *MOCK),
         ("backup", "-o", Path("b.zip"), "--force", *MOCK),
-        ("backup", "restore", Path("kept.zip"), "--yes", "--mock", "--mock-speed", "0"),
+        ("backup", "restore", Path("kept.zip"), "--force", "--yes", "--mock", "--mock-speed", "0"),
         ("write", "--list"),
         ("monitor", "--mock", "--mock-speed", "0", "--duration", "3", "--raw"),
         ("profile", "show", "-t", "bms"),
