@@ -9,6 +9,7 @@ import hashlib
 import os
 import random
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -33,6 +34,8 @@ _ON_BUS_US: Final = 12_000
 """The time of an answer on a loaded bus."""
 _HEARD_AGAIN_US: Final = 50_000
 """The end of transfer can be answered again so long after complete."""
+_CHEAPEST: Final = LoadedBootloader if sys.platform == "linux" else BootloaderProcess
+"""Other linkers cannot wrap calls."""
 _BARE: Final = ("has_power", "has_readback", "has_bus_off", "has_timed_cuts")
 _NODES: Final = {"wmc": 1, "bms": 2, "obc": 3}
 
@@ -62,9 +65,7 @@ class RightCDevice:
         }
 
     @contextmanager
-    def subject(
-        self, kind: type[BootloaderProcess] = LoadedBootloader
-    ) -> Iterator[CompiledSubject]:
+    def subject(self, kind: type[BootloaderProcess] = _CHEAPEST) -> Iterator[CompiledSubject]:
         """It on its bench, loaded into this process or as users run theirs."""
         path = _build(self.choices, self.boot_version, is_library=kind is LoadedBootloader)
         with closing(kind(str(path))) as process:

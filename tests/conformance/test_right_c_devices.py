@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import sys
 
 import pytest
 
@@ -57,6 +58,7 @@ def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
     assert faults_of(seed, Selection(cases=(case_id,)), make=right_c_device) == []
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a linker that wraps calls")
 def test_a_bootloader_that_is_loaded_into_this_process_behaves_as_its_program() -> None:
     device, found = right_c_device(19), []
     for kind in (LoadedBootloader, BootloaderProcess):
