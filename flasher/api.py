@@ -18,6 +18,7 @@ from typing import (
     Any,
     Concatenate,
     Final,
+    NamedTuple,
     ParamSpec,
     TypeVar,
     Unpack,
@@ -33,8 +34,17 @@ from flasher.host.query import Request
 from flasher.host.session import Result
 from flasher.host.survey import Survey
 from flasher.host.table import Ending
-from flasher.host.verify import Level, Verification, as_level, check_level, default_level
+from flasher.host.verify import (
+    Level,
+    Verdict,
+    Verification,
+    as_level,
+    check_level,
+    default_level,
+    possible_levels,
+)
 from flasher.host.write import WritePlan, WriteResult
+from flasher.i18n import text
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
@@ -881,6 +891,51 @@ def _check_result(result: Result) -> Result:
     if error is not None:
         raise error
     return result
+
+
+class Comparison(NamedTuple):
+    """Comparison of a device with an image, without an upgrade."""
+
+    verification: Verification
+    memory_not_compared: str | None
+    """Reason why the memory was not compared; None if it was."""
+
+
+def compare(
+    device: Device,
+    plan: Plan,
+    options: UpgradeOptions,
+    level: Level | str | None = None,
+    **watch: Unpack[CallOptions],
+) -> Comparison:
+    """Compare what a device runs with an image: by `level`, else by its version, and by its memory
+    where that can be read. Nothing is written or reset. Raises UsageError for an impossible level.
+    """
+    chosen, unread = _comparable(plan, options) if level is None else (as_level(level), None)
+    if level is not None and chosen is Level.VERSION:
+        unread = text("as requested")
+    check_level(plan, chosen, options)
+    found = device.verify(plan, chosen, **watch)
+    if level is None and found.running_version and found.verdict is Verdict.NO_ANSWER:
+        unread = text("no answer {detail}", detail=found.detail)
+        is_named = plan.image.version is not None and plan.image.version == found.running_version
+        verdict = Verdict.VERSION_RIGHT if is_named else Verdict.VERSION_UNJUDGED
+        found = replace(found, level=Level.VERSION, verdict=verdict, detail="")
+    if found.level is Level.VERSION and not found.ok:
+        unread = text("the version decides already")
+    return Comparison(found, unread)
+
+
+def _comparable(plan: Plan, options: UpgradeOptions) -> tuple[Level, str | None]:
+    """Return the highest level, and the reason why the memory is not to be compared."""
+    if Level.MEMORY not in possible_levels(plan.target, options):
+        why = text(
+            "the documents give no way to read that of the {node}", node=plan.target.node.name
+        )
+        return Level.VERSION, why
+    if plan.image.base is None:
+        return Level.VERSION, text("a raw binary has no addresses")
+    return Level.MEMORY, None
 
 
 def with_release(image: Image, release: Release | None) -> Image:

@@ -112,6 +112,9 @@ def before_an_upgrade(page: Page, album: Album) -> None:
     page.click("#waive-2-go")
     expect(page.locator("#go")).to_be_visible()
     album.take("checks")
+    page.click("#do-compare")
+    expect(page.locator("#compared")).to_be_visible()
+    album.take("compared")
     _again(page)
 
 

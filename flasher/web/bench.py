@@ -17,7 +17,7 @@ from queue import Empty, Queue
 from typing import Final, Protocol, TypeVar
 
 from flasher import events
-from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
+from flasher.api import Connection, DeviceInfo, Job, Result, compare, prepare, refusal
 from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
 from flasher.history import Flash
@@ -32,6 +32,7 @@ from flasher.host.identity import (
 )
 from flasher.host.outcome import AGAIN
 from flasher.host.query import memory_bytes
+from flasher.host.verify import Level, Verdict, possible_levels
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
@@ -51,6 +52,7 @@ from flasher.web.bench_state import (
     Adapter,
     BenchState,
     BusWatch,
+    Compared,
     Done,
     Offer,
     Saved,
@@ -263,14 +265,14 @@ class BenchController:
         self._set(
             adapter=adapter, adapters=marked, bike=None, target=None, offers=(), offer=None,
             done=None, checks=(), notes=(), areas=None, saved=None, watched=None,
-            waived=frozenset(),
+            waived=frozenset(), compared=None,
         )  # fmt: skip
         if not self.state.is_rescue:
             self.look()
 
     def look(self) -> None:
         """Request the battery's identity, and receive from the others, which have no query."""
-        self._set(doing=Activity.LOOKING, bike=None, done=None)
+        self._set(doing=Activity.LOOKING, bike=None, done=None, compared=None)
         bike = self._seen(self._adapter(), BMS)
         self._set(bike=bike)
         if not bike.survey.heard:
@@ -385,6 +387,42 @@ class BenchController:
                 watcher, connection.link, connection.clock,
                 on_event=happened, cancelled=self._cancelled,
             )  # fmt: skip
+
+    def compare(self) -> None:
+        """Compare what the device runs with the chosen image. Nothing is written or reset."""
+        target, offer = self.state.target, self.state.offer
+        if target is None or offer is None:
+            raise UsageError("No image is chosen.", remedy="Choose the one to compare with.")
+        job = self._job(offer.path, target)
+        if Level.VERSION not in possible_levels(target, job.options):
+            raise UsageError(
+                text(
+                    "The documents give no query for what the {node} runs.", node=target.node.name
+                ),
+                remedy=text("Look into the history of this computer: it has each upgrade."),
+            )
+
+        def happened(event: object) -> None:
+            if isinstance(event, events.MemoryRead):
+                self._set(compared_bytes=event.read_bytes)
+
+        self._set(doing=Activity.COMPARING, compared=None, compared_bytes=0)
+        with self._backend.connect(self._adapter()) as connection:
+            device = connection.device(
+                target, dialect=self._backend.dialect, profile=self._backend.profile(target)
+            )
+            found, unread = compare(
+                device, job.plan, job.options, cancelled=self._cancelled, on_event=happened
+            )
+        error = found.error(target, is_after_upgrade=False)
+        if error is not None:
+            is_silent = found.verdict is Verdict.NO_ANSWER
+            error.remedy = (
+                text("Wake the device with its key, then compare again.")
+                if is_silent
+                else text("Upgrade it with this image, or choose the one that it should run.")
+            )
+        self._set(compared=Compared(offer, found, unread, error))
 
     def find_areas(self) -> None:
         """Find memory areas for a backup in the images that fit: reading an address that does not
@@ -501,7 +539,7 @@ class BenchController:
         self._set(
             doing=Activity.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
             repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
-            adapter_left_s=None, watched=None,
+            adapter_left_s=None, watched=None, compared=None,
         )  # fmt: skip
         self._last_image = None
         job = self._job(offer.path, chosen)

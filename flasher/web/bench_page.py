@@ -46,6 +46,7 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "look": (BenchController.look, ()),
     "watch": (BenchController.watch, ()),
     "areas": (BenchController.find_areas, ()),
+    "compare": (BenchController.compare, ()),
     "backup": (BenchController.back_up, ("source",)),
     "no-backup": (BenchController.leave_backup, ()),
     "target": (BenchController.choose_target, ("name",)),

@@ -12,7 +12,7 @@ from flasher import events
 from flasher.api import DeviceInfo, Result
 from flasher.errors import FlasherError
 from flasher.history import Flash
-from flasher.host.verify import Verdict
+from flasher.host.verify import Verdict, Verification
 from flasher.protocol.spec import Target
 from flasher.report.base import visible
 from flasher.settings.area import Area
@@ -30,6 +30,7 @@ class Activity(Enum):
     LOOKING_AGAIN = "looking_again"
     WATCHING = "watching"
     SAVING = "saving"
+    COMPARING = "comparing"
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,24 @@ class Saved:
 
 
 @dataclass(frozen=True)
+class Compared:
+    """Comparison of the device with the chosen image."""
+
+    offer: Offer
+    verification: Verification
+    memory_not_compared: str | None
+    """Reason why the memory was not compared; None if it was."""
+    error: FlasherError | None
+    """Why the device does not run the image; None if it does, as far as it was compared."""
+
+    @property
+    def is_sure(self) -> bool:
+        """True if version or memory are the image's."""
+        good = self.verification.verdict
+        return good in (Verdict.VERSION_RIGHT, Verdict.MEMORY_RIGHT)
+
+
+@dataclass(frozen=True)
 class BenchState:
     """Complete state of the bench page."""
 
@@ -177,6 +196,9 @@ class BenchState:
     saved_bytes: int = 0
     """Number of bytes of memory read for a backup so far."""
     saved: Saved | None = None
+    compared: Compared | None = None
+    compared_bytes: int = 0
+    """Number of bytes of memory compared so far."""
     watched: BusWatch | None = None
     dropped: tuple[str, ...] = ()
     target: Target | None = None

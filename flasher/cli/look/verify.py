@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import click
@@ -25,8 +25,7 @@ from flasher.cli.output import ClosingLine, Output, byte_count, counted
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.cli.upgrade import text
 from flasher.errors import ExitCode, VerificationError
-from flasher.host.options import UpgradeOptions
-from flasher.host.verify import Level, Verdict, Verification, possible_levels
+from flasher.host.verify import Level, Verdict, Verification
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.protocol.spec import Target
@@ -108,8 +107,8 @@ def verify(
     plan = api.make_plan(
         opened.image, target, bus.dialect, bitrate_bps=bus.bit_rate.bps, has_upgrade=True
     )
-    chosen, unread = _level(plan, options, level)
-    api.check_level(plan, chosen, options)
+    if level is not None:
+        api.check_level(plan, Level(level), options)
     with recorded_device(recorded, bus, output, target, settings) as (device, record):
         output.progress(f"comparing the {target.node.name} on {device.connection.name} ...")
 
@@ -120,15 +119,12 @@ def verify(
                 bar.move_to(event.read_bytes, event.total_bytes)
 
         with Bar(output, unit="B", unit_scale=True, desc="memory") as bar:
-            found = device.verify(plan, chosen, on_event=show)
-        if level is None and found.running_version and found.verdict is Verdict.NO_ANSWER:
-            unread = f"no answer {found.detail}"
-            found = replace(found, level=Level.VERSION, verdict=_by_version(plan, found), detail="")
+            found, unread = api.compare(device, plan, options, level, on_event=show)
+        if level is None and found.ok and unread is not None and plan.image.base is None:
+            unread += ": --base gives that of its first byte"
         error = found.error(target, is_after_upgrade=False)
         if error is not None and not isinstance(error, VerificationError):
             record.failed(error)
-    if found.level is Level.VERSION and not found.ok:
-        unread = "the version decides already"
     document = VerifyDocument(
         target.name, text.image_document(opened.image, vector_table(opened.image)), found, unread
     )
@@ -164,19 +160,3 @@ def _lines(plan: Plan, found: Verification, unread: str | None) -> Iterator[str]
             yield f"         and {len(found.differing) - _RANGES_SHOWN} more, see --json"
     elif found.verdict is Verdict.MEMORY_RIGHT:
         yield f"memory:  {byte_count(image.size_bytes)} are the image's"
-
-
-def _by_version(plan: Plan, found: Verification) -> Verdict:
-    is_named = plan.image.version is not None and plan.image.version == found.running_version
-    return Verdict.VERSION_RIGHT if is_named else Verdict.VERSION_UNJUDGED
-
-
-def _level(plan: Plan, options: UpgradeOptions, chosen: str | None) -> tuple[Level, str | None]:
-    """Return the level, and the reason why the memory is not to be compared."""
-    if chosen is not None:
-        return Level(chosen), "as requested" if chosen == Level.VERSION.value else None
-    if Level.MEMORY not in possible_levels(plan.target, options):
-        return Level.VERSION, f"the documents give no way to read that of the {plan.target.name}"
-    if plan.image.base is None:
-        return Level.VERSION, "a raw binary has no addresses: --base gives that of its first byte"
-    return Level.MEMORY, None

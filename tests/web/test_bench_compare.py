@@ -1,0 +1,118 @@
+"""The bench page's "Is this what runs?": the chosen image compared with the device."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ErrorCode, ExitCode
+from flasher.host.verify import Verdict
+from flasher.web.bench import BenchController
+from flasher.web.bench_state import BenchState
+from flasher.web.virtual_bike import BikeFault
+from tests.loops import each
+from tests.web.bench_place import IMAGE, BenchPlace, order
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> BenchPlace:
+    return BenchPlace(tmp_path)
+
+
+def chosen(place: BenchPlace, fault: BikeFault = BikeFault.NONE, target: str = "bms") -> BenchState:
+    return place.do(
+        order(BenchController.use_adapter, fault.value),
+        order(BenchController.choose_target, target),
+        order(BenchController.choose_image, IMAGE),
+    )
+
+
+def upgraded(place: BenchPlace) -> BenchState:
+    state = chosen(place)
+    assert state.offer is not None
+    done = place.do(order(BenchController.upgrade, "bms", state.offer.sha256)).done
+    assert done is not None
+    assert done.error is None
+    return place.do(
+        order(BenchController.choose_target, "bms"), order(BenchController.choose_image, IMAGE)
+    )
+
+
+def test_another_version_than_the_image_is_reported_and_nothing_is_sent_to_change_it(
+    place: BenchPlace,
+) -> None:
+    chosen(place)
+    state = place.do(BenchController.compare)
+    assert state.trouble is None
+    assert state.compared is not None
+    assert state.compared.verification.verdict is Verdict.VERSION_OTHER
+    assert state.compared.memory_not_compared == "the version decides already"
+    error = state.compared.error
+    assert error is not None
+    assert error.exit_code is ExitCode.VERIFICATION
+    assert "flasher" not in error.remedy
+    assert "--" not in error.remedy
+    again = place.do(BenchController.look)
+    assert again.bike is not None
+    assert again.bike.version is not None
+    assert str(again.bike.version.firmware_version) == state.compared.verification.running_version
+    assert again.compared is None, "it belonged to the bike before"
+
+
+def test_the_image_that_runs_is_confirmed(place: BenchPlace) -> None:
+    upgraded(place)
+    compared = place.do(BenchController.compare).compared
+    assert compared is not None
+    assert compared.error is None
+    assert compared.is_sure
+    assert compared.memory_not_compared == "a raw binary has no addresses"
+
+
+def test_an_upgrade_makes_the_comparison_void(place: BenchPlace) -> None:
+    state = chosen(place)
+    place.do(BenchController.compare)
+    assert state.offer is not None
+    done = place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
+    assert done.compared is None
+
+
+@each("target", ["wmc", "obc"])
+def test_a_device_without_a_version_query_cannot_be_compared(
+    target: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = BenchPlace(tmp_path_factory.mktemp("place"))
+    chosen(place, target=target)
+    state = place.do(BenchController.compare)
+    assert state.compared is None
+    assert state.trouble is not None
+    assert "no query for what the" in state.trouble.what
+
+
+def test_a_device_in_its_bootloader_is_no_match(place: BenchPlace) -> None:
+    state = chosen(place, BikeFault.POWER)
+    assert state.offer is not None
+    place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
+    place.do(
+        order(BenchController.choose_target, "bms"), order(BenchController.choose_image, IMAGE)
+    )
+    state = place.do(BenchController.compare)
+    assert state.compared is not None
+    assert state.compared.error is not None
+    assert state.compared.error.code in (ErrorCode.IN_BOOTLOADER, ErrorCode.NO_ANSWER)
+    assert not state.compared.is_sure
+
+
+def test_without_an_image_nothing_is_compared(place: BenchPlace) -> None:
+    state = place.do(BenchController.compare)
+    assert state.trouble is not None
+    assert state.trouble.what == "No image is chosen."
+    assert state.trouble.exit_code is ExitCode.USAGE
+
+
+def test_stop_ends_it_without_a_verdict(place: BenchPlace) -> None:
+    chosen(place)
+    place.bench.stop()
+    state = place.do(BenchController.compare)
+    assert state.compared is None or state.compared.error is not None
+    assert state.is_idle
