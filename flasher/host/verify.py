@@ -113,14 +113,15 @@ class Verification:
         if is_after_upgrade or self.verdict in (Verdict.TWO_DEVICES, Verdict.SECOND_TOOL):
             error = self._error(target, what)
             error.needs_rescue = self.device_left.needs_rescue
-            return error
-        return self._error_of_comparison(target, what)
+        else:
+            error = self._error_of_comparison(target, what)
+        error.where = f"verification by {self.level.value}"
+        return error
 
     def _error_of_comparison(self, target: Target, what: str) -> FlasherError:
         if self.verdict is Verdict.IN_BOOTLOADER:
             return VerificationError(
                 what,
-                where=f"verification by {self.level.value}",
                 cause="an upgrade of it was broken off or refused: it has no application",
                 remedy=f"Flash it: flasher flash IMAGE -t {target.name}.",
                 code=ErrorCode.IN_BOOTLOADER,
@@ -128,7 +129,6 @@ class Verification:
         if self.verdict is Verdict.NO_ANSWER:
             return NoAnswerError(
                 what,
-                where=f"verification by {self.level.value}",
                 cause="it is off, asleep or not connected, or an older device that does not know "
                 "the query",
                 remedy="Wake the device with its key; list the devices on the bus with flasher "
@@ -140,7 +140,6 @@ class Verification:
             cause = "it was flashed with another image, or another build of the same version"
         return VerificationError(
             what,
-            where=f"verification by {self.level.value}",
             cause=cause,
             remedy=f"flasher flash IMAGE -t {target.name} upgrades it; "
             "flasher image-info shows what is in an image.",
@@ -151,13 +150,11 @@ class Verification:
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(
                 what,
-                where=f"verification by {self.level.value}",
                 remedy=self._with_state("Show its version with flasher info."),
             )
         if self.verdict is Verdict.TWO_DEVICES:
             return WrongDeviceError(
                 what,
-                where=f"verification by {self.level.value}",
                 cause=TWO_DEVICES_CAUSE,
                 remedy=TWO_DEVICES_REMEDY,
                 code=ErrorCode.TWO_DEVICES,
@@ -165,7 +162,6 @@ class Verification:
         if self.verdict is Verdict.SECOND_TOOL:
             return BusError(
                 what,
-                where=f"verification by {self.level.value}",
                 cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
                 remedy=self._with_state(
                     "End the other tool, then look at the device with flasher info."
@@ -175,7 +171,6 @@ class Verification:
         if self.verdict is Verdict.IN_BOOTLOADER:
             return VerificationError(
                 what,
-                where=f"verification by {self.level.value}",
                 cause="the device does not start the image that it confirmed, or a second device "
                 "of its kind has lost its application",
                 remedy=self._with_state(
@@ -193,7 +188,6 @@ class Verification:
             remedy = self._with_state(remedy)
         return VerificationError(
             what,
-            where=f"verification by {self.level.value}",
             cause="the device runs another image, fell back to an older one, or does not start",
             remedy=remedy,
             code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,

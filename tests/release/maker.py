@@ -22,6 +22,7 @@ from flasher.protocol.spec import BMS, Target  # noqa: E402
 from flasher.release import container, verify  # noqa: E402
 from flasher.release.build import Part, build, with_signatures  # noqa: E402
 from flasher.release.keys import PublicKey, SigningKey  # noqa: E402
+from flasher.release.store import TrustStore  # noqa: E402
 from flasher.release.transparency import ReleaseLog  # noqa: E402
 from flasher.release.trust import Chain, Role, Trust, TrustedKey, new_chain  # noqa: E402
 from flasher.settings.manifest import release_of  # noqa: E402
@@ -137,3 +138,13 @@ def signed(raw: bytes, signers: Sequence[str]) -> bytes:
 
 def opened(raw: bytes) -> verify.Package:
     return verify.parse_package(container.unpack(raw, "bike.wfw"), "bike.wfw")
+
+
+@pytest.fixture
+def maker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Maker:
+    """The maker whose keys this computer trusts."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    made = Maker()
+    TrustStore().install(made.chain)
+    return made

@@ -27,22 +27,14 @@ from flasher.station.records.model import (
 )
 from flasher.station.runs import with_history
 from flasher.station.unit_checks import signature_measurements
-from tests.release.maker import Maker, chain_of, first_trust, role, trusted
+from tests.release.maker import Maker, chain_of, first_trust, maker, role, trusted
 from tests.station.factory import DAY, HEAD, IMAGES, SERIAL, SERIAL_NUMBER, Bench, target_table
 from tests.station.postgres import Server
 from tests.station.unit_bench import NEW_UNIT, WRITES, UnitBench
 
+__all__ = ["maker"]  # a fixture
+
 USUAL = HEAD + SERIAL_NUMBER
-
-
-@pytest.fixture
-def maker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Maker:
-    """The maker whose keys this computer trusts."""
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    made = Maker()
-    TrustStore().install(made.chain)
-    return made
 
 
 def table(signature: str = "", image: str = "bike.wfw") -> str:

@@ -16,20 +16,12 @@ from flasher.web.bench_page import BenchPage
 from flasher.web.bench_state import BenchState, Done, Offer
 from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault
-from tests.release.maker import Maker, role, trusted
+from tests.release.maker import Maker, maker, role, trusted
 from tests.web.bench_place import IMAGE, BenchPlace, order
 
+__all__ = ["maker"]  # a fixture
+
 RELEASE = "bike.wfw"
-
-
-@pytest.fixture
-def maker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Maker:
-    """The maker whose keys this computer trusts."""
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    made = Maker()
-    TrustStore().install(made.chain)
-    return made
 
 
 @pytest.fixture
