@@ -99,15 +99,37 @@ DECLARE
     images bigint[];
     here bigint;
 BEGIN
-    here := plant_named('station', '{{name}}', shared->'station');
-    r.socket_id := plant_named('socket', '{{station_id,name}}',
-        (shared->'socket') || jsonb_build_object('station_id', here));
-    r.unit_id := plant_named('unit', '{{part,serial}}', own->'unit');
-    r.operator_id := plant_named('operator', '{{name}}', shared->'operator');
-    r.lot_id := plant_named('lot', '{{part,name}}', shared->'lot');
-    r.recipe_id := plant_named('recipe', '{{name,revision,part,sha256,content,'
-        'verification_required,allow_completed_not_read_back}}', shared->'recipe');
-    SELECT array_agg(plant_named('artifact', '{{target,name,version,sha256,size_bytes}}', each)
+    -- Looked up here first: their plans are cached, those of plant_named are made each time.
+    SELECT id INTO here FROM station WHERE name = shared->'station'->>'name';
+    here := coalesce(here, plant_named('station', '{{name}}', shared->'station'));
+    SELECT id INTO r.socket_id FROM socket
+        WHERE station_id = here AND name = shared->'socket'->>'name';
+    IF r.socket_id IS NULL THEN
+        r.socket_id := plant_named('socket', '{{station_id,name}}',
+            (shared->'socket') || jsonb_build_object('station_id', here));
+    END IF;
+    SELECT id INTO r.unit_id FROM unit
+        WHERE part = own->'unit'->>'part' AND serial = own->'unit'->>'serial';
+    r.unit_id := coalesce(r.unit_id, plant_named('unit', '{{part,serial}}', own->'unit'));
+    SELECT id INTO r.operator_id FROM operator WHERE name = shared->'operator'->>'name';
+    r.operator_id := coalesce(r.operator_id,
+        plant_named('operator', '{{name}}', shared->'operator'));
+    SELECT id INTO r.lot_id FROM lot
+        WHERE part = shared->'lot'->>'part' AND name = shared->'lot'->>'name';
+    r.lot_id := coalesce(r.lot_id, plant_named('lot', '{{part,name}}', shared->'lot'));
+    SELECT t.id INTO r.recipe_id FROM recipe t,
+        jsonb_populate_record(NULL::recipe, shared->'recipe') k
+        WHERE t.sha256 = k.sha256 AND t.name = k.name AND t.revision = k.revision
+        AND t.part = k.part AND t.verification_required = k.verification_required
+        AND t.allow_completed_not_read_back = k.allow_completed_not_read_back
+        AND t.content = k.content;
+    r.recipe_id := coalesce(r.recipe_id, plant_named('recipe', '{{name,revision,part,sha256,'
+        'content,verification_required,allow_completed_not_read_back}}', shared->'recipe'));
+    SELECT array_agg(coalesce((SELECT t.id FROM artifact t,
+            jsonb_populate_record(NULL::artifact, each) k
+            WHERE t.sha256 = k.sha256 AND t.target = k.target AND t.name = k.name
+            AND t.version = k.version AND t.size_bytes = k.size_bytes),
+            plant_named('artifact', '{{target,name,version,sha256,size_bytes}}', each))
         ORDER BY at) INTO images FROM jsonb_array_elements(shared->'artifacts')
         WITH ORDINALITY AS x(each, at);
     r.id := floor(extract(epoch FROM r.begun_at::timestamptz) * 1000000);
@@ -190,7 +212,9 @@ BEGIN
         RAISE EXCEPTION '%', refusal USING ERRCODE = '{REFUSED}';
     END IF;
     NEW.arrived_at := clock_timestamp();
-    NEW.station_id := plant_named('station', '{{name}}', jsonb_build_object('name', mine.name));
+    SELECT id INTO NEW.station_id FROM station WHERE name = mine.name;
+    NEW.station_id := coalesce(NEW.station_id,
+        plant_named('station', '{{name}}', jsonb_build_object('name', mine.name)));
     IF NEW.content IS NULL THEN
         IF NEW.run_number IS NOT NULL THEN
             SELECT run_id INTO NEW.run_id FROM chain_row WHERE station = NEW.station

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -26,8 +27,10 @@ LOOK_S: Final = 1.0
 REPORT_S: Final = 10.0
 """Interval at which the state is reported if nothing has to be sent."""
 RETRY_MAX_S: Final = 30.0
-_END_S: Final = 5.0
+_END_S: Final = 10.0
 """Time limit for the last batch when the station ends; what is left is sent at the next start."""
+_LOOK_AFTER_S: Final = 0.5
+_RESTART_S: Final = 2.0
 _LOG: Final = logging.getLogger(__name__)
 
 
@@ -81,21 +84,33 @@ def keep_sending(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
 
 @contextmanager
 def sending(what: Sending) -> Iterator[None]:
-    """Send records in a process of its own while the block runs."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, what), name="plant", daemon=True)
-    with signals_blocked():
-        process.start()
-    theirs.close()
+    """Send records in a process of its own while the block runs; one that dies is replaced."""
+    over = threading.Event()
+    watch = threading.Thread(target=_watch, args=(what, over), name="plant", daemon=True)
+    watch.start()
     try:
         yield
     finally:
+        over.set()
+        watch.join()
+
+
+def _watch(what: Sending, over: threading.Event) -> None:
+    context = multiprocessing.get_context("spawn")
+    while not over.is_set():
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs, what), name="plant", daemon=True)
+        with signals_blocked():
+            process.start()
+        theirs.close()
+        while not over.wait(_LOOK_AFTER_S) and process.exitcode is None:
+            pass
         ours.close()  # it then sends what is left
         process.join(_END_S)
         if process.exitcode is None:
             process.kill()
             process.join()
+        over.wait(_RESTART_S)
 
 
 def _work(channel: Connection, what: Sending) -> None:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
 import sqlite3
 import sys
+import time
+from collections.abc import Callable
 from contextlib import closing
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -121,7 +125,8 @@ def test_a_server_that_is_away_is_named_without_the_password(flasher: Flasher) -
 def test_a_station_sends_while_it_runs(
     flasher: Flasher, plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The forwarder is a real process."""
+    """The forwarder is a real process, which takes its time to start on a busy computer."""
+    monkeypatch.setattr("flasher.plant.process._END_S", 60.0)
     monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     file = tmp_path / "station.toml"
@@ -182,3 +187,29 @@ def test_what_reads_all_stations(flasher: Flasher, plant: Plant, sender: Sender)
     assert changed.out.startswith("line-2, run 1: what reports and pages show differs")
     none = flasher("plant", "units", "--image", "V9", *database)
     assert "No station has used an image V9" in none.err
+
+
+def test_a_process_that_is_killed_is_replaced(plant: Plant, sender: Sender) -> None:
+    sender.bench.make()
+    sender.end()
+    url, path = plant.url("flasher_line_2"), str(sender.bench.path)
+    before = set(multiprocessing.active_children())
+    with sending(Sending(url, "line-2", path, None)):
+        first = _appeared(before)
+        first.kill()
+        assert _appeared(before | {first}).pid != first.pid
+        wait_until(lambda: plant.rows("SELECT count(*) FROM run") == [(1,)])
+
+
+def wait_until(is_so: Callable[[], bool], limit_s: float = 60.0) -> None:
+    end_s = time.perf_counter() + limit_s
+    while not is_so():
+        assert time.perf_counter() < end_s
+        time.sleep(0.1)
+
+
+def _appeared(before: set[BaseProcess]) -> BaseProcess:
+    """The process that appears besides those."""
+    wait_until(lambda: bool(set(multiprocessing.active_children()) - before))
+    (found,) = set(multiprocessing.active_children()) - before
+    return found

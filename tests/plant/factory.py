@@ -92,6 +92,7 @@ class Sender:
     station: str
     folder: Path
     role: str = ""
+    _forwarders: list[Forwarder] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.folder.mkdir(exist_ok=True)
@@ -104,6 +105,7 @@ class Sender:
 
     def start(self) -> None:
         """A new process: it knows nothing of the last one."""
+        self.end()
         self.forwarder = Forwarder(
             self.bench.opened(self.station).database,
             self.bench.store.files,
@@ -111,6 +113,16 @@ class Sender:
             self.station,
             FakeClock(datetime.now(UTC)),
         )
+        self._forwarders.append(self.forwarder)
+
+    def lose_the_server(self) -> None:
+        self.forwarder._central.close()
+        self.forwarder._central = Central("postgresql://x@127.0.0.1:1/plant")
+
+    def end(self) -> None:
+        """End the process that sends."""
+        while self._forwarders:
+            self._forwarders.pop().close()
 
     def send(self) -> None:
         """Send everything; raises what the plant answers."""
@@ -120,5 +132,5 @@ class Sender:
             raise self.forwarder.error
 
     def close(self) -> None:
-        self.forwarder.close()
+        self.end()
         self.bench.store.close()

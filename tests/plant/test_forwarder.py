@@ -167,7 +167,7 @@ def test_a_forwarder_that_dies_loses_and_doubles_nothing(
 
 def test_a_server_that_is_away_is_waited_for(plant: Plant, sender: Sender) -> None:
     run_id = sender.bench.make()
-    sender.forwarder._central = Central("postgresql://x@127.0.0.1:1/plant")
+    sender.lose_the_server()
     assert not sender.forwarder.forward()
     state = sender.forwarder.state
     assert state.fault
@@ -199,7 +199,7 @@ def test_it_sends_until_the_station_ends_and_then_the_rest(plant: Plant, sender:
 
 
 def test_it_waits_longer_for_a_server_that_stays_away(sender: Sender) -> None:
-    sender.forwarder._central = Central("postgresql://x@127.0.0.1:1/plant")
+    sender.lose_the_server()
     waits: list[float] = []
 
     def wait(limit_s: float) -> bool:
@@ -325,7 +325,7 @@ def test_records_are_sent_again_after_the_right_ones_are_back(
     copy = copied(sender, tmp_path / "copy.sqlite")
     changed(sender, "UPDATE operator SET name = 'somebody else'")
     assert refused(sender) is Refusal.EDITED
-    sender.forwarder.close()
+    sender.end()
     shutil.copy(copy, sender.bench.path)
     sender.start()
     sender.send()
