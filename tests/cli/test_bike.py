@@ -157,6 +157,25 @@ def test_a_device_that_reports_the_version_of_the_set_is_left_alone_unless_force
     assert bike.erased == [OBC, WMC, BMS]
 
 
+def test_a_release_with_several_images_is_a_set(
+    bike: BikeOnTheBus, flasher: Flasher, folder: Path
+) -> None:
+    release = folder / "bike.wfw"
+    images = [
+        word
+        for target in IMAGES
+        for word in ("--image", f"{target.name}={folder / target.name}.bin")
+    ]
+    built = flasher("release", "build", release, *images, "--product", "X", "--counter", "1")
+    assert built.code == ExitCode.OK, built.err
+    run = flasher("flash", "--bike", release, *WORDS, "--without", "bms")
+    assert run.code == ExitCode.WRONG_DEVICE, "the release states the version of the battery"
+    run = flasher("flash", "--bike", release, *WORDS)
+    assert run.code == ExitCode.OK, run.err
+    assert bike.is_done
+    assert bike.erased == [OBC, WMC, BMS]
+
+
 def test_a_dry_run_shows_the_plan_of_each_device_and_opens_no_adapter(
     upgrade: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
