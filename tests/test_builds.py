@@ -101,6 +101,16 @@ def test_every_module_that_is_started_is_one_that_the_start_knows() -> None:
     assert sorted(started) == sorted(flasher_start._PROCESSES)
 
 
+def test_the_packages_of_the_builds_have_the_versions_of_the_constraints() -> None:
+    pinned = re.compile(r"^[\w.-]+==[^ ;\n]+", re.MULTILINE)
+    builds, people = (
+        set(pinned.findall((CHECKOUT / ".ci" / name).read_text("utf-8")))
+        for name in ("bundle_hashes.txt", "constraints.txt")
+    )
+    assert len(builds) > 50
+    assert builds <= people  # else run .ci/lock
+
+
 # -- what the folder contains ----------------------------------------------------------------------
 
 

@@ -60,13 +60,13 @@ QUESTIONS: Final = (
         "service",
         "Can all three devices be upgraded in one go?",
         "how-to/questions.html#can-all-three-devices-be-upgraded-in-one-go",
-        "stops at the first one that fails",
+        "flasher flash --bike SET",
     ),
     Question(
         "service",
         "Can it be installed without Python?",
         "how-to/questions.html#can-it-be-installed-without-python",
-        "it needs Python 3.11 or later",
+        "a folder with a Python of its own",
     ),
     Question(
         "service",
