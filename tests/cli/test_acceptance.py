@@ -11,6 +11,7 @@ import pytest
 
 from flasher.errors import InterruptedByUserError
 from flasher.mock.model import MockDevice
+from flasher.mock.table import BootloaderState
 from tests.cli.conftest import SAMPLES, Flasher, Run
 
 MOCK = ("--mock", "--mock-speed", "0")
@@ -129,17 +130,18 @@ def test_ctrl_c_in_an_upgrade_leaves_the_report_and_the_state(
 
     def received(device: MockDevice, frame: Any, now: float) -> None:
         nonlocal seen
-        seen += 1
+        seen += device.state is BootloaderState.TRANSFER
         receive(device, frame, now)
 
     monkeypatch.setattr(MockDevice, "receive", received)
-    monkeypatch.setattr("flasher.cli.stop.Stop.__call__", lambda stop: seen > 800 or stop.is_asked)
+    monkeypatch.setattr("flasher.cli.stop.Stop.__call__", lambda stop: seen > 20 or stop.is_asked)
     run = walk("--yes")
     assert run.code == 130
     assert "stopped" in states(report()).values()
     assert "passed" in states(report()).values()
     assert "state of the BMS: " in run.out
     assert report()["verdict"] == "incomplete"
+    assert "with --force: it overwrites this report." in run.err
 
 
 def test_without_a_terminal_or_agreement_it_is_refused(walk: Callable[..., Run]) -> None:
@@ -156,6 +158,13 @@ def test_an_older_report_is_kept_unless_forced(walk: Callable[..., Run]) -> None
     assert Path("acceptance-bms.json").read_text() == "kept"
     assert walk("--yes", "--interrupt", "--force").code == 0
     assert walk("--yes", "-o", "report.txt").code == 2
+
+
+def test_an_image_for_another_target_is_refused_and_no_check_is_waived(flasher: Flasher) -> None:
+    run = flasher("acceptance", SAMPLES / "wmc.hex", "-t", "bms", *MOCK, "--yes")
+    assert run.code == 6
+    assert "Take the maker's image for this BMS: an acceptance waives no check." in run.err
+    assert not Path("acceptance-bms.html").exists()
 
 
 def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flasher) -> None:

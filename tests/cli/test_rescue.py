@@ -13,7 +13,7 @@ import click
 import pytest
 
 from flasher import events
-from flasher.cli.upgrade.flash import repair_command
+from flasher.cli.upgrade.choices import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
 from flasher.wording import wording

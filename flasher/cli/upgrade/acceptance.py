@@ -41,7 +41,7 @@ from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.events import PacketAcknowledged
-from flasher.host.outcome import DeviceLeft
+from flasher.host.outcome import AGAIN, DeviceLeft
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
@@ -203,7 +203,13 @@ def acceptance(
     bus = choose_adapter(bus.with_profile(profile), output)
     identity = settings.identity(release=opened.release, provenance=opened.provenance)
     job = api.prepare(opened.image, settings, bitrate_bps=bus.bit_rate.bps, identity=identity)
-    job.checked()
+    try:
+        job.checked()
+    except FlasherError as error:
+        error.remedy = (
+            f"Take the maker's image for this {target.node.name}: an acceptance waives no check."
+        )
+        raise
     with stop_on_signal(
         lambda: output.error_line("stopping at the end of the message ...")
     ) as stop:
@@ -581,6 +587,8 @@ class _Walk:
             output.verdict(closing if not practice else closing._replace(colour="yellow"))
             return output.document(document)
         if self.error is not None:
+            again = f"{AGAIN[:-1]} with --force: it overwrites this report."
+            self.error.remedy = self.error.remedy.replace(AGAIN, again)
             output.ending = lambda _error: closing
             return output.failure(self.error, document)
         output.verdict(closing)

@@ -29,7 +29,7 @@ from flasher.cli.output import ClosingLine, Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade import text
-from flasher.cli.upgrade.flash import TRACE_OPTIONS, UpgradeChoices, repair_command
+from flasher.cli.upgrade.choices import TRACE_OPTIONS, UpgradeChoices, repair_command
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     BikeDeviceDocument,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Annotated, Final
+from dataclasses import dataclass
+from typing import Final
 
 import click
 
@@ -15,47 +14,41 @@ from flasher import api
 from flasher.cli import values
 from flasher.cli.adapters import check_heard, choose_adapter
 from flasher.cli.framework import (
-    Decorator,
     command,
     missing_option,
     option,
-    option_set,
     rebuild_command_line,
 )
 from flasher.cli.options import (
-    STANDARD_INPUT,
     Bus,
     ImageOptions,
     bus_options,
-    gap_options,
     holder,
     image_options,
-    profile_option,
     target_option,
 )
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.upgrade import text
+from flasher.cli.upgrade.choices import (
+    TRACE_OPTIONS,
+    UpgradeChoices,
+    image_again,
+    repair_command,
+    upgrade_options,
+)
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import BikeDocument, DryRunDocument, UpgradeDocument
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError, UsageError
-from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import (
-    DEFAULT_ATTEMPTS,
     DEFAULT_POWER_UP_TIMEOUT_S,
-    PATIENT_TRIES,
-    UpgradeOptions,
 )
 from flasher.host.outcome import AGAIN
-from flasher.host.verify import Level
-from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR, UNSIGNED, WAIVERS
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
-from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.settings.profile import Profile, load_profile
-from flasher.way_back import images_beside, images_here
 
 DOCUMENTS: Final = (UpgradeDocument, DryRunDocument, BikeDocument)
 _FLASH_EXAMPLES: Final = """\
@@ -102,175 +95,6 @@ _EXIT_CODES: Final = (
     ExitCode.INTERRUPTED,
 )
 
-# -- options ---------------------------------------------------------------------------------------
-
-
-def _waiver_option(name: str) -> Decorator:
-    return option(
-        f"--allow-{name}", is_flag=True, panel="checks before the first write",
-        help=f"let through {OF_DEVICE[name].permits}",
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class UpgradeChoices:
-    """Options of an upgrade, with its waived checks."""
-
-    manifest: Annotated[str | None, option(
-        "--manifest", metavar="FILE", type=values.FilePath("toml"), panel="image",
-        help="the image's release manifest (default: IMAGE.toml beside the image, if there is one)",
-    )]  # fmt: skip
-    profile: Annotated[str | None, profile_option]
-    dry_run: Annotated[bool, option(
-        "-n", "--dry-run", is_flag=True, panel="upgrade", brief=True,
-        help="show the plan and stop",
-    )]  # fmt: skip
-    verify: Annotated[str | None, option(
-        "--verify", type=click.Choice([level.value for level in Level]), panel="upgrade",
-        help="after the upgrade: ask the new application for its version, or read the whole image "
-        "back as well (default: version where the target has a query for it, else none)",
-    )]  # fmt: skip
-    packet_tries: Annotated[int | None, option(
-        "--retries", "packet_tries", type=values.count, metavar="N", panel="upgrade",
-        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries}, and "
-        f"{PATIENT_TRIES} once the device has no application)",
-    )]  # fmt: skip
-    attempts: Annotated[int | None, option(
-        "--attempts", type=values.count, metavar="N", panel="upgrade",
-        help="begin the upgrade up to N times: when the device restarts, a packet is lost for good "
-        f"or the adapter comes back (default {DEFAULT_ATTEMPTS}, and until the overall deadline "
-        "once the device has no application)",
-    )]  # fmt: skip
-    timeout_s: Annotated[float | None, option(
-        "--timeout", "timeout_s", type=values.seconds, metavar="S", panel="upgrade",
-        help="overall deadline in seconds, of all attempts together (default: computed from the "
-        "plan)",
-    )]  # fmt: skip
-    adapter_return_s: Annotated[float | None, option(
-        "--adapter-wait", "adapter_return_s", type=values.seconds, metavar="S", panel="upgrade",
-        help="seconds that a lost adapter may take to come back, once anything was sent "
-        f"(default {UpgradeOptions.adapter_return_s:g})",
-    )]  # fmt: skip
-    frame_gap_s: Annotated[float | None, gap_options]
-    packet_gap_s: float | None
-    nak_next_is_ack: Annotated[bool, option(
-        "--nak-next-is-ack", is_flag=True, panel="upgrade",
-        help="for bootloaders that answer a repeated packet n with NAK n+1",
-    )]  # fmt: skip
-    keep_settings: Annotated[bool, option(
-        "--keep-settings", is_flag=True, panel="upgrade",
-        help="save what may be written (user strings, check code) before the upgrade, and restore "
-        "what changed (default: keep_settings of the profile)",
-    )]  # fmt: skip
-    no_keep_settings: Annotated[bool, option(
-        "--no-keep-settings", is_flag=True, panel="upgrade",
-        help="do not, whatever the profile has",
-    )]  # fmt: skip
-    in_session: Annotated[bool, option(
-        "--in-session", is_flag=True, panel="upgrade",
-        help="an upgrade of this device was broken off, and it may still wait in it: when it "
-        "answers nothing, send it an update command",
-    )]  # fmt: skip
-    allow_implausible: Annotated[bool, _waiver_option("implausible")]
-    allow_other_target: Annotated[bool, _waiver_option("other-target")]
-    allow_hardware: Annotated[bool, _waiver_option("hardware")]
-    allow_downgrade: Annotated[bool, _waiver_option("downgrade")]
-    allow_previous_version: Annotated[bool, _waiver_option("previous-version")]
-    allow_in_use: Annotated[bool, _waiver_option("in-use")]
-    allow_low_charge: Annotated[bool, _waiver_option("low-charge")]
-    allow_boot_name: Annotated[bool, _waiver_option("boot-name")]
-    allow_boot_version: Annotated[bool, _waiver_option("boot-version")]
-    force: Annotated[bool, option(
-        "-f", "--force", is_flag=True, panel="checks before the first write",
-        help="the same as every --allow-... together but --allow-unsigned; neither a damaged file "
-        "nor a second tool is waived by any",
-    )]  # fmt: skip
-    require_signed: Annotated[bool, option(
-        "--require-signed", is_flag=True, panel="checks before the first write",
-        help="refuse an image that no trusted key has signed (default once this computer has a "
-        "trust file)",
-    )]  # fmt: skip
-    allow_unsigned: Annotated[bool, option(
-        "--allow-unsigned", is_flag=True, panel="checks before the first write",
-        help=f"let through {WAIVERS[UNSIGNED].permits}; --force does not",
-    )]  # fmt: skip
-
-    def allows(self, name: str) -> bool:
-        """True if --allow-NAME was given, or --force, which does not waive signatures."""
-        given: bool = getattr(self, f"allow_{name.replace('-', '_')}")
-        return given or (self.force and name != UNSIGNED)
-
-    def waived_checks(self) -> frozenset[IdentityCheck]:
-        """Waived checks of image and device."""
-        return frozenset(check for check in WAIVABLE if self.allows(check.value))
-
-    def options(self, profile: Profile, wait: float | None) -> UpgradeOptions:
-        """Return the options of the command line, with the profile as default. Raises UsageError
-        for options that exclude each other.
-        """
-        names = {each.name for each in (*fields(UpgradeOptions), *fields(Timings))}
-        chosen = {name: value for name, value in vars(self).items() if name in names}
-        chosen["allow_boot_name"] = self.allows("boot-name")
-        given = {name: None if value is False else value for name, value in chosen.items()}
-        return profile.upgrade_options(**given, power_up_timeout_s=wait)
-
-    def job(
-        self,
-        opened: api.OpenedImage,
-        path: str | Path,
-        profile: Profile,
-        bus: Bus,
-        *,
-        allow_outside_vector: bool,
-        verify: str | None,
-        at_power_up: bool = False,
-        power_up_timeout_s: float | None = None,
-        skip_same_version: bool = False,
-    ) -> api.Job:
-        """Prepare the upgrade of a device with the image of a file. Raises ImageError and
-        UsageError.
-        """
-        waived = [name for name in OF_DEVICE if self.allows(name)]
-        waived += [OUTSIDE_VECTOR] * (allow_outside_vector or self.force)
-        waived += [UNSIGNED] * self.allow_unsigned
-        return api.prepare(
-            opened.image,
-            profile,
-            bitrate_bps=bus.bit_rate.bps,
-            options=self.options(profile, power_up_timeout_s),
-            verify=None if self.dry_run else verify,
-            identity=profile.identity(
-                release=opened.release,
-                provenance=opened.provenance,
-                waived=self.waived_checks(),
-                skip_same_version=skip_same_version,
-                reports_unchecked=at_power_up,
-                images_here=images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES)),
-            ),
-            at_power_up=at_power_up,
-            waived=waived,
-        )
-
-    def keeps_settings(self, profile: Profile) -> bool:
-        """True if the settings are saved and restored."""
-        return (profile.keep_settings or self.keep_settings) and not self.no_keep_settings
-
-    def check_contradictions(self) -> None:
-        """Raise UsageError for options that contradict each other."""
-        if self.keep_settings and self.no_keep_settings:
-            raise UsageError(
-                "--keep-settings and --no-keep-settings contradict each other.",
-                remedy="Leave one of them out.",
-            )
-        if self.require_signed and self.allow_unsigned:
-            raise UsageError(
-                "--require-signed and --allow-unsigned contradict each other.",
-                remedy="Leave one of them out.",
-            )
-
-
-_upgrade_options: Final = option_set("choices", UpgradeChoices)
-
 
 # -- the commands ----------------------------------------------------------------------------------
 
@@ -278,7 +102,7 @@ _upgrade_options: Final = option_set("choices", UpgradeChoices)
 @command(epilog=_FLASH_EXAMPLES, exit_codes=(*_EXIT_CODES, ExitCode.NOTHING_TO_DO))
 @target_option(required=False)
 @image_options
-@_upgrade_options
+@upgrade_options
 @option(
     "--bike", is_flag=True, panel="upgrade", brief=True,
     help="IMAGE is a set: upgrade each device that it has an image for, in a safe order",
@@ -312,7 +136,7 @@ def flash(
     of a bike, one after the other.
     """
     if bike:
-        from flasher.cli.upgrade.bike import BikeUpgrade  # noqa: PLC0415  it imports this module
+        from flasher.cli.upgrade.bike import BikeUpgrade  # noqa: PLC0415  for sets alone
 
         return BikeUpgrade(output, image, choices, bus, recorded, frozenset(without)).run(target)
     if without:
@@ -326,7 +150,7 @@ def flash(
 @command(epilog=_RESCUE_EXAMPLES, exit_codes=_EXIT_CODES)
 @target_option()
 @image_options
-@_upgrade_options
+@upgrade_options
 @option(
     "--wait", type=values.seconds, metavar="S", panel="upgrade", brief=True,
     help=f"seconds to wait for the announcement (default {DEFAULT_POWER_UP_TIMEOUT_S:g})",
@@ -427,7 +251,7 @@ class _Upgrade:
     def _carry_out(self, job: api.Job, profile: Profile) -> int:
         output = self.output
         ctx = click.get_current_context()
-        name, replaced = str(ctx.info_name), _image_again(ctx)
+        name, replaced = str(ctx.info_name), image_again(ctx)
         words = rebuild_command_line(
             ctx, name, without=TRACE_OPTIONS.__contains__, replaced=replaced
         )
@@ -502,40 +326,3 @@ class _Upgrade:
             is_refused = error.exit_code is ExitCode.REFUSED
             error.command = repair_command(click.get_current_context(), is_refused=is_refused)
             error.remedy = error.remedy.replace(f"{AGAIN} ", "")
-
-
-# -- the command that repairs ----------------------------------------------------------------------
-
-OTHER_IMAGE: Final = "OTHER_IMAGE"
-"""Placeholder for another image, after the device refused the one sent."""
-SAME_IMAGE: Final = "IMAGE"
-"""Placeholder for an image from standard input, which is read once."""
-TRACE_OPTIONS: Final = frozenset({"--trace-file", "--overwrite-trace"})
-_LEFT_OUT: Final = TRACE_OPTIONS | {"--timeout", "--skip-same-version", "--bike", "--without"}
-"""Options that the repair command omits: a deadline for a device that answers at once (a rescue
-waits until it is switched off and on), a trace that is evidence now, options without `rescue`."""
-_OF_THE_IMAGE: Final = frozenset(
-    {"--format", "--base", "--range", "--fill-gaps-up-to", "--manifest", "--force"}
-)
-
-
-def _image_again(ctx: click.Context) -> dict[str, str]:
-    return {"image": SAME_IMAGE} if ctx.params["image"] == STANDARD_INPUT else {}
-
-
-def repair_command(
-    ctx: click.Context, *, is_refused: bool, of_set: tuple[Target, str] | None = None
-) -> str:
-    """Return the `flasher rescue` command for the command of `ctx`, quoted for a shell. Options
-    about an image that the device refused are omitted. `of_set` is a device of a bike, and the file
-    of its image.
-    """
-
-    def is_left_out(name: str) -> bool:
-        of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
-        return name in _LEFT_OUT or (is_refused and of_the_image)
-
-    image = _image_again(ctx) if of_set is None else {"image": of_set[1]}
-    replaced = {"image": OTHER_IMAGE} if is_refused else image
-    words = rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)
-    return shlex.join(["flasher", *words, *(() if of_set is None else ("-t", of_set[0].name))])
