@@ -328,6 +328,7 @@ def test_sigterm_to_all_processes_of_a_station_finishes_the_runs_that_go_on(tmp_
 def test_ctrl_c_while_the_program_loads_is_one_line_without_a_traceback(tmp_path: Path) -> None:
     interrupted = """\
 import builtins, os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
 real = builtins.__import__
 def load(name, *others):
     if name == "flasher.cli.main":

@@ -54,7 +54,7 @@ _EXAMPLES: Final = """\
 examples:
   flasher acceptance firmware.hex -t bms -i socketcan -c can0
   flasher acceptance firmware.hex -t bms -i pcan -c PCAN_USBBUS1 -o bench-3.html
-  flasher acceptance firmware_samples/bms.hex -t bms --mock --yes --interrupt    practice
+  flasher acceptance firmware.hex -t bms --mock --yes --interrupt    practice
 
 Ten minutes: bus, speed of the adapter, identity, reading, two upgrades with the maker's image, and
 one that is interrupted in its middle on request and rescued. Nothing is erased before you agree.
