@@ -24,7 +24,13 @@ from flasher.conformance.mock import (
     device_maker,
     profile_of_mock,
 )
-from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys, unstated
+from flasher.conformance.profile import (
+    ConformanceProfile,
+    Limits,
+    load_profile,
+    profile_keys,
+    unstated,
+)
 from flasher.conformance.results import InitResult
 from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
@@ -271,6 +277,8 @@ def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
     found = values(ask_device(erasing, ConformanceProfile()))
     assert found["limits.erase_s"] > AREA_BYTES / 2048 * 0.1  # the largest image
     assert found["limits.pause_s"] == 12.5
+    # As long as the document gives it: no image was refused.
+    assert found["limits.complete_s"] == Limits().complete_s
     assert found["limits.window_s"] == pytest.approx(0.32, abs=0.002)
 
 

@@ -14,7 +14,7 @@ from flasher.conformance.init import entry_questions, transfer_questions
 from flasher.conformance.init.answers import Findings, Trial, decide, limit_answer
 from flasher.conformance.init.session import ANSWER_S, InitSession
 from flasher.conformance.judge import TimeName
-from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
+from flasher.conformance.profile import ConformanceProfile, Limits, Value, profile_keys
 from flasher.conformance.restore import restore
 from flasher.conformance.results import CaseEnded, InitResult, KeyAnswer, RunStopped
 from flasher.conformance.subject import Subject
@@ -71,7 +71,8 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
     "limits.start_s": (1.0, (TimeName.START, TimeName.START_AGAIN)),
     "limits.erase_s": (0.5, (TimeName.REQUEST,)),
     "limits.ack_s": (0.1, (TimeName.ANSWER, TimeName.REJECTED)),
-    "limits.complete_s": (0.5, (TimeName.COMPLETE,)),
+    # A rejected image may be reported later than complete, and no question ends one.
+    "limits.complete_s": (Limits().complete_s, (TimeName.COMPLETE,)),
 }
 """Smallest value of a limit in seconds, and the measured times that determine it."""
 NOT_ASKED: Final = {
