@@ -37,7 +37,7 @@ _PACKET_ANSWERS: Final = (Reply.ACK, Reply.NAK, Reply.BOOT_VERSION, Reply.COMPLE
 
 
 def is_leftover(one: Received, requested_at: float) -> bool:
-    """True for a boot version that was sent before request transfer (R11)."""
+    """True for a boot version that was sent before request transfer, or a restart (R11)."""
     return one.kind is Reply.BOOT_VERSION and one.at < requested_at + LEFTOVER_S
 
 
@@ -100,26 +100,44 @@ class PatientHost:
         limit_s = self._profile.limit("start_s") if within_s is None else within_s
         if self._encoder.has_version_query:
             return self.application_version(limit_s) is not None
-        tester = self._tester
-        deadline = tester.now + limit_s
+        tester, limit = self._tester, self._profile.limit
+        kinds = (Reply.FEEDBACK, Reply.BOOT_VERSION)
+        deadline, start_s = tester.now + limit_s, tester.waits.burst_s + limit_s
+        announced_at = inf  # first boot version after a reset: it may have restarted (RS-02)
         while True:
             # One that starts at the end of its limit answers the last reset.
-            is_last = tester.now >= deadline
+            is_last = tester.now >= deadline and (
+                announced_at == inf or tester.now >= announced_at + start_s
+            )
             with tester.collecting_feedback():
-                tester.send(self._encoder.reset())
-                runs = tester.wait_for(Reply.FEEDBACK) is not None
+                sent_at = tester.send(self._encoder.reset()).left_at
+                ends_at = tester.now + limit("feedback_s")
+                while reply := tester.wait_for(*kinds, within_s=ends_at - tester.now):
+                    if reply.kind is Reply.FEEDBACK:
+                        break
+                    if not is_leftover(reply, sent_at):
+                        announced_at = min(announced_at, reply.at)
+            runs = reply is not None
             if runs or is_last:
                 # A message sent before the application listens again would be lost.
-                if tester.wait_for(Reply.BOOT_VERSION) is not None:
-                    start_s = self._profile.limit("start_s") if runs else _SETTLE_S
-                    tester.wait(tester.waits.burst_s + start_s)
+                reply = tester.wait_for(Reply.BOOT_VERSION)
+                if reply is not None and announced_at == inf and not runs:
+                    # Each reset restarted the bootloader before it announced itself.
+                    announced_at = reply.at
+                    tester.wait_until(announced_at + start_s)
+                    continue
+                if reply is not None:
+                    after_s = limit("start_s") if runs else _SETTLE_S
+                    tester.wait(tester.waits.burst_s + after_s)
                     tester.forget()
                 tester.expired = {} if runs else limits_of(limit_s)
                 return runs
-            # The reset may have started a burst (RS-02), which another reset would restart.
-            quiet_s = self._tester.waits.burst_s + _SETTLE_S
-            while tester.wait_for(Reply.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
-                pass
+            # The reset may have started a burst, which another reset would restart.
+            quiet_s = tester.waits.burst_s + _SETTLE_S
+            while reply := tester.wait_for(Reply.BOOT_VERSION, within_s=quiet_s):
+                announced_at = min(announced_at, reply.at)
+                if tester.now >= max(deadline, announced_at + start_s):
+                    break
 
     def read_memory(self, start: int, size_bytes: int) -> bytes | None:
         """Read memory of the application from `start` on; None when it does not answer."""

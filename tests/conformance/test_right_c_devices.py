@@ -17,6 +17,7 @@ from flasher.conformance.init import ask_device
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
+from tests.campaigns.profiles import faults as profile_faults
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_c_in_process import LoadedBootloader
 from tests.campaigns.right_devices import HELD, faults_of
@@ -138,6 +139,11 @@ def test_init_finds(seed: int, changed: dict[str, int], wanted: dict[str, Value 
     assert {key: found[key] for key in wanted} == wanted
 
 
+def test_an_image_may_be_refused_much_later_than_init_saw_the_good_one_confirmed() -> None:
+    """After 10 s, where complete follows at once."""
+    assert profile_faults(17, Selection(cases=("TX-07",)), make=right_c_device) == []
+
+
 def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without_power() -> None:
     device = right_c_device(3)
     choices = {**device.choices, "PAGE_BYTES": 8448, "PAUSE_US": 2_500_000}
@@ -161,10 +167,25 @@ def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without
         # A pause counts from the packet, whose ACK comes 0.5 s later.
         (24, "fitting", "reset update=good packet update=good update=300 update=good"),
         (24, "default", "reset update=128 packets=4 packet-zero end-mark packet-start"),
+        # A reset in its announcements restarts it, and it takes 2 s to announce itself again.
+        (27, "fitting", "reset"),
     ),
 )
 def test_a_walk_finds_nothing(seed: int, profile: str, steps: str) -> None:
     device = right_c_device(seed)
     with device.subject() as subject:
         result = Explorer(subject, device.profiles[profile], seed="1").replay(steps.split())
+    assert result.finding is None
+
+
+@each("first_us", (958_000, 1_200_000, 4_900_000))
+@each("profile", ("fitting", "default"))
+def test_a_bootloader_that_resets_restart_may_use_its_times_to_the_limit(
+    first_us: int, profile: str
+) -> None:
+    device = right_c_device(27)
+    times = {"FIRST_US": first_us, "START_US": 4_900_000}
+    device = dataclasses.replace(device, choices={**device.choices, **times})
+    with device.subject() as subject:
+        result = Explorer(subject, device.profiles[profile], seed="1").replay(["reset"])
     assert result.finding is None
