@@ -62,6 +62,8 @@ def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender)
         runs = page(pages, "/runs")
         assert "W2605002" in runs
         assert "W2605003" in runs
+        assert "<th>station, socket</th>" in runs
+        assert "line-3, A" in runs
         for path in ("/yield", "/times", "/images", "/audit"):
             assert pages.answer(Question(path)).status == 200
         assert "line-3" in page(pages, "/units", serial="W2605003", part="BAT-36")
