@@ -125,15 +125,17 @@ def restore_settings(
             remedy="A device in its bootloader needs an upgrade first: see flasher info.",
         )
     serials = [
-        ", ".join(each[_SERIAL].shown.values()) if _SERIAL in each else "(not answered)"
-        for each in (before, now)
+        ", ".join(each[_SERIAL].shown.values()) if _SERIAL in each else "" for each in (before, now)
     ]
-    if serials[0] != serials[1] and not allow_other_unit:
+    if not allow_other_unit and (serials[0] != serials[1] or not serials[0].strip()):
+        was, is_now = (ascii(each) if each.strip() else "none" for each in serials)
         raise WrongDeviceError(
-            f"The {node} has the serial number {serials[1]!a}, and the settings are of "
-            f"{serials[0]!a}: nothing was written.",
-            cause="another unit is connected, or the upgrade has lost the serial number",
-            remedy="Connect the unit that they are of; --force writes them to this one.",
+            f"The {node} has the serial number {is_now}, and the settings are of {was}: nothing "
+            "was written.",
+            cause="another unit is connected, the upgrade has lost the serial number, or the unit "
+            "never reported one",
+            remedy="Connect the unit that they are of; flasher backup restore --force writes them "
+            "to this one.",
         )
     for name, setting in before.items():
         present = now.get(name)
