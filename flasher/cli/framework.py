@@ -181,7 +181,7 @@ def rebuild_command_line(
     command: str,
     *,
     without: Callable[[str], bool] = lambda _option: False,
-    replaced: Mapping[str, str] | None = None,
+    replaced: Mapping[str, str | list[str]] | None = None,
 ) -> list[str]:
     """Build a command line that runs `command` with the arguments of the command of `ctx`,
     passwords hidden.

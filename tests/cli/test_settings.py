@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -10,13 +11,14 @@ from pathlib import Path
 import pytest
 
 from flasher.cli.look.backup import backup_folder
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, UsageError
 from flasher.mock.bms import BmsApplication
 from flasher.protocol.contents import CheckCode, SerialNumber, UserString
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.text import encode_text
 from tests.cli.conftest import Flasher, Run
 from tests.end_to_end.stage import IMAGE, Stage
+from tests.loops import each
 
 WORDS = ("-t", "bms", "-i", "virtual")
 
@@ -159,13 +161,68 @@ def test_a_failure_names_the_command_that_restores_the_settings_afterwards(
     run = flash("--keep-settings", "--timeout", "20")
     assert run.code not in (ExitCode.OK, ExitCode.INTERNAL)
     (path,) = saved()
-    assert f"can be written back after that: `flasher backup restore {path}`" in run.err
+    assert f"can be written back after that: `flasher backup restore {path} -i virtual`" in run.err
     battery.stage.give_power()
     assert flash().code == ExitCode.OK
     restored = flasher("backup", "restore", path, "--yes", "-i", "virtual")
     assert restored.code == ExitCode.OK, restored.err
     assert battery.kept["user string 1"] == RACK
     assert "user-string-1           restored" in restored.out
+
+
+def test_the_printed_command_restores_the_settings_from_a_folder_with_a_space(
+    battery: Settings,
+    flash: Callable[..., Run],
+    flasher: Flasher,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "my data"))
+    run = flash("--keep-settings")
+    assert run.code == ExitCode.OK, run.err
+    words = shlex.split(run.err.split("settings are saved: `")[1].split("`")[0])
+    assert words[1:] == ["backup", "restore", str(saved()[0]), "-i", "virtual"]
+    battery.kept["user string 1"] = EMPTY
+    assert flasher(*words[1:], "--yes").code == ExitCode.OK
+    assert battery.kept["user string 1"] == RACK
+
+
+@each("number", ["", "    "])
+def test_settings_of_a_unit_without_a_serial_number_are_not_written_to_another_one(
+    battery: Settings, flash: Callable[..., Run], number: str
+) -> None:
+    battery.kept["serial number"] = SerialNumber(_text(number))
+    battery.lose(user_string_1=EMPTY)
+    run = flash("--keep-settings", "--force")
+    assert run.code == ExitCode.OK
+    assert "not all were compared: The BMS has the serial number none" in run.err
+    assert battery.kept["user string 1"] == EMPTY
+
+
+def test_a_full_disk_ends_the_command_before_anything_is_erased(
+    battery: Settings, flash: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_whole(path: Path, *_arguments: object, **_options: object) -> None:
+        raise UsageError(f"{path} cannot be written: No space left on device.", remedy="Name one.")
+
+    monkeypatch.setattr("flasher.cli.upgrade.settings.write_whole", write_whole)
+    run = flash("--keep-settings")
+    assert run.code == ExitCode.USAGE
+    assert "what to do: Make room there, or upgrade with --no-keep-settings." in run.err
+    assert battery.stage.has != IMAGE.data
+
+
+def test_a_rescue_does_not_query_a_device_without_application_for_its_settings(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "image.bin"
+    path.write_bytes(IMAGE.data)
+    words = ("-t", "bms", "--mock", "--mock-speed", "0", "--keep-settings", "--allow-implausible")
+    run = flasher("rescue", path, *words, "--json")
+    assert run.code == ExitCode.OK, run.err
+    sentences = [each["text"] for each in run.document["checks"] if each["check"] == "settings"]
+    assert sentences == ["not saved: no application runs that could report them"]
+    assert saved() == []
 
 
 # -- backup restore --------------------------------------------------------------------------------

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Unpack
 
+import click
+
 from flasher.api import CallOptions, Device
 from flasher.cli.files import write_whole
+from flasher.cli.framework import rebuild_command_line
 from flasher.cli.look.backup import backup_of, own_backup_path
-from flasher.errors import FlasherError, InterruptedByUserError
+from flasher.errors import FlasherError, UsageError
 from flasher.events import SETTINGS, CheckMade
 from flasher.kept_settings import Setting, SettingState, restore_settings, settings_in, settings_of
 from flasher.protocol.text import printable
@@ -31,8 +35,15 @@ class SavedSettings:
 
     @property
     def command(self) -> str:
-        """Command that writes them back; the options of the adapter are missing."""
-        return f"flasher backup restore {printable(str(self.path))}"
+        """Command that writes them back, with the options of the adapter."""
+        ctx = click.get_current_context()
+        options = [each for each in ctx.command.params if getattr(each, "panel", "") == "bus"]
+        of_bus = {"--dialect", "--mock", "--mock-speed", *(each.opts[-1] for each in options)}
+        words = rebuild_command_line(
+            ctx, "backup", without=lambda name: name not in of_bus,
+            replaced={"image": ["restore", str(self.path)]},
+        )  # fmt: skip
+        return printable(shlex.join(["flasher", *words]))
 
 
 Emit = Callable[[CheckMade], None]
@@ -52,12 +63,12 @@ def save_settings(device: Device, emit: Emit, **watch: Unpack[CallOptions]) -> S
         emit(CheckMade(SETTINGS, "unknown", f"the {node} answers no query: nothing was saved"))
         return None
     path = own_backup_path(found)
-    write_whole(
-        path,
-        backup_of(found, None, b"", device.connection.name, path).archive,
-        "",
-        is_private=True,
-    )
+    archive = backup_of(found, None, b"", device.connection.name, path).archive
+    try:
+        write_whole(path, archive, "", is_private=True)
+    except UsageError as error:
+        error.remedy = "Make room there, or upgrade with --no-keep-settings."
+        raise
     saved = SavedSettings(path, values)
     emit(CheckMade(SETTINGS, "passed", f"the settings are saved: `{saved.command}` restores them"))
     emit(CheckMade(SETTINGS, "passed", _NOT_KEPT))
@@ -86,8 +97,8 @@ def compare_settings(
                     why = each.detail or "it was not answered"
                     what = f"the {name} was not restored: {why} `{saved.command}` tries again"
                     emit(CheckMade(SETTINGS, "warned", what))
-    except (FlasherError, InterruptedByUserError) as error:
-        what = f"not all were compared: {error.what} `{saved.command}` goes on"
+    except FlasherError as error:
+        what = f"not all were compared: {error.what} {error.remedy} `{saved.command}` goes on"
         emit(CheckMade(SETTINGS, "warned", what))
     else:
         emit(

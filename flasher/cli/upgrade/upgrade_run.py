@@ -19,6 +19,7 @@ from flasher.cli.upgrade.settings import SavedSettings, compare_settings, save_s
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import (
+    SETTINGS,
     CheckMade,
     PacketAcknowledged,
     Phase,
@@ -141,7 +142,11 @@ class UpgradeRun:
         """Run the upgrade, with the settings saved before and compared after it."""
         device = connection.device(self.job.plan.target, dialect=self.bus.dialect)
         calls: CallOptions = {"taps": record.taps, "cancelled": watch.get("cancelled")}
-        if self.keeps_settings:
+        if self.keeps_settings and self.job.options.at_power_up:
+            # No application answers a query, and the announcement must not be missed meanwhile.
+            what = "not saved: no application runs that could report them"
+            on_event(CheckMade(SETTINGS, "unknown", what))
+        elif self.keeps_settings:
             self._saved = save_settings(device, on_event, **calls)
         result = self.job.run(
             device,
