@@ -8,6 +8,10 @@ from typing import Final
 
 SUFFIX: Final = ".pyz"
 """File name ending of the build in one file, which a Python runs."""
+_START: Final = "flasher_start"
+"""Module that the build in one file begins with. Somebody else's file with flasher in it does not,
+and would begin itself anew for each process.
+"""
 
 
 def is_frozen() -> bool:
@@ -17,7 +21,7 @@ def is_frozen() -> bool:
 
 def is_whole() -> bool:
     """True for a build to which pip can add no package."""
-    return is_frozen() or _program().suffix == SUFFIX
+    return is_frozen() or (_START in sys.modules and _program().suffix == SUFFIX)
 
 
 def module_command(module: str) -> tuple[str, ...]:

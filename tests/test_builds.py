@@ -78,6 +78,12 @@ def test_one_file_is_named_with_its_place(one_file: Path) -> None:
 # -- processes -------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("one_file")
+def test_one_file_of_somebody_else_is_not_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "flasher_start")
+    assert module_command("flasher.trace.mf4") == (sys.executable, "-m", "flasher.trace.mf4")
+
+
 def test_one_file_runs_its_processes_by_itself(one_file: Path) -> None:
     own = "flasher.bus.detect"
     assert module_command(own) == (sys.executable, str(one_file), "-m", own)
