@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
+from secrets import token_hex
 from typing import Any, Final
 from uuid import UUID
 
@@ -30,8 +31,8 @@ from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.schema import OWN_PARTS, SHARED_PARTS
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
-from flasher.station.records.database import Database
-from flasher.station.records.errors import RecordError, mapped
+from flasher.station.records.database import Database, in_file_name
+from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import StationClock, utc_text
 from flasher.station.records.schema import audit
@@ -39,7 +40,6 @@ from flasher.station.records.schema import audit
 BATCH_ROWS: Final = 200
 BATCH_BYTES: Final = 4 * 1024 * 1024
 """Traces of a batch; the first run is sent whatever its size."""
-STATE_FILE: Final = "plant.json"
 _STATE_MAX_SIZE: Final = 64 * 1024
 _ROW: Final = ("number", "at", "event", "data", "previous_hash", "hash", "signature")
 
@@ -82,11 +82,14 @@ class ForwarderState:
 _STATE: Final = TypeAdapter(ForwarderState)
 
 
-def load_state(folder: Path) -> ForwarderState:
-    """Read the forwarder's file in the folder of the records' files; the default without one.
-    Raises RecordError.
-    """
-    path = folder / STATE_FILE
+def state_file(folder: Path, station: str) -> Path:
+    """The forwarder's file in the folder of the records' files, which stations may share."""
+    return folder / f"plant-{in_file_name(station)}.json"
+
+
+def load_state(folder: Path, station: str) -> ForwarderState:
+    """Read the forwarder's file; the default without one. Raises RecordError."""
+    path = state_file(folder, station)
     if not path.exists():
         return ForwarderState()
     try:
@@ -168,8 +171,9 @@ class Forwarder:
                 raise
             self._parts.clear()
             self.error, fault = error, error.cause or error.what
-        self._note(head, fault, refusal)
+        self.state = self._state_after(head, fault, refusal)
         self._report()
+        self._save_state()
         return not (fault or refusal) and self.state.unsent > 0
 
     def has_new(self) -> bool:
@@ -254,22 +258,28 @@ class Forwarder:
 
     # -- state ------------------------------------------------------------------------------------
 
-    def _note(self, head: _Head | None, fault: str, refusal: str) -> None:
-        """Compute the state, and write it to the file."""
+    def _state_after(self, head: _Head | None, fault: str, refusal: str) -> ForwarderState:
         now, number, offset_s = self._clock.utc(), self.state.sent, self.state.clock_offset_s
         if head is not None:
             number, offset_s = head.number, (now - head.now).total_seconds()
         with self._records.reading() as local:
             last, oldest = _rest(local, self._station, number)
-        self.state = ForwarderState(
+        return ForwarderState(
             utc_text(now), number, last - number, oldest, offset_s, fault, refusal
         )
-        path = self._files.folder / STATE_FILE
-        part = path.with_suffix(".part")
-        with mapped(printable(str(path)), writes=True):
+
+    def _save_state(self) -> None:
+        """Write the state to its file, if the disk takes it: sending goes on without."""
+        path = state_file(self._files.folder, self._station)
+        # `flasher plant send` may write it too while the station runs.
+        part = path.with_name(f".{path.name}-{token_hex(4)}.part")
+        with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(_STATE.dump_json(self.state))
-            part.replace(path)  # not flushed to the disk: the next attempt writes it again
+            try:
+                part.write_bytes(_STATE.dump_json(self.state))
+                part.replace(path)  # not flushed to the disk: the next attempt writes it again
+            finally:
+                part.unlink(missing_ok=True)
 
     def _report(self) -> None:
         """Report the state to the database, if it can be reached."""
@@ -281,9 +291,11 @@ class Forwarder:
             "unsent": state.unsent,
             "oldest": state.oldest_unsent_at,
             "offset_s": state.clock_offset_s,
-            "free": shutil.disk_usage(self._files.folder).free,
+            "free": None,
             "refusal": state.refusal,
         }
+        with suppress(OSError):
+            values["free"] = shutil.disk_usage(self._files.folder).free
         try:
             with self._central.writing() as central:
                 central.execute(_REPORT, values)

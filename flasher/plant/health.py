@@ -18,17 +18,17 @@ STALE_S: Final = 4 * RETRY_MAX_S
 """Age of the last attempt after which the process that sends is regarded as dead."""
 
 
-def check(folder: Path, now: datetime) -> HealthCheck:
-    """Check the state that the forwarder has written into the folder of the records' files."""
+def check(folder: Path, station: str, now: datetime) -> HealthCheck:
+    """Check the state that a station's forwarder wrote into the folder of the records' files."""
     name = text("plant")
     try:
-        state = load_state(folder)
+        state = load_state(folder, station)
     except FlasherError as error:
         return HealthCheck(name, is_good=False, text=error.what)
     if state.refusal:
         sentence = text("REFUSED by the plant: {reason}", reason=printable(state.refusal))
     elif not state.at or abs((now - utc_moment(state.at)).total_seconds()) > STALE_S:
-        sentence = text("nothing is sent to the plant: the process that sends does not run")
+        sentence = text("the process that sends to the plant does not report")
     elif state.fault:
         sentence = text("{count} rows wait: the plant cannot be reached", count=state.unsent)
     else:

@@ -86,7 +86,7 @@ def station_main(name: str, url: str, folder: Path, runs: int) -> None:
                 sender = context.Process(target=_send, args=(what, folder), daemon=True)
                 sender.start()
             if done >= runs:
-                state = forwarder.load_state(store.files.folder)
+                state = forwarder.load_state(store.files.folder, name)
                 if state.at and not (state.unsent or state.fault) and _is_last(store, state):
                     return
                 time.sleep(0.5)

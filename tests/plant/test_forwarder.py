@@ -15,11 +15,13 @@ import pytest
 
 from flasher.plant import forwarder as forwarder_module
 from flasher.plant.central import Central, ChainRefusedError, Refusal
-from flasher.plant.forwarder import ForwarderState, load_state
+from flasher.plant.forwarder import ForwarderState, load_state, state_file
 from flasher.plant.health import check
 from flasher.plant.process import keep_sending
 from flasher.plant.setup import setup
+from flasher.station.health import HealthCheck
 from flasher.station.records.errors import RecordError
+from flasher.station.records.files import FileStore
 from flasher.station.records.model import AuditEvent, RunDetails, RunId, RunState
 from tests.plant.factory import Plant, Sender
 
@@ -172,15 +174,15 @@ def test_a_server_that_is_away_is_waited_for(plant: Plant, sender: Sender) -> No
     state = sender.forwarder.state
     assert state.fault
     assert state.unsent == len(own_hashes(sender))
-    assert load_state(sender.bench.store.files.folder) == state
-    shown = check(sender.bench.store.files.folder, sender.forwarder._clock.utc())
+    assert load_state(sender.bench.store.files.folder, sender.station) == state
+    shown = check_of(sender)
     assert not shown.is_good
     assert shown.text == f"{state.unsent} rows wait: the plant cannot be reached"
     assert sender.bench.store.read.run(run_id).run.state is RunState.PASS
     sender.start()
     sender.send()
     assert hashes(plant) == own_hashes(sender)
-    assert check(sender.bench.store.files.folder, sender.forwarder._clock.utc()).is_good
+    assert check_of(sender).is_good
 
 
 def test_it_sends_until_the_station_ends_and_then_the_rest(plant: Plant, sender: Sender) -> None:
@@ -247,6 +249,12 @@ def test_runs_that_began_in_the_same_microsecond_both_arrive(plant: Plant, sende
     assert ids[1] == ids[0] + 1
 
 
+def check_of(sender: Sender) -> HealthCheck:
+    """What the operator page shows."""
+    folder, now = sender.bench.store.files.folder, sender.forwarder._clock.utc()
+    return check(folder, sender.station, now)
+
+
 # -- refused by name -------------------------------------------------------------------------------
 
 
@@ -255,9 +263,9 @@ def refused(sender: Sender) -> Refusal:
         sender.send()
     reported = sender.plant.status(sender.station)
     assert reported.refusal == caught.value.text
-    state = load_state(sender.bench.store.files.folder)
+    state = load_state(sender.bench.store.files.folder, sender.station)
     assert state.refusal == caught.value.text
-    shown = check(sender.bench.store.files.folder, sender.forwarder._clock.utc())
+    shown = check_of(sender)
     assert not shown.is_good
     assert caught.value.text in shown.text
     return caught.value.refusal
@@ -369,7 +377,65 @@ def test_new_records_under_the_same_name_are_foreign_until_renewed(
 
 
 def test_an_unreadable_state_file_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "plant.json").write_text("{", encoding="ascii")
+    state_file(tmp_path, "line-2").write_text("{", encoding="ascii")
     with pytest.raises(RecordError, match="cannot be read"):
-        load_state(tmp_path)
-    assert load_state(tmp_path / "nowhere") == ForwarderState()
+        load_state(tmp_path, "line-2")
+    assert load_state(tmp_path / "nowhere", "line-2") == ForwarderState()
+
+
+def test_a_disk_that_takes_no_state_file_stops_neither_rows_nor_report(
+    plant: Plant, sender: Sender
+) -> None:
+    """As a full disk does; a folder in the way refuses root too."""
+    sender.bench.make()
+    folder = sender.bench.store.files.folder
+    state_file(folder, "line-2").mkdir()
+    sender.send()
+    assert hashes(plant) == own_hashes(sender)
+    assert plant.status().unsent == 0
+    assert not list(folder.glob("*.part"))
+    shown = check_of(sender)
+    assert not shown.is_good
+
+
+def test_a_folder_of_files_that_cannot_be_made_stops_neither(plant: Plant, sender: Sender) -> None:
+    (sender.folder / "in the way").touch()
+    sender.forwarder._files = FileStore(sender.folder / "in the way" / "files")
+    sender.send()
+    assert hashes(plant) == own_hashes(sender)
+    assert plant.status().disk_free_bytes is None
+
+
+def test_two_senders_of_a_station_at_once_do_not_disturb_each_other(
+    plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`flasher plant send` while the station runs: both write the state file."""
+    sender.bench.make()
+    running = sender.forwarder
+    sender._forwarders.clear()
+    sender.start()
+    usual = Path.replace
+
+    def replace_late(part: Path, to: Path) -> Path:
+        monkeypatch.undo()
+        assert not running.forward()  # between writing the file and its new name
+        return usual(part, to)
+
+    monkeypatch.setattr(Path, "replace", replace_late)
+    sender.send()
+    running.close()
+    assert hashes(plant) == own_hashes(sender)
+    assert load_state(sender.bench.store.files.folder, sender.station) == sender.forwarder.state
+
+
+def test_stations_that_share_a_folder_have_states_of_their_own(
+    plant: Plant, sender: Sender
+) -> None:
+    other = plant.sender("line-3")
+    other.forwarder._files = sender.forwarder._files
+    other.lose_the_server()
+    sender.send()
+    other.forwarder.forward()
+    other.close()
+    assert check_of(sender).is_good
+    assert load_state(sender.bench.store.files.folder, "line-3").fault

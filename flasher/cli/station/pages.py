@@ -152,7 +152,7 @@ def _plant_check(store: Store, clock: StationClock) -> HealthCheck:
     """Check the sending of records to the plant's database."""
     from flasher.plant.health import check  # noqa: PLC0415  an extra
 
-    return check(store.files.folder, clock.utc())
+    return check(store.files.folder, store.station, clock.utc())
 
 
 # -- supervisor pages only ------------------------------------------------------------------------

@@ -260,12 +260,16 @@ class Database:
                 )
 
 
+def in_file_name(station: str) -> str:
+    """A station's name as a part of file names."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", station)
+
+
 class StationLock:
     """File lock: one process runs as a station, from `acquire` until `release` or its end."""
 
     def __init__(self, station: str, folder: Path) -> None:
-        name = f"station-{re.sub(r'[^A-Za-z0-9_-]', '_', station)}.lock"
-        self._path = folder / name
+        self._path = folder / f"station-{in_file_name(station)}.lock"
         self._lock = FileLock(self._path, timeout=0, thread_local=False)
 
     def acquire(self) -> None:
