@@ -38,8 +38,8 @@ class Refusal(StrEnum):
     def remedy(self) -> str:
         if self is Refusal.FOREIGN:
             return (
-                "If the station has new records: flasher plant init --renew STATION. Else give this"
-                " station its own user."
+                "If the station has new records: flasher plant init --renew STATION --database"
+                " URL. Else give this station its own user."
             )
         return (
             "Find out who changed or copied the records (flasher station verify). Units that this"
@@ -61,13 +61,15 @@ class ChainRefusedError(RuleBrokenError):
 
 
 def plant_location(url: str) -> Location:
-    """Parse the URL of a plant's database. Raises UsageError."""
+    """Parse the URL of a plant's database, which it names. Raises UsageError."""
     location = locate(url, Path())
     if location.url.get_backend_name() != "postgresql":
         raise UsageError(
             f"{location.shown} is not a PostgreSQL database.",
             remedy="Name postgresql://USER@HOST/NAME.",
         )
+    if not location.url.database:
+        raise UsageError("The URL names no database.", remedy="Add /NAME to it, such as /flasher.")
     return location
 
 

@@ -64,9 +64,7 @@ def role_of(station: str) -> str:
 
 def create_database(url: str) -> bool:
     """Create the database of a URL; False if it exists. Raises UsageError, RecordError."""
-    name = plant_location(url).url.database
-    if not name:
-        raise UsageError("The URL names no database.", remedy="Add /NAME to it, such as /flasher.")
+    name = str(plant_location(url).url.database)
     with closing(Central(url, database="postgres")) as server, server.outside_transaction() as own:
         known = text("SELECT 1 FROM pg_database WHERE datname = :name")
         if own.execute(known, {"name": name}).first() is not None:

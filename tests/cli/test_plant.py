@@ -55,6 +55,8 @@ def test_init_creates_what_is_missing_and_prints_the_rest(
         "\\password flasher_line_8",
         "# in pg_hba.conf, above lines that allow more:",
         "hostssl plant_by_command flasher_line_8 samenet scram-sha-256",
+        "-- then, in psql:",
+        "SELECT pg_reload_conf();",
         "# in the station file of line 8:",
         f'plant = "{of_role}?sslmode=verify-full"',
     ]
@@ -62,6 +64,45 @@ def test_init_creates_what_is_missing_and_prints_the_rest(
     hold_output(json.loads(SCHEMA.read_text("utf-8")), again.out, again.code)
     assert again.document["is_new"] is False
     assert not any("password" in line for line in again.document["to_run"])
+
+
+def test_init_prints_each_step_from_an_empty_server_on(flasher: Flasher) -> None:
+    url = f"postgresql://Owner:{PASSWORD}@plant-db/flasher"
+    run = flasher("plant", "init", "--database", url, "--station", "line 8", "--print")
+    assert run.out.splitlines()[:11] == [
+        "-- as an administrator of the server (psql postgres):",
+        'CREATE ROLE "Owner" LOGIN CREATEROLE;',
+        '\\password "Owner"',
+        'CREATE DATABASE "flasher" OWNER "Owner";',
+        "# in pg_hba.conf, above lines that allow more:",
+        "hostssl flasher,postgres Owner samenet scram-sha-256",
+        "-- then, in psql:",
+        "SELECT pg_reload_conf();",
+        "# then, which creates the tables and the roles of the stations:",
+        "flasher plant init --database postgresql://Owner@plant-db/flasher --station 'line 8'",
+        "-- in psql, a password for each new role (stations read theirs from ~/.pgpass):",
+    ]
+    none = flasher("plant", "init", "--database", "postgresql://x@plant-db", "--print")
+    assert none.code == ExitCode.USAGE
+    assert "The URL names no database" in none.err
+
+
+def test_a_database_without_the_plants_tables_is_named(flasher: Flasher, postgres: Server) -> None:
+    run = flasher("plant", "status", "--database", postgres.url(postgres.database()))
+    assert run.code == ExitCode.USAGE
+    assert "the database has other tables" in run.err
+    assert "flasher plant init" in run.err
+
+
+def test_a_wrong_url_of_the_plant_is_refused_before_the_first_unit(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    file = tmp_path / "station.toml"
+    file.write_text('keys = "keys"\n' + STATION.format(plant="mysql://x/y"), encoding="utf-8")
+    words = ("--recipe", write_recipe(tmp_path, USUAL), "--sockets", file, "--units", "1")
+    run = flasher("station", "run", *words, "--operator", "jo")
+    assert run.code == ExitCode.USAGE
+    assert "mysql" in run.err
 
 
 def test_status_and_send(flasher: Flasher, plant: Plant) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
+
+from sqlalchemy import make_url
 
 from flasher.cli.output import Output, byte_count, counted, duration
 from flasher.cli.plant.documents import PlantInitDocument, PlantSendDocument, PlantStatusDocument
@@ -28,7 +31,10 @@ def init(
     location = plant_location(url)
     if prints:
         roles = {name: role_of(name) for name in (*stations, *renewed)}
-        lines = [*_before(location), *_after(location, roles, roles.values())]
+        lines = [
+            *_before(location, url, stations, renewed),
+            *_after(location, roles, roles.values()),
+        ]
         output.results(lines)
         return output.document(PlantInitDocument(is_new=False, roles=roles, to_run=lines))
     if create_database(url):
@@ -45,12 +51,29 @@ def init(
     return output.document(PlantInitDocument(is_new=made.is_new, roles=roles, to_run=lines))
 
 
-def _before(location: Location) -> Iterator[str]:
-    """SQL for an administrator of the server, before `init`."""
-    user, name = location.url.username or "flasher_plant", location.url.database
+def _before(
+    location: Location, url: str, stations: Sequence[str], renewed: Sequence[str]
+) -> Iterator[str]:
+    """What an administrator of the server runs first, and then `init`."""
+    user, name = location.url.username or "flasher_plant", str(location.url.database)
     yield "-- as an administrator of the server (psql postgres):"
-    yield f'CREATE ROLE "{printable(user)}" LOGIN CREATEROLE;'
-    yield f'CREATE DATABASE "{printable(str(name))}" OWNER "{printable(user)}";'
+    yield printable(f'CREATE ROLE "{user}" LOGIN CREATEROLE;')
+    yield printable(f'\\password "{user}"')
+    yield printable(f'CREATE DATABASE "{name}" OWNER "{user}";')
+    yield from _allowed(f"{name},postgres", [user])  # `init` asks there for the database
+    words = ["--database", make_url(url)._replace(password=None).render_as_string()]
+    words += [word for each in stations for word in ("--station", each)]
+    words += [word for each in renewed for word in ("--renew", each)]
+    yield "# then, which creates the tables and the roles of the stations:"
+    yield printable(f"flasher plant init {shlex.join(words)}")
+
+
+def _allowed(name: str, roles: Collection[str]) -> Iterator[str]:
+    """Rules of the server that let roles connect to a database."""
+    yield "# in pg_hba.conf, above lines that allow more:"
+    yield from (printable(f"hostssl {name} {role} samenet scram-sha-256") for role in roles)
+    yield "-- then, in psql:"
+    yield "SELECT pg_reload_conf();"
 
 
 def _after(location: Location, roles: Mapping[str, str], created: Collection[str]) -> Iterator[str]:
@@ -61,10 +84,7 @@ def _after(location: Location, roles: Mapping[str, str], created: Collection[str
         yield "-- in psql, a password for each new role (stations read theirs from ~/.pgpass):"
         yield from (printable(f"\\password {role}") for role in created)
     if roles:
-        yield "# in pg_hba.conf, above lines that allow more:"
-        yield from (
-            printable(f"hostssl {name} {role} samenet scram-sha-256") for role in roles.values()
-        )
+        yield from _allowed(str(name), roles.values())
     for station, role in roles.items():
         yield printable(f"# in the station file of {station}:")
         yield printable(f'plant = "postgresql://{role}@{host}{port}/{name}?sslmode=verify-full"')
@@ -79,7 +99,7 @@ def status(output: Output, url: str) -> int:
     for each in found:
         output.results(_lines(each))
     if not found:
-        output.result("no stations: flasher plant init --station NAME adds one")
+        output.result("no stations: flasher plant init --station NAME --database URL adds one")
     code = ExitCode.VERIFICATION if any(each.refusal for each in found) else ExitCode.OK
     return output.document(PlantStatusDocument(found), exit_code=code)
 

@@ -191,8 +191,10 @@ def _sent_to_plant(
     if not config.plant or _is_temporary(options, records):
         return nullcontext()
     need("Sending records to a plant", "plant")
-    from flasher.plant.process import Sending, sending  # noqa: PLC0415  an extra
+    from flasher.plant.central import plant_location  # noqa: PLC0415  an extra
+    from flasher.plant.process import Sending, sending  # noqa: PLC0415
 
+    plant_location(config.plant)  # refuses a wrong URL before the first unit
     place = records_of(records)
     return sending(Sending(config.plant, config.name, place.url, place.files))
 

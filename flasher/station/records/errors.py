@@ -199,6 +199,12 @@ _TOO_SLOW: Final[_Kind] = (
     "the database server did not finish in time",
     "Find what delays it (pg_stat_activity shows it), then retry.",
 )
+_NO_TABLES: Final[_Kind] = (
+    RecordError,
+    "the database has other tables",
+    "Name the right database. flasher plant init, or a station's first start, makes the tables.",
+)
+"""Undefined table or function."""
 _POSTGRESQL: Final[dict[str, _Kind]] = {
     "": _NO_SERVER,
     "08": _NO_SERVER,
@@ -219,6 +225,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
         "the disk of the database server is full",
         "Make room on it, then retry.",
     ),
+    **dict.fromkeys(("42P01", "42883"), _NO_TABLES),
     LOCK_NOT_AVAILABLE: (
         RecordsLockedError,
         "another program holds the database",
