@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from typing import Final
 
@@ -98,19 +99,28 @@ def sending(what: Sending) -> Iterator[None]:
 def _watch(what: Sending, over: threading.Event) -> None:
     context = multiprocessing.get_context("spawn")
     while not over.is_set():
-        ours, theirs = context.Pipe()
+        try:
+            _send_in_process(context, what, over)
+        except OSError as error:  # no process, memory or file descriptor is free
+            _LOG.warning("nothing is sent to the plant: %s", error)
+        over.wait(_RESTART_S)
+
+
+def _send_in_process(context: SpawnContext, what: Sending, over: threading.Event) -> None:
+    """Start a process, and return after it died or `over`. Raises OSError."""
+    ours, theirs = context.Pipe()
+    with ours, theirs:
         process = context.Process(target=_work, args=(theirs, what), name="plant", daemon=True)
         with signals_blocked():
             process.start()
         theirs.close()
         while not over.wait(_LOOK_AFTER_S) and process.exitcode is None:
             pass
-        ours.close()  # it then sends what is left
-        process.join(_END_S)
-        if process.exitcode is None:
-            process.kill()
-            process.join()
-        over.wait(_RESTART_S)
+    # The closed channel tells it to send what is left.
+    process.join(_END_S)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
 
 
 def _work(channel: Connection, what: Sending) -> None:

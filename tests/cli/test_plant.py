@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import multiprocessing
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
+from multiprocessing.context import SpawnProcess
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -240,6 +242,24 @@ def test_a_process_that_is_killed_is_replaced(plant: Plant, sender: Sender) -> N
         first.kill()
         assert _appeared(before | {first}).pid != first.pid
         wait_until(lambda: plant.rows("SELECT count(*) FROM run") == [(1,)])
+
+
+def test_a_computer_that_cannot_start_the_process_now_starts_it_later(
+    plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender.bench.make()
+    sender.end()
+    usual, failures = SpawnProcess.start, [OSError(errno.EAGAIN, "no process is free")]
+
+    def start(process: SpawnProcess) -> None:
+        if failures:
+            raise failures.pop()
+        usual(process)
+
+    monkeypatch.setattr(SpawnProcess, "start", start)
+    with sending(Sending(plant.url("flasher_line_2"), "line-2", str(sender.bench.path), None)):
+        wait_until(lambda: plant.rows("SELECT count(*) FROM run") == [(1,)])
+    assert not failures
 
 
 def wait_until(is_so: Callable[[], bool], limit_s: float = 60.0) -> None:
