@@ -1,50 +1,53 @@
 """Images on this computer by the firmware version inside: the way back from an upgrade.
 
-Files are searched for the text of a version, not loaded: that takes milliseconds for a folder. An
+Files are searched for the text of a version, not loaded: that takes milliseconds for a file. An
 image that is flashed later is checked like any other.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from flasher.errors import FlasherError
 from flasher.files import read
-from flasher.history import FlashHistory
+from flasher.history import Flash, FlashHistory
 from flasher.protocol.spec import Target
 from flasher.protocol.text import find_firmware_version, printable
 from flasher.release.places import SUFFIX as RELEASE_SUFFIX
 
 FILES_MAX: Final = 100
-"""Maximum number of files that are searched, the newest of a folder first."""
+"""Maximum number of searched files: of a folder the newest, of the history the last used."""
 _SIZE_MAX: Final = 8 * 1024 * 1024
 """Maximum size of a searched file in bytes: more than the largest image as Intel HEX needs."""
-_TEXT_START: Final = {
-    b":": 9,  # Intel HEX: length, address and type
-    b"S1": 8,
-    b"S2": 10,
-    b"S3": 12,
-}
-"""Place of the first data digit in a record, by its beginning."""
+_RECORD: Final = re.compile(
+    rb"^(?::.{6}00|S1.{6}|S2.{8}|S3.{10})((?:[0-9A-Fa-f]{2})*)[0-9A-Fa-f]{2}\s*$", re.MULTILINE
+)
+"""Matches a record with data, of Intel HEX or S-record, before its checksum."""
 
 
 def images_here(target: Target, files: Iterable[Path]) -> dict[str, str]:
     """Return the files with images for a target on this computer, by firmware version: those of its
     upgrades that are still in their places, then `files`.
     """
-    found: dict[str, str] = {}
+    flashes: list[Flash] = []
     with suppress(FlasherError, OSError):
-        for flash in FlashHistory().flashes()[0]:
-            began = flash.began
+        flashes, _ = FlashHistory().flashes()
+    used: dict[Path, set[str]] = {}
+    for flash in reversed(flashes):
+        began = flash.began
+        if began.target == target.name and began.image_version is not None:
             path = Path(began.folder) / began.image
-            version = began.image_version or ""
-            is_there = began.target == target.name and path.is_file()
-            if is_there and version in _versions(path, target):
-                found[version] = printable(str(path))
+            used.setdefault(path, set()).add(began.image_version)
+    found: dict[str, str] = {}
+    for path, flashed in islice(used.items(), FILES_MAX):
+        for version in flashed.intersection(_versions(path, target)):
+            found.setdefault(version, printable(str(path)))
     for path in files:
         for version in _versions(path, target):
             found.setdefault(version, printable(str(path)))
@@ -82,10 +85,4 @@ def _contents(raw: bytes) -> bytes:
     """Return the bytes of hexadecimal records; any other file as it is."""
     if not raw.startswith((b":", b"S")):
         return raw
-    data = []
-    for line in raw.splitlines():
-        start = _TEXT_START.get(line[:1]) or _TEXT_START.get(line[:2])
-        if start is not None:
-            with suppress(ValueError):
-                data.append(bytes.fromhex(line[start:-2].decode("ascii", "replace")))
-    return b"".join(data)
+    return bytes.fromhex(b"".join(_RECORD.findall(raw)).decode("ascii"))

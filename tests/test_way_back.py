@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from intelhex import IntelHex
 
+from flasher.files import read
 from flasher.history import Began, FlashHistory
 from flasher.protocol.spec import BMS, WMC
 from flasher.way_back import images_beside, images_here
@@ -88,3 +89,26 @@ def test_an_image_of_the_history_is_found_while_it_is_still_the_one_that_was_fla
     assert images_here(BMS, ()) == {}
     path.unlink()
     assert images_here(BMS, ()) == {}
+
+
+def test_a_file_that_was_flashed_many_times_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    (tmp_path / "old.bin").write_bytes(DATA)
+    for _ in range(3):
+        FlashHistory().begin(
+            Began(
+                "2026-05-17T10:31:02+02:00", "flash", "bms", False, "can0", "old.bin", "ab", 3, OLD,
+                folder=str(tmp_path),
+            )
+        )  # fmt: skip
+    reads: list[object] = []
+
+    def counted(path: Path, size_max: int) -> bytes:
+        reads.append(path)
+        return read(path, size_max)
+
+    monkeypatch.setattr("flasher.way_back.read", counted)
+    assert images_here(BMS, ()) == {OLD: str(tmp_path / "old.bin")}
+    assert reads == [tmp_path / "old.bin"]
