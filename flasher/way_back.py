@@ -26,9 +26,9 @@ FILES_MAX: Final = 100
 _SIZE_MAX: Final = 8 * 1024 * 1024
 """Maximum size of a searched file in bytes: more than the largest image as Intel HEX needs."""
 _RECORD: Final = re.compile(
-    rb"^(?::.{6}00|S1.{6}|S2.{8}|S3.{10})((?:[0-9A-Fa-f]{2})*)[0-9A-Fa-f]{2}\s*$", re.MULTILINE
+    rb"^(?::.{6}00|S1.{6}|S2.{8}|S3.{10})([0-9A-Fa-f]*)[0-9A-Fa-f]{2}\s*$", re.MULTILINE
 )
-"""Matches a record with data, of Intel HEX or S-record, before its checksum."""
+"""Matches a data record of Intel HEX or Motorola S-record; its group are the data."""
 
 
 def images_here(target: Target, files: Iterable[Path]) -> dict[str, str]:
@@ -85,4 +85,5 @@ def _contents(raw: bytes) -> bytes:
     """Return the bytes of hexadecimal records; any other file as it is."""
     if not raw.startswith((b":", b"S")):
         return raw
-    return bytes.fromhex(b"".join(_RECORD.findall(raw)).decode("ascii"))
+    data = [digits for digits in _RECORD.findall(raw) if len(digits) % 2 == 0]
+    return bytes.fromhex(b"".join(data).decode("ascii"))
