@@ -57,6 +57,8 @@ class SetImage:
     opened: OpenedImage
     firmware_version: str | None
     """Version that the set states; None if it states none."""
+    options: tuple[str, ...] = ()
+    """Options of the command line that load this image alone in the same way."""
 
 
 def open_bike_set(
@@ -91,16 +93,21 @@ def open_bike_set(
     else:
         for each in read_bike_set(path).target:
             file = path.parent / each.image
+            manifest = path.parent / each.manifest if each.manifest else None
             base: dict[str, Any] = {} if each.base is None else {"base": each.base}
+            options = [] if each.base is None else ["--base", hex(each.base)]
+            options += [] if manifest is None else ["--manifest", str(manifest)]
             opened = open_image(
                 file,
                 each.device,
-                manifest=path.parent / each.manifest if each.manifest else None,
+                manifest=manifest,
                 require_signed=require_signed,
                 allow_outside_vector=allow_outside_vector,
                 **base,
             )
-            images.append(SetImage(each.device, file, opened, each.firmware_version))
+            images.append(
+                SetImage(each.device, file, opened, each.firmware_version, tuple(options))
+            )
     _check_belongs_together(path, images)
     return sorted(images, key=lambda each: ORDER.index(each.target))
 
@@ -148,7 +155,7 @@ class BikeFound:
     """Versions that the devices reported."""
     answers: Mapping[Target, DeviceAnswers]
     silent: tuple[Target, ...]
-    """Devices that sent nothing, and that the documents give no query for."""
+    """Devices that sent nothing, and that reported no version."""
 
     def ready(self, job: Job) -> Job:
         """Return the upgrade of a device, without rules that no application can answer for one in

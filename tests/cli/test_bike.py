@@ -271,6 +271,45 @@ def test_a_device_that_fails_ends_the_bike_and_the_others_are_not_begun(
     assert bike.is_done
 
 
+def test_the_repair_of_a_device_loads_its_image_as_the_set_does(
+    bike: BikeOnTheBus, upgrade: Callable[..., Run], folder: Path
+) -> None:
+    path = folder / "bike.toml"
+    line = 'image = "obc.bin"\n'
+    path.write_text(path.read_text().replace(line, f"{line}base = 0x08004000\n"))
+    bike.at[OBC, 2] = interrupt
+    assert upgrade().code == ExitCode.INTERRUPTED
+    bike.device(OBC).power_cut(bike.clock.now())
+    run = upgrade()
+    assert bike.erased == [OBC]
+    assert run.code == ExitCode.NO_ANSWER, run.err
+    command = run.err.split("to repair it:\n")[1].split("\n")[0]
+    assert command.split()[1:3] == ["rescue", str(folder / "obc.bin")]
+    assert command.endswith(" -t obc --base 0x8004000")
+
+
+def test_the_repair_after_a_deadline_does_not_repeat_the_deadline(
+    bike: BikeOnTheBus, upgrade: Callable[..., Run]
+) -> None:
+    bike.at[OBC, 2] = lambda: bike.system.power_cut(bike.clock.now())
+    run = upgrade("--timeout", "20")
+    assert bike.erased == [OBC]
+    command = run.err.split("to repair it:")[1]
+    assert "flash" in command
+    assert "--bike" in command
+    assert "--timeout" not in command
+
+
+def test_a_silent_device_that_is_left_out_is_not_said_to_be_reset(
+    bike: BikeOnTheBus, upgrade: Callable[..., Run]
+) -> None:
+    bike.device(OBC).power_cut(bike.clock.now())
+    run = upgrade("--without", "obc")
+    assert run.code == ExitCode.OK, run.err
+    assert bike.erased == [WMC, BMS]
+    assert "the OBC has sent nothing" not in run.err
+
+
 @each(
     "broken, order",
     [

@@ -107,7 +107,9 @@ class BikeUpgrade:
         self._devices: list[_Device] = []
         self._left_out: list[SetImage] = []
         ctx = click.get_current_context()
-        words = rebuild_command_line(ctx, str(ctx.info_name), without=TRACE_OPTIONS.__contains__)
+        # A deadline that has passed once would pass again.
+        without = TRACE_OPTIONS | {"--timeout"}
+        words = rebuild_command_line(ctx, str(ctx.info_name), without=without.__contains__)
         self._again = shlex.join(["flasher", *words])
 
     def run(self, target: Target | None) -> int:
@@ -243,7 +245,8 @@ class BikeUpgrade:
             if check.verdict in (CheckVerdict.WARNED, CheckVerdict.WAIVED, CheckVerdict.SKIPPED):
                 output.progress(f"{device.name}: {text.check_line(check.event)}")
         for target in found.silent:
-            output.progress(silence_text(target))
+            if target in jobs:  # one that is left out is not reset
+                output.progress(silence_text(target))
         if found.broken:
             targets = in_safe_order(list(jobs), found.broken)
             devices.sort(key=lambda each: targets.index(each.part.target))
@@ -311,9 +314,8 @@ class BikeUpgrade:
             return
         is_refused = error.exit_code is ExitCode.REFUSED
         if is_refused or error.exit_code is ExitCode.NO_ANSWER:
-            of_set = (device.part.target, str(device.part.path))
             ctx = click.get_current_context()
-            error.command = repair_command(ctx, is_refused=is_refused, of_set=of_set)
+            error.command = repair_command(ctx, is_refused=is_refused, of_set=device.part)
         else:
             error.command = self._again
         error.remedy = error.remedy.replace(f"{AGAIN} ", "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import click
 
@@ -18,10 +18,12 @@ from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import DEFAULT_ATTEMPTS, PATIENT_TRIES, UpgradeOptions
 from flasher.host.verify import Level
 from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR, UNSIGNED, WAIVERS
-from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.settings.profile import Profile
 from flasher.way_back import images_beside, images_here
+
+if TYPE_CHECKING:
+    from flasher.bike import SetImage
 
 
 def _waiver_option(name: str) -> Decorator:
@@ -211,19 +213,18 @@ def image_again(ctx: click.Context) -> dict[str, str]:
     return {"image": SAME_IMAGE} if ctx.params["image"] == STANDARD_INPUT else {}
 
 
-def repair_command(
-    ctx: click.Context, *, is_refused: bool, of_set: tuple[Target, str] | None = None
-) -> str:
+def repair_command(ctx: click.Context, *, is_refused: bool, of_set: SetImage | None = None) -> str:
     """Return the `flasher rescue` command for the command of `ctx`, quoted for a shell. Options
-    about an image that the device refused are omitted. `of_set` is a device of a bike, and the file
-    of its image.
+    about an image that the device refused are omitted. `of_set` is the image of a bike's device.
     """
 
     def is_left_out(name: str) -> bool:
         of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
         return name in _LEFT_OUT or (is_refused and of_the_image)
 
-    image = image_again(ctx) if of_set is None else {"image": of_set[1]}
+    image = image_again(ctx) if of_set is None else {"image": str(of_set.path)}
     replaced = {"image": OTHER_IMAGE} if is_refused else image
     words = rebuild_command_line(ctx, "rescue", without=is_left_out, replaced=replaced)
-    return shlex.join(["flasher", *words, *(() if of_set is None else ("-t", of_set[0].name))])
+    if of_set is not None:
+        words += ["-t", of_set.target.name, *(() if is_refused else of_set.options)]
+    return shlex.join(["flasher", *words])
