@@ -7,7 +7,8 @@ values. A value that is a `Text` is translated too.
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Any, Final
 
 
 class Text(str):
@@ -40,3 +41,20 @@ def with_value(sentence: str, old: str, new: str) -> str:
         for name, value in sentence.values.items()
     }
     return Text(sentence.template, values)
+
+
+_WAIVES: Final = re.compile(r"; --allow-[\w-]+ waives this.*(?=\)\.?$)", re.DOTALL)
+_JOINED: Final = re.compile(r"\{\w+\}( \{\w+\})*")
+"""Matches the template of joined sentences, which are translated one by one."""
+_OPTION: Final = re.compile(r"(?<!\w)--[a-z]")
+
+
+def without_options(message: str) -> str:
+    """Leave out what a message says of options of the command line, for readers without one."""
+    if not _OPTION.search(message):
+        return message
+    sentences: list[str] = re.split(r"(?<=[.!?]) ", _WAIVES.sub("", message))
+    if isinstance(message, Text) and _JOINED.fullmatch(message.template):
+        sentences = list(message.values.values())
+    kept = [each for each in sentences if not _OPTION.search(each)]
+    return kept[0] if len(kept) == 1 else " ".join(kept)

@@ -262,7 +262,7 @@ _EXPLANATIONS: Final = {
     Ending.BOOT_TOO_OLD: _Explanation(
         WrongDeviceError,
         "the image's manifest asks for a newer bootloader",
-        "Look for an image for this bootloader; --allow-boot-version takes the device as it is.",
+        "Look for an image for this bootloader. --allow-boot-version takes the device as it is.",
         code=ErrorCode.BOOT_TOO_OLD,
     ),
     Ending.NOT_FOR_DEVICE: _Explanation(
@@ -292,7 +292,7 @@ _EXPLANATIONS: Final = {
     Ending.IN_USE: _Explanation(
         WrongDeviceError,
         "the bike is being ridden, or a load draws current",
-        "Let it stand still and switch its loads off; --allow-in-use upgrades it all the same.",
+        "Let it stand still and switch its loads off. --allow-in-use upgrades it all the same.",
         code=ErrorCode.VEHICLE_IN_USE,
     ),
     Ending.LOW_CHARGE: _Explanation(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -19,7 +18,7 @@ from starlette.routing import BaseRoute, Route
 from flasher.errors import UsageError
 from flasher.files import parse_json
 from flasher.host.waivers import WAIVERS
-from flasher.i18n import Text, text
+from flasher.i18n import Text, text, without_options
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
@@ -261,23 +260,6 @@ def _listed(shown: Field) -> str:
         return ""
     values = {f"name_{number}": text(name) for number, name in enumerate(names)}
     return Text(", ".join(f"{{{name}}}" for name in values), values)
-
-
-_WAIVES: Final = re.compile(r"; --allow-[\w-]+ waives this.*(?=\)\.?$)", re.DOTALL)
-_JOINED: Final = re.compile(r"\{\w+\}( \{\w+\})*")
-"""Matches the template of joined sentences, which are translated one by one."""
-_OPTION: Final = re.compile(r"(?<!\w)--[a-z]")
-
-
-def without_options(message: str) -> str:
-    """Leave out what a message says of options of the command line: a page has controls instead."""
-    if not _OPTION.search(message):
-        return message
-    sentences: list[str] = re.split(r"(?<=[.!?]) ", _WAIVES.sub("", message))
-    if isinstance(message, Text) and _JOINED.fullmatch(message.template):
-        sentences = list(message.values.values())
-    kept = [each for each in sentences if not _OPTION.search(each)]
-    return kept[0] if len(kept) == 1 else " ".join(kept)
 
 
 def as_it_is_now(state: BenchState) -> BenchState:

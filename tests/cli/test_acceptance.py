@@ -175,3 +175,16 @@ def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flashe
     assert states(run.document)["second upgrade"] == "passed"
     assert states(run.document)["identity afterwards"] == "not possible"
     assert run.document["device_state"] == "it has the new image"
+
+
+def test_a_check_of_the_device_that_refuses_names_no_option_to_waive_it(
+    walk: Callable[..., Run], tmp_path: Path
+) -> None:
+    profile = tmp_path / "limits.toml"
+    profile.write_text("minimum_charge_percent = 100\n")
+    run = walk("--yes", "--profile", profile)
+    assert run.code == 6
+    assert "--allow" not in run.err
+    assert "Connect its charger: while it charges, the upgrade is allowed." in run.err
+    assert "An acceptance waives no check." in run.err
+    assert "--allow" not in Path("acceptance-bms.json").read_text()

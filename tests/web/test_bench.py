@@ -30,7 +30,7 @@ from flasher.errors import (
 from flasher.history import MOCK, Began, Flash, FlashHistory, Reached, latest_left_open
 from flasher.host.event_text import progress_line
 from flasher.host.verify import Level, Verdict, Verification
-from flasher.i18n import Text, text
+from flasher.i18n import Text, text, without_options
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
@@ -39,7 +39,7 @@ from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
-from flasher.web.bench_page import as_it_is_now, battery_answers, facts, without_options
+from flasher.web.bench_page import as_it_is_now, battery_answers, facts
 from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault

@@ -37,11 +37,13 @@ from flasher.cli.recording import Recording, RecordingOptions
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.terminal import agrees, can_ask
 from flasher.cli.upgrade import text
+from flasher.cli.upgrade.choices import EXIT_CODES
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.events import PacketAcknowledged
 from flasher.host.outcome import AGAIN, DeviceLeft
+from flasher.i18n import without_options
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
@@ -131,18 +133,7 @@ DOCUMENTS: Final = (AcceptanceDocument,)
 
 @command(
     epilog=_EXAMPLES,
-    exit_codes=(
-        ExitCode.IMAGE,
-        ExitCode.BUS,
-        ExitCode.NO_ANSWER,
-        ExitCode.WRONG_DEVICE,
-        ExitCode.TRANSFER,
-        ExitCode.REFUSED,
-        ExitCode.UNCONFIRMED,
-        ExitCode.VERIFICATION,
-        ExitCode.PARTIAL,
-        ExitCode.INTERRUPTED,
-    ),
+    exit_codes=(*EXIT_CODES, ExitCode.PARTIAL),
 )
 @target_option()
 @image_options
@@ -206,8 +197,9 @@ def acceptance(
     try:
         job.checked()
     except FlasherError as error:
-        error.remedy = (
-            f"Take the maker's image for this {target.node.name}: an acceptance waives no check."
+        _offer_no_waiver(
+            error,
+            f"Take the maker's image for this {target.node.name}: an acceptance waives no check.",
         )
         raise
     with stop_on_signal(
@@ -221,6 +213,13 @@ STEPS: Final = (
     "bus", "identity", "read", "first upgrade", "second upgrade", "interrupted and rescued",
     "identity afterwards",
 )  # fmt: skip
+
+
+def _offer_no_waiver(error: FlasherError, remedy: str) -> None:
+    """Replace the options that would waive the check that refused: an acceptance has none."""
+    if error.waiver:
+        error.what = without_options(error.what)
+        error.remedy = remedy
 
 
 def _now() -> str:
@@ -490,13 +489,16 @@ class _Walk:
             self._fail(error)
             raise
         except FlasherError as error:
-            state, what = StepState.FAILED, f"{error.what} [{error.code}]"
             self._fail(error)
+            state, what = StepState.FAILED, f"{error.what} [{error.code}]"
             raise _StepError from error
         finally:
             self._add(name, state, what, time.perf_counter() - begun)
 
     def _fail(self, error: FlasherError) -> None:
+        _offer_no_waiver(
+            error, f"{without_options(error.remedy)} An acceptance waives no check.".lstrip()
+        )
         self.error = self.error or error
 
     def _add(self, name: str, state: StepState, what: str, took_s: float = 0.0) -> None:

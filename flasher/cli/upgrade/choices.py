@@ -13,7 +13,7 @@ from flasher import api
 from flasher.cli import values
 from flasher.cli.framework import Decorator, option, option_set, rebuild_command_line
 from flasher.cli.options import STANDARD_INPUT, Bus, gap_options, profile_option
-from flasher.errors import UsageError
+from flasher.errors import ExitCode, UsageError
 from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import DEFAULT_ATTEMPTS, PATIENT_TRIES, UpgradeOptions
 from flasher.host.verify import Level
@@ -24,6 +24,20 @@ from flasher.way_back import images_beside, images_here
 
 if TYPE_CHECKING:
     from flasher.bike import SetImage
+
+
+EXIT_CODES: Final = (
+    ExitCode.IMAGE,
+    ExitCode.BUS,
+    ExitCode.NO_ANSWER,
+    ExitCode.WRONG_DEVICE,
+    ExitCode.TRANSFER,
+    ExitCode.REFUSED,
+    ExitCode.UNCONFIRMED,
+    ExitCode.VERIFICATION,
+    ExitCode.INTERRUPTED,
+)
+"""Exit codes of an upgrade."""
 
 
 def _waiver_option(name: str) -> Decorator:

@@ -32,6 +32,7 @@ from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.choices import (
+    EXIT_CODES,
     TRACE_OPTIONS,
     UpgradeChoices,
     image_again,
@@ -83,23 +84,12 @@ Nothing is sent before the device announces itself, unless an upgrade of it has 
 that is still in its transfer is found without a power cycle, which is requested only after that.
 Hardware and running version cannot be checked, since no application runs.
 """
-_EXIT_CODES: Final = (
-    ExitCode.IMAGE,
-    ExitCode.BUS,
-    ExitCode.NO_ANSWER,
-    ExitCode.WRONG_DEVICE,
-    ExitCode.TRANSFER,
-    ExitCode.REFUSED,
-    ExitCode.UNCONFIRMED,
-    ExitCode.VERIFICATION,
-    ExitCode.INTERRUPTED,
-)
 
 
 # -- the commands ----------------------------------------------------------------------------------
 
 
-@command(epilog=_FLASH_EXAMPLES, exit_codes=(*_EXIT_CODES, ExitCode.NOTHING_TO_DO))
+@command(epilog=_FLASH_EXAMPLES, exit_codes=(*EXIT_CODES, ExitCode.NOTHING_TO_DO))
 @target_option(required=False)
 @image_options
 @upgrade_options
@@ -147,7 +137,7 @@ def flash(
     return upgrade.run(skip_same_version=skip_same_version)
 
 
-@command(epilog=_RESCUE_EXAMPLES, exit_codes=_EXIT_CODES)
+@command(epilog=_RESCUE_EXAMPLES, exit_codes=EXIT_CODES)
 @target_option()
 @image_options
 @upgrade_options
