@@ -30,7 +30,7 @@ def check(folder: Path, station: str, now: datetime) -> HealthCheck:
     elif not state.at or abs((now - utc_moment(state.at)).total_seconds()) > STALE_S:
         sentence = text("the process that sends to the plant does not report")
     elif state.fault:
-        sentence = text("{count} rows wait: the plant cannot be reached", count=state.unsent)
+        sentence = text("{count} rows wait: sending to the plant failed", count=state.unsent)
     else:
         return HealthCheck(name, is_good=True, text=text("sent to the plant"))
     return HealthCheck(name, is_good=False, text=sentence)
