@@ -17,11 +17,15 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import ExitCode
 from flasher.history import FlashHistory
+from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
+from flasher.protocol.contents import SerialNumber
+from flasher.protocol.fields import WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC, Target
+from flasher.protocol.text import encode_text
 from tests.cli.conftest import Flasher, Run
 from tests.end_to_end.stage import NEW, NEWER, OLD, image_of, packet_number
 from tests.loops import each
@@ -308,6 +312,25 @@ def test_a_silent_device_that_is_left_out_is_not_said_to_be_reset(
     assert run.code == ExitCode.OK, run.err
     assert bike.erased == [WMC, BMS]
     assert "the OBC has sent nothing" not in run.err
+
+
+@each("place, erased", [((OBC, 6), [OBC]), ((WMC, 4), [OBC, WMC])])
+def test_another_bike_in_the_middle_is_refused_before_its_next_device_is_erased(
+    upgrade: Callable[..., Run],
+    monkeypatch: pytest.MonkeyPatch,
+    place: tuple[Target, int],
+    erased: list[Target],
+) -> None:
+    bike = put(BikeOnTheBus(), monkeypatch)
+    battery = bike.device(BMS).application
+    assert isinstance(battery, BmsApplication)
+    other = SerialNumber(WireText(encode_text("W2605999", 16)))
+    bike.at[place] = lambda: battery.kept.update({"serial number": other})
+    run = upgrade()
+    assert run.code == ExitCode.WRONG_DEVICE, run.err
+    assert "The BMS has the serial number W2605999, and had W2605001 before" in run.err
+    assert bike.erased == erased
+    assert run.err.splitlines()[-1].endswith("BMS not begun")
 
 
 @each(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from flasher.bike import (
     judge_bike,
     look_at_bike,
     open_bike_set,
+    serial_number,
     silence_text,
 )
 from flasher.cli.adapters import check_heard, choose_adapter
@@ -38,7 +39,15 @@ from flasher.cli.upgrade.text import (
     UpgradeDocument,
 )
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
-from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import (
+    ErrorCode,
+    ExitCode,
+    FlasherError,
+    InterruptedByUserError,
+    NoAnswerError,
+    UsageError,
+    WrongDeviceError,
+)
 from flasher.events import CheckMade
 from flasher.host.identity import CheckVerdict
 from flasher.host.outcome import AGAIN
@@ -106,6 +115,8 @@ class BikeUpgrade:
     def __post_init__(self) -> None:
         self._devices: list[_Device] = []
         self._left_out: list[SetImage] = []
+        self._battery = ""
+        """Serial number of the battery before the first upgrade; empty if not known."""
         ctx = click.get_current_context()
         # A deadline that has passed once would pass again.
         without = TRACE_OPTIONS | {"--timeout"}
@@ -239,6 +250,7 @@ class BikeUpgrade:
                 device.was_in_bootloader = device.part.target in found.broken
                 device.job = found.ready(device.job)
             checks = judge_bike(found, jobs, self._left_out)
+            self._battery = serial_number(found.answers[BMS].version)
         for target, check in checks:
             device = next(each for each in devices if each.part.target is target)
             device.checks.append(check.event)
@@ -286,8 +298,10 @@ class BikeUpgrade:
 
                 yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}
 
-        device.state = DeviceState.FAILED
         try:
+            if device is not self._devices[0]:
+                self._check_same_bike(connection, stop)
+            device.state = DeviceState.FAILED
             result = upgrade_run.write_planned(lambda: nullcontext(connection), watching)
         except FlasherError as error:
             return upgrade_run.error or error
@@ -298,6 +312,25 @@ class BikeUpgrade:
             device.is_sure = closing.colour == "green"
             device.state, device.summary = _ending(device.name, result)
         return upgrade_run.error
+
+    def _check_same_bike(self, connection: api.Connection, stop: Stop) -> None:
+        """Raise WrongDeviceError if the battery is another one than before the first upgrade."""
+        profile = self._profile(BMS)
+        request = profile.upgrade_options().version_request_for(BMS)
+        if not self._battery or request is None:
+            return
+        with suppress(NoAnswerError):  # the upgrade judges a silent device
+            battery = connection.device(profile=profile, cancelled=stop.asked)
+            now = serial_number(battery.ask(request))
+            if now and now != self._battery:
+                raise WrongDeviceError(
+                    f"The BMS has the serial number {now}, and had {self._battery} before the "
+                    "first upgrade.",
+                    cause="another bike is connected, or another battery",
+                    remedy="Connect the first bike with its battery and run the same command, then "
+                    "run it for the other one.",
+                    code=ErrorCode.NOT_FOR_DEVICE,
+                )
 
     def _trace_file(self, device: _Device) -> str | None:
         """Return the trace file of a device: the name of the option, with that of the device."""
