@@ -17,6 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, Final
@@ -245,12 +246,14 @@ class Forwarder:
         station = batch.rows[0]["station"]
         new = [
             {"station": station, "sha256": sha256, "content": part}
-            for sha256, part in batch.parts.items()
+            for sha256, part in sorted(batch.parts.items())
             if sha256 not in self._parts
         ]
+        # Sorted, so that two senders that insert the same rows cannot deadlock.
+        traces = sorted(batch.traces, key=itemgetter("sha256"))
         with self._central.writing() as central:
             for statement, values in (
-                (_ADD_PART, new), (_ADD_TRACE, batch.traces), (_ADD_ROW, batch.rows),
+                (_ADD_PART, new), (_ADD_TRACE, traces), (_ADD_ROW, batch.rows),
             ):  # fmt: skip
                 if values:
                     central.execute(statement, values)

@@ -172,6 +172,11 @@ def _add_station(connection: Connection, name: str) -> str:
     """Register a station; returns its role. Raises UsageError."""
     table = plant_station.c
     role = role_of(name)
+    if role in (STATIONS, READERS):
+        raise UsageError(
+            f"A station cannot be called {printable(name)}: {role} is a role of all stations.",
+            remedy="Give it another name.",
+        )
     connection.execute(insert(plant_station).values(role=role, name=name).on_conflict_do_nothing())
     query = select(table.name).where(table.role == role)
     found = connection.execute(query).scalar_one_or_none()

@@ -52,6 +52,12 @@ def test_two_stations_never_share_a_role(plant: Plant) -> None:
         setup(plant.url(), ["LINE 2"], NOW)
 
 
+@pytest.mark.parametrize("name", ["stations", "Readers"])
+def test_a_station_is_not_called_like_a_role_of_all(plant: Plant, name: str) -> None:
+    with pytest.raises(UsageError, match=f"cannot be called {name}"):
+        setup(plant.url(), [name], NOW)
+
+
 @pytest.mark.parametrize("grant", ["ALTER ROLE {} CREATEROLE", "GRANT flasher_readers TO {}"])
 def test_a_station_never_has_more_rights(plant: Plant, grant: str) -> None:
     role = role_of("line-2")
