@@ -168,6 +168,9 @@ class UpgradeChoices:
         waived = [name for name in OF_DEVICE if self.allows(name)]
         waived += [OUTSIDE_VECTOR] * (allow_outside_vector or self.force)
         waived += [UNSIGNED] * self.allow_unsigned
+        found = None
+        if not self.dry_run and not at_power_up:  # a version is reported
+            found = images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES))
         return api.prepare(
             opened.image,
             profile,
@@ -180,7 +183,7 @@ class UpgradeChoices:
                 waived=self.waived_checks(),
                 skip_same_version=skip_same_version,
                 reports_unchecked=at_power_up,
-                images_here=images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES)),
+                images_here=found,
             ),
             at_power_up=at_power_up,
             waived=waived,
