@@ -96,8 +96,10 @@ def settings_of_items(
         given = [fields[field] for field, _ in entry.fields]
         shown = {field: str(value) for (field, _), value in zip(entry.fields, given, strict=True)}
         content = None
+        if entry.item.manufacturer_only:
+            shown = {field: codec.show(shown[field]) for field, codec in entry.fields}
         # An escape cannot be told from a backslash of the text.
-        if not entry.item.manufacturer_only and not any("\\" in each for each in shown.values()):
+        elif not any("\\" in each for each in shown.values()):
             content = make_content(entry, given)
             shown = {field: codec.show(getattr(content, field)) for field, codec in entry.fields}
         values[name] = Setting(shown, content)

@@ -247,6 +247,22 @@ def test_settings_of_another_unit_are_refused_unless_forced(
     assert states["serial-number"] == "changed"
 
 
+@pytest.mark.usefixtures("battery")
+def test_every_setting_of_a_backup_reads_as_before_on_the_same_unit(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "b.zip"
+    assert flasher("backup", "-t", "bms", "-o", path, "--no-memory", "-i", "virtual").code == 0
+    run = flasher("backup", "restore", path, "--yes", "--json", "-i", "virtual")
+    assert {each["name"]: each["state"] for each in run.document["settings"]} == dict.fromkeys(
+        (
+            "check-code", "user-string-1", "user-string-2", "user-string-3",
+            "production-information", "model", "serial-number",
+        ),
+        "kept",
+    )  # fmt: skip
+
+
 def test_a_device_without_application_gets_no_settings(
     battery: Settings, flasher: Flasher, tmp_path: Path
 ) -> None:
