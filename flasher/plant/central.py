@@ -18,6 +18,9 @@ from flasher.station.records.database import Location, locate
 from flasher.station.records.errors import RuleBrokenError, mapped
 
 LOCK_TIMEOUT_S: Final = 10.0
+_NAME_ONE: Final = (
+    "Name postgresql://USER@HOST/NAME; in a password, @ is written %40 and / is written %2F."
+)
 
 
 class Refusal(StrEnum):
@@ -62,11 +65,15 @@ class ChainRefusedError(RuleBrokenError):
 
 def plant_location(url: str) -> Location:
     """Parse the URL of a plant's database, which it names. Raises UsageError."""
-    location = locate(url, Path())
+    try:
+        location = locate(url, Path())
+    except UsageError as error:
+        error.remedy = _NAME_ONE
+        raise
     if location.url.get_backend_name() != "postgresql":
         raise UsageError(
             f"{location.shown} is not a PostgreSQL database.",
-            remedy="Name postgresql://USER@HOST/NAME.",
+            remedy=_NAME_ONE,
         )
     if not location.url.database:
         raise UsageError("The URL names no database.", remedy="Add /NAME to it, such as /flasher.")

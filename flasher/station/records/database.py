@@ -113,10 +113,11 @@ def locate(url: str, folder: Path | None = None) -> Location:
 
 
 def _no_database(url: str) -> UsageError:
-    """Shows only the beginning of the text: any part may be a password."""
-    begin, scheme, _ = url.partition("://")
+    """Shows only the scheme, if there is one: any other part may be a password."""
+    scheme, separator, _ = url.partition("://")
+    shown = f"{printable(scheme)[:40]}://..." if separator else "What is named"
     return UsageError(
-        f"{printable(begin + scheme)[:40]}... is neither a file nor the URL of a database.",
+        f"{shown} is neither a file nor the URL of a database.",
         remedy="Name an SQLite file, or postgresql+psycopg://user@host/name; in a password, @ is "
         "written %40 and / is written %2F.",
     )

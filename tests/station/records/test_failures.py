@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import UsageError
+from flasher.plant.central import plant_location
 from flasher.station.records.database import locate
 from flasher.station.records.errors import (
     DiskFullError,
@@ -169,6 +170,16 @@ def test_a_place_that_cannot_be_is_a_wrong_setting(url: str) -> None:
 
 def test_a_password_is_not_shown(tmp_path: Path) -> None:
     assert "secret" not in locate("postgresql://me:secret@host/db", tmp_path).shown
+
+
+@each("url", ["me:secret@host/db", "postgresql://me:sec@ret@host/db", "mysql://me:secret@host/db"])
+def test_a_password_is_not_shown_of_a_url_that_is_refused(url: str) -> None:
+    with pytest.raises(UsageError, match="neither a file nor the URL") as caught:
+        locate(url)
+    assert "sec" not in str(caught.value)
+    with pytest.raises(UsageError, match="neither a file nor the URL") as caught:
+        plant_location(url)
+    assert "SQLite" not in caught.value.remedy
 
 
 def test_every_connection_has_the_settings_that_make_a_commit_last(tmp_path: Path) -> None:
