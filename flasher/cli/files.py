@@ -30,6 +30,13 @@ def check_writable(
     """
     if path is None:
         return
+    if str(path) == "-":
+        raise UsageError(
+            "This command writes a file, not standard output.",
+            where=option,
+            remedy="Name a file.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        )
     try:
         if path.is_dir():
             raise _not_written(path, option, "it is a folder")

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from flasher.cli.files import write_whole
-from flasher.errors import UsageError
+from flasher.errors import ExitCode, UsageError
+from tests.loops import each
 
 from .conftest import SAMPLES, Flasher
 
@@ -54,3 +55,23 @@ def test_a_link_of_another_user_is_not_followed(
         with pytest.raises(UsageError, match="a link of another user"):
             write_whole(tmp_path / name, b"new", "--html")
     assert real.read_bytes() == b"mine"
+
+
+@each(
+    "words",
+    [
+        ("backup", "-t", "bms", "--mock", "-o", "-"),
+        ("release", "payload", "bike.wfw", "-o", "-"),
+        ("bundle", "--last", "-o", "-"),
+    ],
+)
+def test_standard_output_is_not_taken_for_a_file_named_by_a_dash(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bundles" / "flasher-bms-20260105-101500").mkdir(parents=True, exist_ok=True)
+    monkeypatch.setenv("FLASHER_BUNDLE_DIR", str(tmp_path / "bundles"))
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert "writes a file, not standard output" in run.err
+    assert not (tmp_path / "-").exists()
