@@ -135,7 +135,8 @@ def test_a_target_without_a_version_query_is_refused_before_anything_is_sent(
     stage = Stage("wmc", profile=SMALL)
     run = verify(stage)
     assert run.code == ExitCode.USAGE
-    assert "cannot be verified by version" in run.err
+    assert "A WMC cannot be verified." in run.err
+    assert "--level" not in run.err, "it was not given"
     assert not stage.heard
 
 

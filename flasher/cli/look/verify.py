@@ -24,8 +24,8 @@ from flasher.cli.options import (
 from flasher.cli.output import ClosingLine, Output, byte_count, counted
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.cli.upgrade import text
-from flasher.errors import ExitCode, VerificationError
-from flasher.host.verify import Level, Verdict, Verification
+from flasher.errors import ExitCode, UsageError, VerificationError
+from flasher.host.verify import Level, Verdict, Verification, possible_levels
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.protocol.spec import Target
@@ -107,6 +107,13 @@ def verify(
     plan = api.make_plan(
         opened.image, target, bus.dialect, bitrate_bps=bus.bit_rate.bps, has_upgrade=True
     )
+    if possible_levels(target, options) == (Level.NONE,):
+        raise UsageError(
+            f"A {target.node.name} cannot be verified.",
+            cause="the document gives no query for it, and no profile names one",
+            remedy="`flasher history` lists what this computer has flashed. A product with a "
+            "query of its own needs a profile with its version_query.",
+        )
     if level is not None:
         api.check_level(plan, Level(level), options)
     with recorded_device(recorded, bus, output, target, settings) as (device, record):
