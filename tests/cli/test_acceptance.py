@@ -175,6 +175,9 @@ def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flashe
     assert states(run.document)["second upgrade"] == "passed"
     assert states(run.document)["identity afterwards"] == "not possible"
     assert run.document["device_state"] == "it has the new image"
+    for number, name in enumerate(NAMES, 1):
+        assert f"{number}. {name} ..." in run.err, "a step that is not tried has its line too"
+    assert "NAK; what runs is not known" in run.err
 
 
 def test_a_check_of_the_device_that_refuses_names_no_option_to_waive_it(

@@ -43,6 +43,7 @@ from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.events import PacketAcknowledged
 from flasher.host.outcome import AGAIN, DeviceLeft
+from flasher.host.verify import Verdict
 from flasher.i18n import without_options
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import Target
@@ -332,7 +333,7 @@ class _Walk:
         node = self.job.plan.target.node.name
         if not self._before.readings:
             why = f"the documents let no tool read the {node}"
-            self._add("read", StepState.IMPOSSIBLE, why)
+            self._leave_out("read", StepState.IMPOSSIBLE, why)
             self._impossible = {"read", STEPS[-1]}
             return
         with self._step("read") as done:
@@ -354,7 +355,7 @@ class _Walk:
         question = f"Flash {what} into the {node}, twice? Its application is erased and replaced."
         if not self.agreed and not self._asks(question):
             for name in ("first upgrade", "second upgrade"):
-                self._add(name, StepState.NOT_TRIED, "the person did not agree")
+                self._leave_out(name, StepState.NOT_TRIED, "the person did not agree")
             return
         for name in ("first upgrade", "second upgrade"):
             with self._step(name) as done:
@@ -368,12 +369,12 @@ class _Walk:
             )
         ):
             why = "not requested" if self.agreed else "the person did not agree"
-            self._add("interrupted and rescued", StepState.NOT_TRIED, why)
+            self._leave_out("interrupted and rescued", StepState.NOT_TRIED, why)
         else:
             with self._step("interrupted and rescued") as done:
                 done.what = self._interrupt_and_rescue(connection)
         if STEPS[-1] in self._impossible:
-            self._add(STEPS[-1], StepState.IMPOSSIBLE, "the documents give no query for it")
+            self._leave_out(STEPS[-1], StepState.IMPOSSIBLE, "the documents give no query for it")
         else:
             with self._step(STEPS[-1]) as done:
                 done.what = self._compare(device.identify())
@@ -423,9 +424,11 @@ class _Walk:
         self._details += text.summary_lines(result, job.plan)
         if left is DeviceLeft.NEW and result.running_version:
             self.device_state = f"it runs {result.running_version}"
+        verdict = result.verification.verdict
+        runs = "what runs is not known" if verdict is Verdict.NOT_ASKED else wording(verdict)
         return (
             f"{duration(figures.duration_s)}, {figures.repetitions} repeated, {figures.naks} NAK; "
-            f"{wording(result.verification.verdict)}"
+            f"{runs}"
         )
 
     def _add_repair(self, error: FlasherError) -> None:
@@ -474,7 +477,7 @@ class _Walk:
     @contextmanager
     def _step(self, name: str) -> Iterator[_Done]:
         """Add a step when the block ends, however it ends."""
-        self.output.progress(f"{len(self.steps) + 1}. {name} ...")
+        self._name(name)
         self._details, done = [], _Done()
         begun = time.perf_counter()
         state, what = StepState.STOPPED, "interrupted at once"
@@ -500,6 +503,14 @@ class _Walk:
             error, f"{without_options(error.remedy)} An acceptance waives no check.".lstrip()
         )
         self.error = self.error or error
+
+    def _name(self, name: str) -> None:
+        self.output.progress(f"{len(self.steps) + 1}. {name} ...")
+
+    def _leave_out(self, name: str, state: StepState, what: str) -> None:
+        """Add a step that is not begun."""
+        self._name(name)
+        self._add(name, state, what)
 
     def _add(self, name: str, state: StepState, what: str, took_s: float = 0.0) -> None:
         self.steps.append(AcceptanceStep(name, state, what, self._details, round(took_s, 2)))
