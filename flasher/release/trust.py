@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from json import JSONDecodeError
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tomli_w
@@ -296,6 +297,8 @@ def parse_chain(raw: bytes, source: str) -> Chain:
         raise untrusted(source, text("it is larger than {limit} bytes", limit=CHAIN_MAX_SIZE))
     try:
         envelopes = _envelopes(raw)
+    except JSONDecodeError as error:
+        raise untrusted(source, text("it is not a JSON file: {why}", why=str(error))) from error
     except ValueError as error:
         raise untrusted(source, printable(str(error))) from error
     versions = tuple(parse_trust(each.payload, source) for each in envelopes)

@@ -312,3 +312,21 @@ def test_rescue_takes_a_release(run: Flasher) -> None:
     signed(run)
     made(run, "trust", "install", "trust.json", "--yes")
     made(run, "rescue", "bike.wfw", *FLASH)
+
+
+def test_a_role_may_not_ask_for_more_signatures_than_it_has_keys(run: Flasher) -> None:
+    works(run)
+    refused = run(
+        "trust", "init", "other.json", "--name", "X", "--grant", "root=boss.key.pub",
+        "--threshold", "root=2", "--key", "boss.key", *WITH,
+    )  # fmt: skip
+    assert refused.code == ExitCode.USAGE
+    assert "The role root would ask for 2 signatures and has 1 key." in refused.err
+    assert "changed by hand" not in refused.err
+
+
+def test_a_file_that_is_no_trust_file_is_named_as_such(run: Flasher) -> None:
+    works(run)
+    refused = run("trust", "show", "boss.key.pub")
+    assert refused.code == ExitCode.USAGE
+    assert "it is not a JSON file" in refused.err

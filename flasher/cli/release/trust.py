@@ -174,6 +174,12 @@ class _Grants:
                 raise UsageError(
                     f"The role {name} has no keys.", remedy=f"Give it some: --grant {name}=FILE."
                 )
+            if threshold > len(found.keys):
+                raise UsageError(
+                    f"The role {name} would ask for {counted(threshold, 'signature')} and has "
+                    f"{counted(len(found.keys), 'key')}.",
+                    remedy=f"Give it more keys: --grant {name}=FILE, or a lower --threshold.",
+                )
             trust = trust.with_role(name, replace(found, threshold=threshold))
         return trust
 
