@@ -197,3 +197,11 @@ def test_a_trace_of_the_conformance_suite_is_no_second_tool(
     suite = tmp_path / "suite.log"
     suite.write_text(plain.read_text().replace(" can0 ", " conformance "))
     assert "two tools" not in flasher("explain", suite).out
+
+
+def test_a_packed_bundle_has_to_be_unpacked_first(flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "flasher-bms.zip").write_bytes(b"PK")
+    for command in ("explain", "bundle"):
+        run = flasher(command, tmp_path / "flasher-bms.zip")
+        assert run.code == 2
+        assert "Unpack it into a folder of its own" in run.err

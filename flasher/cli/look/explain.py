@@ -112,6 +112,12 @@ def find_source(named: Path | None, *, last: bool) -> Path:
     if last == (named is not None):
         raise UsageError("Name one trace or bundle.", remedy=f"Write either its name or {_LAST}.")
     if named is not None:
+        if named.suffix.lower() == ".zip":
+            raise UsageError(
+                f"{printable(str(named))} is an archive, not a trace.",
+                remedy="Unpack it into a folder of its own; a packed bundle is read with "
+                "`flasher explain FOLDER`.",
+            )
         return named
     folder = bundle_folder()
     found = bundles(folder)
