@@ -83,4 +83,5 @@ class BikeSet(TomlTable):
 
 def read_bike_set(path: str | os.PathLike[str]) -> BikeSet:
     """Read a bike set. Raises UsageError with all problems of the file."""
-    return Reader(BikeSet, "bike set").load(path)
+    remedy = 'Each device has a table [[target]] with target = "bms" and image = "FILE".'
+    return Reader(BikeSet, "bike set", remedy=remedy).load(path)

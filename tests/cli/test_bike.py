@@ -203,6 +203,14 @@ def test_each_device_has_a_trace_file_of_its_own(
     }  # fmt: skip
 
 
+def test_an_error_in_a_set_shows_how_a_set_is_written(flasher: Flasher, folder: Path) -> None:
+    for content in ("", 'bms = "bms.bin"\n', "[[target]]\n"):
+        (folder / "bike.toml").write_text(content)
+        run = flasher("flash", "--bike", folder / "bike.toml", *WORDS)
+        assert run.code == ExitCode.USAGE
+        assert 'a table [[target]] with target = "bms" and image = "FILE"' in run.err
+
+
 # -- interrupted -----------------------------------------------------------------------------------
 
 
@@ -219,6 +227,7 @@ def test_after_an_interruption_the_same_command_goes_on(
     bike.at[place] = act
     stopped = upgrade()
     assert stopped.code == ExitCode.INTERRUPTED, stopped.err
+    assert "it may have no application now" in stopped.err
     assert "--bike" in stopped.err.split("to repair it:")[1]
     bike.erased.clear()
     again = upgrade("--json")

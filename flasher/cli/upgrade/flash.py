@@ -62,7 +62,10 @@ examples:
   flasher flash --bike bike.wfw -i socketcan -c can0    all devices of a bike
   flasher flash --bike bike.toml --mock
 
---bike takes a release with several images, or a TOML file that names an image for each device.
+--bike takes a release with several images, or a TOML file with a table for each device:
+  [[target]]
+  target = "bms"
+  image = "battery.hex"
 Everything is checked before the first device is erased. A device without an application comes
 first; then OBC and WMC, and the battery last: it supplies the others, and has to work as long as
 one of them may need a rescue. After an interruption the same command goes on: a device that

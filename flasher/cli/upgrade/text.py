@@ -224,7 +224,7 @@ def failed(error: FlasherError, more: str = "") -> ClosingLine:
     if len(what) > _LINE_MAX:
         what = what.partition(" (")[0]
     if error.needs_rescue and not more:
-        more = "; it has no application now, or perhaps none"
+        more = "; it may have no application now"
     return ClosingLine(word, what + more, "red")
 
 
