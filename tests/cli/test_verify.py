@@ -10,7 +10,7 @@ import pytest
 from flasher.errors import ExitCode
 from flasher.image.image import Image
 from flasher.protocol.frame import Frame
-from tests.cli.conftest import Flasher, Run
+from tests.cli.conftest import SAMPLES, Flasher, Run
 from tests.end_to_end.stage import IMAGE, NEW, OLD, SMALL, Stage, image_of
 
 BASE = 0x0800_8000
@@ -69,6 +69,15 @@ def test_another_version_decides_without_reading_the_memory(
     assert "completed" not in run.err
     assert "memory:  not compared: the version decides already" in run.out
     assert not any(frame.data.startswith(READ_MEMORY) for frame in flashed.heard)
+
+
+def test_an_image_that_names_another_target_is_compared_with_a_warning(
+    flasher: Flasher, flashed: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.cli.options.connect", flashed.connect)
+    run = flasher("verify", SAMPLES / "wmc.hex", "-t", "bms", "-i", "virtual")
+    assert run.code == ExitCode.VERIFICATION
+    assert "warning: the image names the WMC inside, not the BMS" in run.err
 
 
 def test_another_build_of_the_same_version_is_found_with_its_ranges(

@@ -28,6 +28,7 @@ from flasher.errors import ExitCode, UsageError, VerificationError
 from flasher.host.verify import Level, Verdict, Verification, possible_levels
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
+from flasher.image.release import target_problem
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.settings.profile import load_profile
@@ -116,6 +117,9 @@ def verify(
         )
     if level is not None:
         api.check_level(plan, Level(level), options)
+    problem = target_problem(opened.image, opened.release, target)
+    if problem is not None:
+        output.error_line(f"warning: {problem}")
     with recorded_device(recorded, bus, output, target, settings) as (device, record):
         output.progress(f"comparing the {target.node.name} on {device.connection.name} ...")
 
