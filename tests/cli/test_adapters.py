@@ -321,3 +321,9 @@ def test_a_named_adapter_asks_nothing_more_than_before(
         run = flasher("flash", SAMPLES / f"{target}.hex", "-t", target, "-i", "pcan", "-c", "x")
     assert run.code == ExitCode.OK
     assert "listening for the" not in run.err
+
+
+def test_rules_for_udev_are_no_list_of_the_network(flasher: Flasher) -> None:
+    run = flasher("adapters", "--udev", "--network")
+    assert run.code == ExitCode.USAGE
+    assert "Leave one out." in run.err

@@ -96,6 +96,10 @@ def adapters(output: Output, *, network: bool, udev: bool) -> int:
         raise UsageError(
             "--udev prints a file of rules, not a JSON document.", remedy="Leave out --json."
         )
+    if udev and network:
+        raise UsageError(
+            "--udev lists no adapters, and --network is for the list.", remedy="Leave one out."
+        )
     if udev:
         for line in udev_rules(WELLING):
             output.result(line)

@@ -465,13 +465,14 @@ examples:
   flasher release verify bike.wfw
   flasher release verify bike.wfw -t bms --json
 
-Exit code 3 for a release that would not be flashed; nothing is sent in any case.
+Exit code 3 for a release that would not be flashed, 2 without a trust file on this computer;
+nothing is sent in any case.
 """,
 )
 @_file
 @target_option(required=False)
 def verify_(output: Output, target: Target | None, *, file: str) -> int:
-    """Check a release as `flasher flash` does before it opens a bus."""
+    """Check a release as `flasher flash --require-signed` does before it opens a bus."""
     package = verify.open_package(file)
     now = datetime.datetime.now(datetime.UTC).date()
     signers: dict[str, list[str]] = {}
