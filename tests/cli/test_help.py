@@ -110,6 +110,9 @@ def test_all_codes_are_listed(flasher: Flasher) -> None:
 
 def test_help_of_a_command_is_that_of_its_option(flasher: Flasher) -> None:
     assert flasher("help", "flash").out == flasher("flash", "--help").out
+    assert flasher("help", "trust", "key").out == flasher("trust", "key", "--help").out
+    for words in (("trust", "no"), ("flash", "key"), ("E201", "key")):
+        assert flasher("help", *words).code == 2
     assert flasher("help").out == flasher("--help").out
 
 

@@ -21,6 +21,7 @@ examples:
   flasher help DUPLICATE    a code of the station
   flasher help codes        all codes
   flasher help flash        the same as flasher flash --help
+  flasher help trust key    the same as flasher trust key --help
 """
 _SECTION: Final = re.compile(r"^## (E\d+): (.+)\n((?:(?!#).*\n?)*)", re.MULTILINE)
 _ALL: Final = "codes"
@@ -63,13 +64,28 @@ def _codes(ctx: click.Context) -> Iterable[str]:
     return (*ErrorCode, *CODES, _ALL, *commands)
 
 
+def _help_of(found: click.Command, shown: click.Context, action: str | None) -> str:
+    """Return the help of a command, or of its action. Raises UsageError for an unknown action."""
+    if action is None:
+        return found.get_help(shown)
+    inner = found.get_command(shown, action) if isinstance(found, click.Group) else None
+    if inner is None:
+        raise UsageError(
+            f"{shown.command_path} has no action {action!a:.40}.",
+            remedy=f"See `flasher help {shown.info_name}`.",
+        )
+    with inner.make_context(action, [], parent=shown, resilient_parsing=True) as inside:
+        return inner.get_help(inside)
+
+
 @command(name="help", epilog=_EXAMPLES)
 @argument(
     "what", metavar="WHAT", required=False, shell_complete=values.offers(_codes),
     help="a code, `codes`, or a command",
 )  # fmt: skip
+@argument("action", metavar="ACTION", required=False, help="an action of the command")
 @click.pass_context
-def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
+def help_(ctx: click.Context, output: Output, *, what: str | None, action: str | None) -> int:
     """Explain a code, or show the help of a command."""
     from flasher.station.codes import CODES  # noqa: PLC0415  needed for its codes alone
 
@@ -78,6 +94,15 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
     if what is None:
         output.print_help(program.get_help())
         return ExitCode.OK
+    if what in program.command.entries:
+        found = program.command.entries[what].load()
+        with found.make_context(what, [], parent=program, resilient_parsing=True) as shown:
+            output.print_help(_help_of(found, shown, action))
+        return ExitCode.OK
+    if action is not None:
+        raise UsageError(
+            f"{what!a:.40} is not a command with actions.", remedy="See `flasher help`."
+        )
     errors = error_codes()
     if what.lower() == _ALL:
         output.table((code, each.title) for code, each in errors.items())
@@ -87,11 +112,6 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
         documents = [CodeDocument(each.code, each.title, "") for each in errors.values()]
         documents += [CodeDocument(name, str(code.meaning), "") for name, code in CODES.items()]
         return output.document(CodesDocument(documents))
-    if what in program.command.entries:
-        found = program.command.entries[what].load()
-        with found.make_context(what, [], parent=program, resilient_parsing=True) as shown:
-            output.print_help(found.get_help(shown))
-        return ExitCode.OK
     word = what.upper()
     if word in CODES:
         code = CODES[word]
