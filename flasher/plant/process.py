@@ -18,7 +18,7 @@ from flasher.errors import FlasherError
 from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
 from flasher.processes import signals_blocked
-from flasher.station.records.database import locate, open_database
+from flasher.station.records.database import locate_records, open_database
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import SystemClock
@@ -48,7 +48,7 @@ class Sending:
     def open(self) -> Forwarder:
         """Open the station's records for reading. Raises UsageError, RecordError."""
         clock = SystemClock()
-        location = locate(self.records, self.files)
+        location = locate_records(self.records, self.files)
         central = Central(self.url)
         records = open_database(
             location,

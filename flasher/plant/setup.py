@@ -26,7 +26,6 @@ from flasher.plant.schema import (
 )
 from flasher.protocol.text import printable
 from flasher.station.records import schema as station_schema
-from flasher.station.records.database import pin_search_path
 from flasher.station.records.model import utc_text
 
 STATIONS: Final = "flasher_stations"
@@ -92,7 +91,13 @@ def setup(
         central.writing() as connection,
     ):
         connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
-        pin_search_path(connection)
+        # The functions prefer the records' tables to temporary ones.
+        connection.execute(
+            text(
+                "SELECT set_config('search_path', quote_ident(current_schema()) || ', pg_temp',"
+                " true)"
+            )
+        )
         is_new = _bring_up_to_date(connection, central, now)
         for role in (STATIONS, READERS):
             _make(connection, role)

@@ -12,7 +12,7 @@ from sqlalchemy import select
 from flasher.errors import UsageError
 from flasher.plant.central import plant_location
 from flasher.plant.schema import trace
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
 from flasher.station.records.heads import ChainHead
@@ -66,6 +66,8 @@ class PlantRecords(Records):
 
 class PlantStore(Store):
     """The records of all stations, for reading."""
+
+    located = staticmethod(locate)
 
     def __init__(
         self,

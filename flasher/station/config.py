@@ -166,11 +166,11 @@ class StationConfig(TomlTable):
     """The station file. Relative paths start at its folder."""
 
     name: ShortText = "station"
-    """Name of the station; different for each station that shares the records."""
+    """Name of the station; different for each station of a plant, or that shares the records."""
     records: str = "records.sqlite"
-    """Records: an SQLite file, or the URL of a PostgreSQL database."""
+    """Records: an SQLite file."""
     files: str = ""
-    """Folder of the traces; required for a server, else default beside the SQLite file."""
+    """Folder of the traces; empty: beside the SQLite file."""
     keys: str = ""
     """Folder of the signing key; empty: a folder of this user."""
     heads: tuple[str, ...] = Field(default=(), max_length=8)

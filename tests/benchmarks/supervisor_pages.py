@@ -1,11 +1,11 @@
 """Times what a plant asks of the records of many runs, and what a station notices of it: pages of
 the supervisor, the certificate, the report of a day, the commit of a run.
 
-    python -m tests.benchmarks.supervisor_pages [--runs N] [--traces N] [--server] [--keep FOLDER]
+    python -m tests.benchmarks.supervisor_pages [--runs N] [--traces N] [--keep FOLDER]
 
-`cold`: records opened anew, and nothing of them in the computer's memory (a server is started
-again for it). `warm`: asked once more; `CPU`: of that, the work of this process. The records are
-made in bulk (`bulk_records`); with --keep they stay in FOLDER, and are used again from there.
+`cold`: records opened anew, and nothing of them in the computer's memory. `warm`: asked once more;
+`CPU`: of that, the work of this process. The records are made in bulk (`bulk_records`); with --keep
+they stay in FOLDER, and are used again from there.
 """
 
 from __future__ import annotations
@@ -18,15 +18,12 @@ import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Final
-
-from sqlalchemy import create_engine
 
 from flasher.protocol.spec import BMS
 from flasher.station.recipe_file import LoadedRecipe
@@ -52,7 +49,6 @@ from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_super
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
 from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock, make_recipe
-from tests.station.postgres import Server, find_programs, running_server
 from tests.station.traces import run_messages, write_trace
 
 TURNS: Final = 300
@@ -66,25 +62,16 @@ class Plant:
 
     folder: Path
     runs: int
-    server: Server | None = None
-    url: str = field(init=False)
     is_filled: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self.is_filled = self.files.exists()
-        self.url = str(self.folder / "records.sqlite")
-        if self.server is not None:
-            is_new = not self.is_filled
-            self.url = self.server.own_records() if is_new else self.server.url("test_1")
 
     def fill(self, traces: int) -> None:
-        bench = Bench(self.folder, url=self.url if self.server else None)
+        bench = Bench(self.folder)
         bench.make(lot="L000")
         bulk_records.fill(bench, self.runs, traces)
         bench.store.close()
-        if self.server is not None:
-            with create_engine(self.url, isolation_level="AUTOCOMMIT").connect() as connection:
-                connection.exec_driver_sql("VACUUM ANALYZE")  # as a server does by itself
 
     def open(self, *, read_only: bool = True, clock: FakeClock | None = None) -> Store:
         return Store.open(
@@ -94,13 +81,15 @@ class Plant:
 
     @property
     def files(self) -> Path:
-        return self.folder / ("files" if self.server else "records.sqlite.files")
+        return self.folder / "records.sqlite.files"
+
+    @property
+    def url(self) -> str:
+        return str(self.folder / "records.sqlite")
 
     def cool(self) -> None:
         """Let the computer forget what it holds of the records."""
-        if self.server is not None:
-            self.server.restart()
-        for path in (self.server.folder if self.server else self.folder).rglob("*"):
+        for path in self.folder.rglob("*"):
             if path.is_file():
                 handle = os.open(path, os.O_RDONLY)
                 os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
@@ -345,33 +334,10 @@ async def _ask(answering: QueryProcesses, ended: threading.Event) -> None:
     print(f"  {asked} pages in {time.perf_counter() - began:.0f} s")
 
 
-@contextmanager
-def plant_of(options: argparse.Namespace, folder: Path) -> Iterator[Plant]:
-    with ExitStack() as stack:
-        server = None
-        if options.server:
-            programs = find_programs()
-            assert programs is not None
-            kept = options.keep and options.keep / "server"
-            if kept is not None:
-                kept.mkdir(exist_ok=True)
-            server = stack.enter_context(running_server(programs, kept))
-        plant = Plant(folder, options.runs, server)
-        if not plant.is_filled:
-            began = time.perf_counter()
-            plant.fill(options.traces)
-            os.sync()
-            print(
-                f"  {options.runs:,} runs made in {time.perf_counter() - began:.0f} s", flush=True
-            )
-        yield plant
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100_000)
     parser.add_argument("--traces", type=int, default=1000, help="the last runs that have one")
-    parser.add_argument("--server", action="store_true", help="on PostgreSQL, in place of a file")
     parser.add_argument("--keep", type=Path, help="make them in this folder, or use those in it")
     parser.add_argument("--files", action="store_true", help="whole files, too")
     parser.add_argument("--pages", default="", help="only pages with this in their address")
@@ -379,13 +345,19 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        with plant_of(options, folder) as plant:
-            measure_sums(plant)
-            measure_pages(plant, options.pages)
-            if options.files:
-                measure_files(plant)
-            measure_report(plant)
-            measure_station(plant)
+        plant = Plant(folder, options.runs)
+        if not plant.is_filled:
+            began = time.perf_counter()
+            plant.fill(options.traces)
+            os.sync()
+            took_s = time.perf_counter() - began
+            print(f"  {options.runs:,} runs made in {took_s:.0f} s", flush=True)
+        measure_sums(plant)
+        measure_pages(plant, options.pages)
+        if options.files:
+            measure_files(plant)
+        measure_report(plant)
+        measure_station(plant)
 
 
 if __name__ == "__main__":

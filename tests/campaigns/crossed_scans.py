@@ -161,7 +161,7 @@ class Line:
         self._stack = ExitStack()
         data = b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(_IMAGE_BYTES))
         self._image = Image.from_bytes(data)
-        self._words = write_files(self.folder, self.ports, "records.sqlite", self._image)
+        self._words = write_files(self.folder, self.ports, self._image)
         self._sources: dict[str, Callable[[str], object]] = {}
         """Scanners and browsers, by the names that the station gives them, and how they scan."""
         lines = []

@@ -3,7 +3,7 @@
 the plant has every run of every station, once:
 
     python -m tests.campaigns.plant_kill --stations 30 --runs 10000 --server-kills 20 \
-        --station-kills 30 --outage 120 [--seed N]
+        --station-kills 30 --outage 120 --spacing 10 [--seed N]
 
 A station is a process that records runs of good and bad units (claim, intent, step, measurement,
 trace, end) as fast as its disk allows; no bus is simulated. What sends is the product's own
@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import psycopg
+from sqlalchemy import func, select
 
 from flasher.plant import forwarder
 from flasher.plant.central import Central
@@ -45,6 +46,7 @@ from flasher.plant.setup import create_database, role_of, setup
 from flasher.plant.store import PlantStore
 from flasher.plant.verify import PlantExaminer
 from flasher.protocol.spec import BMS
+from flasher.station.records import schema
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Measurement, Order, RunEnd, RunState, StepState, Verified
 from flasher.station.records.store import Store
@@ -55,7 +57,7 @@ from tests.station.traces import run_messages, write_trace
 POINTS: Final = ("enter", "part", "trace", "row", "before commit", "before acknowledgement")
 CHANCE: Final = 0.1
 PASSWORD: Final = "campaign"  # noqa: S105
-_DRAIN_LIMIT_S: Final = 600.0
+_DRAIN_LIMIT_S: Final = 3600.0
 _STATEMENTS: Final = {
     forwarder._ENTER: "enter", forwarder._ADD_PART: "part", forwarder._ADD_TRACE: "trace",
     forwarder._ADD_ROW: "row",
@@ -78,7 +80,8 @@ def station_main(name: str, url: str, folder: Path, runs: int) -> None:
     chance = random.Random(f"{name} {time.time_ns()}")
     with store:
         while True:
-            done = len(store.read.table())
+            with store.database.reading() as connection:
+                done = connection.execute(select(func.count()).select_from(schema.run)).scalar_one()
             if done < runs:
                 _one_run(store, recipe, folder, f"W26{done // 1000:02}{done % 1000:03}", chance)
             if sender is None or sender.exitcode is not None:
@@ -204,7 +207,7 @@ class Campaign:
         plan = ["server"] * self.options.server_kills + ["station"] * self.options.station_kills
         self.chance.shuffle(plan)
         for number, what in enumerate(plan):
-            time.sleep(self.chance.uniform(0.5, 4.0))
+            time.sleep(self.chance.uniform(0.2, 1.8) * self.options.spacing)
             if what == "server":
                 is_outage = number >= times // 2 and not self.kills["outage"]
                 self.kill_server(self.options.outage if is_outage else 0.0)
@@ -281,6 +284,7 @@ def main() -> None:
     parser.add_argument("--server-kills", type=int, default=20)
     parser.add_argument("--station-kills", type=int, default=30)
     parser.add_argument("--outage", type=float, default=120.0, help="seconds")
+    parser.add_argument("--spacing", type=float, default=2.0, help="mean seconds between kills")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     programs = find_programs()

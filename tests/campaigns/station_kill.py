@@ -1,7 +1,7 @@
 """Kills the real station, and the processes of its sockets, while an operator works at it; and
 looks each time whether what was shown is true:
 
-    python -m tests.campaigns.station_kill --times 60 [--database postgresql] [--seed N]
+    python -m tests.campaigns.station_kill --times 60 [--seed N]
 
 Nothing of the station is looked into: it is the command `flasher station run`, its event stream and
 its scanner. The units are in a process of their own, which knows nothing of flasher; they keep
@@ -37,7 +37,6 @@ from flasher.protocol.spec import BMS
 from flasher.settings.manifest import release_of, to_toml
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
 from tests.campaigns.station_operator import Fault, Operator, Place, Station, is_running
-from tests.station.postgres import find_programs, running_server
 
 KILLS_IN_A_ROW: Final = 3
 PEACE_LIMIT_S: Final = 240.0
@@ -74,14 +73,14 @@ item = "physical-id"
 """
 
 
-def write_files(folder: Path, ports: list[int], records: str, image: Image) -> list[str]:
+def write_files(folder: Path, ports: list[int], image: Image) -> list[str]:
     """Recipe, image, manifest and the station's file; the options that name them."""
     (folder / "bms.bin").write_bytes(image.data)
     manifest = to_toml(release_of(image, BMS))
     (folder / "bms.bin.toml").write_text(manifest, encoding="utf-8")
     recipe = RECIPE.replace("SHA256", image.sha256)
     (folder / "recipe.toml").write_text(recipe, encoding="utf-8")
-    lines = ['name = "line"', f'records = "{records}"', 'files = "files"']
+    lines = ['name = "line"', 'records = "records.sqlite"', 'files = "files"']
     for number, port in enumerate(ports, 1):
         bus = bus_of(port)
         lines += ["", "[[socket]]", f'name = "{number}"']
@@ -242,14 +241,13 @@ def campaign(
     seed: int,
     *,
     sockets: int = 2,
-    records: str = "records.sqlite",
     image_bytes: int = IMAGE_BYTES,
 ) -> Iterator[Campaign]:
     """A campaign that is ready to begin."""
     ports = [free_port() for _ in range(sockets)]
     data = b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(image_bytes))
     image = Image.from_bytes(data)
-    words = write_files(folder, ports, records, image)
+    words = write_files(folder, ports, image)
     with Units(ports, folder / "stderr") as units:
         made = Campaign(folder, units, ports, seed, words, image)
         try:
@@ -264,9 +262,6 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=60, help="kills in all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sockets", type=int, default=2)
-    parser.add_argument(
-        "--database", choices=("sqlite", "postgresql"), default="sqlite", help="of the records"
-    )
     parser.add_argument("--keep", type=Path, help="a new folder for records, traces and the story")
     options = parser.parse_args()
     began = time.perf_counter()
@@ -274,16 +269,7 @@ def main() -> int:
         folder = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=options.keep is None)
         os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
-        records = "records.sqlite"
-        if options.database == "postgresql":
-            programs = find_programs()
-            if programs is None:
-                parser.error("PostgreSQL is not installed")
-            server = stack.enter_context(running_server(programs))
-            records = server.url(server.database())
-        made = stack.enter_context(
-            campaign(folder, options.seed, sockets=options.sockets, records=records)
-        )
+        made = stack.enter_context(campaign(folder, options.seed, sockets=options.sockets))
         chance = random.Random(options.seed)
         while made.kills < options.times:
             for _ in range(min(KILLS_IN_A_ROW, options.times - made.kills)):

@@ -274,3 +274,66 @@ def _appeared(before: set[BaseProcess]) -> BaseProcess:
     wait_until(lambda: bool(set(multiprocessing.active_children()) - before))
     (found,) = set(multiprocessing.active_children()) - before
     return found
+
+
+# -- connections -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql://jo:s3cr3t@{place}/records",
+        "postgresql://jo:s3cr3t%40x@{place}/records",
+        "postgresql://jo:s3cr3t@x@{place}/records",
+        "postgresql://jo:x/s3cr3t@{place}/records",
+        "postgresql://j/o:s3cr3t@{place}/records",
+        "postgresql://jo:s3cr3t@{place}x/records",
+        "postgresql://jo:s3cr3t/records",
+        "postgresql://jo@{place}/records?password=s3cr3t",
+        "postgresql://jo:s3cr3t@{place}/records?connect_timeout=x",
+        "postgresql+none://jo:s3cr3t@{place}/records",
+        "postgresql:/jo:s3cr3t@{place}/records",
+    ],
+)
+def test_a_password_is_in_no_message_log_or_document(
+    flasher: Flasher, postgres: Server, tmp_path: Path, url: str
+) -> None:
+    place = f"127.0.0.1:{postgres.port}"
+    log = tmp_path / "log"
+    for command in (("plant", "status"), ("station", "report")):
+        for more in (("--database",), ("--json", "--database")):
+            run = flasher("--log-file", log, "-vv", *command, *more, url.format(place=place))
+            assert run.code == ExitCode.USAGE
+            shown = run.out + run.err + log.read_text(encoding="utf-8")
+            assert "s3cr3t" not in shown
+            assert "Traceback" not in shown
+    assert "station report" in log.read_text(encoding="utf-8")
+
+
+def test_a_driver_that_is_not_installed_is_named_with_how_to_install_it(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "flasher.station.records.server", raising=False)
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    run = flasher("plant", "status", "--database", "postgresql://jo@127.0.0.1/records", "--json")
+    assert run.code == ExitCode.USAGE
+    assert "'.[plant]'" in run.document["error"]["remedy"]
+
+
+def test_records_of_a_station_are_not_on_a_server(flasher: Flasher, tmp_path: Path) -> None:
+    sockets = tmp_path / "station.toml"
+    url = "postgresql://flasher_station@plant-db/flasher"
+    text = STATION.format(plant=url).replace(
+        'name = "line-2"', f'name = "line-2"\nrecords = "{url}"'
+    )
+    sockets.write_text(text, encoding="utf-8")
+    for words in (
+        ("verify", "--sockets", sockets),
+        ("upgrade", "--sockets", sockets),
+        ("report", "--database", url),
+        ("report", "--database", url, "--files", tmp_path),
+    ):
+        run = flasher("station", *words, "--json")
+        assert run.code == ExitCode.USAGE
+        assert "in a file on its own PC" in run.document["error"]["what"]
+        assert "flasher plant report" in run.document["error"]["remedy"]

@@ -14,6 +14,7 @@ from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
 from flasher.plant.setup import READERS, role_of, setup
 from flasher.plant.stations import StationStatus, stations_of
+from flasher.plant.store import PlantStore
 from flasher.station.records.store import Store
 from tests.station.factory import Bench, FakeClock
 from tests.station.postgres import OWNER, Server
@@ -81,7 +82,7 @@ class Plant:
     def store(self) -> Store:
         """The runs as reports and pages read them."""
         url = self.url(READER)
-        return Store.open(url, station="desk", folder=self.folder / "desk", read_only=True)
+        return PlantStore.open(url, station="desk", folder=self.folder / "desk", read_only=True)
 
 
 @dataclass

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import psycopg
 from sqlalchemy import event
 
 from flasher.image.image import Image
@@ -117,8 +116,6 @@ class Bench:
     folder: Path
     clock: FakeClock = field(default_factory=FakeClock)
     lock_timeout_s: float = 0.02
-    url: str | None = None
-    """Records on a server that are ready; None: in a file."""
     heads: tuple[str | Path, ...] = ()
     """Other places than beside the key."""
     _traces: int = 0
@@ -127,30 +124,25 @@ class Bench:
         self.recipe = make_recipe(self.folder)
         self.path = self.folder / "records.sqlite"
         self.trace = self.traced(SERIAL)
-        if self.url is not None:
-            self.lock_timeout_s = 5.0  # a server takes a moment to let go what a session held
-        else:
-            self.keys.mkdir()
-            for name, data in _begun_records().items():
-                file = self.folder / name
-                file.touch(0o600)
-                file.write_bytes(data)
+        self.keys.mkdir()
+        for name, data in _begun_records().items():
+            file = self.folder / name
+            file.touch(0o600)
+            file.write_bytes(data)
         self.store = self.opened()
         self.store.recover()
 
     def opened(self, station: str = "line-2", lock_timeout_s: float | None = None) -> Store:
         store = Store.open(
-            self.url or str(self.path),
+            str(self.path),
             station=station,
             clock=self.clock,
-            folder=None if self.url is None else self.folder / "files",
             key_locations=self.key_locations,
             lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
         )
-        if self.url is None:
-            # These tests pull no plug, and share the disk with each other.
-            event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
-            store.database.close()
+        # These tests pull no plug, and share the disk with each other.
+        event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
+        store.database.close()
         return store
 
     @property
@@ -160,14 +152,10 @@ class Bench:
     @contextmanager
     def outsider(self) -> Iterator[Any]:
         """A connection of a program that knows nothing of the station, of the plain driver."""
-        if self.url is None:
-            with closing(sqlite3.connect(self.path)) as connection:
-                connection.execute("PRAGMA foreign_keys = ON")
-                connection.execute("PRAGMA synchronous = OFF")
-                yield connection
-        else:
-            with closing(psycopg.connect(self.url.replace("+psycopg", ""))) as server:
-                yield server
+        with closing(sqlite3.connect(self.path)) as connection:
+            connection.execute("PRAGMA foreign_keys = ON")
+            connection.execute("PRAGMA synchronous = OFF")
+            yield connection
 
     @property
     def keys(self) -> Path:

@@ -1,4 +1,3 @@
-# ruff: noqa: S608  all of this SQL is written here
 """A PostgreSQL server of the tests' own: an ordinary user, a temporary folder, loopback."""
 
 from __future__ import annotations
@@ -10,16 +9,10 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import psycopg
-from sqlalchemy import Engine, Table, create_engine
-
-from flasher.station.records.schema import metadata
-from flasher.station.records.store import Store
-from tests.station.factory import FakeClock
 
 OWNER = "postgres"
 _INSTALLED = Path("/usr/lib/postgresql")
@@ -28,16 +21,6 @@ host all {OWNER} 127.0.0.1/32 trust
 host all all 127.0.0.1/32 scram-sha-256
 """
 _FAST = "-c fsync=off -c synchronous_commit=off -c full_page_writes=off -c max_connections=60"
-_EMPTY = "SET session_replication_role = replica;" + "".join(
-    f"DELETE FROM {table.name};" for table in metadata.sorted_tables
-)
-"""Deletes all rows, against the rules of the records."""
-_COUNT_ON = "".join(
-    f"SELECT setval(pg_get_serial_sequence('{table.name}', 'id'),"
-    f" (SELECT coalesce(max(id), 0) + 1 FROM {table.name}), false);"
-    for table in metadata.sorted_tables
-    if "id" in table.c
-)
 
 
 @dataclass
@@ -48,8 +31,6 @@ class Server:
     folder: Path
     port: int
     _made: int = 0
-    _shared: Engine | None = None
-    _first_rows: dict[Table, list[dict[str, Any]]] = field(default_factory=dict)
 
     def url(self, database: str, user: str = OWNER) -> str:
         return f"postgresql+psycopg://{user}@127.0.0.1:{self.port}/{database}"
@@ -59,29 +40,6 @@ class Server:
         host = "127.0.0.1"
         return psycopg.connect(host=host, port=self.port, dbname=database, user=user)
 
-    def records(self) -> str:
-        """The URL of records with nothing in them; always the same ones, for one test at a time."""
-        if self._shared is None:
-            self._shared = create_engine(self.own_records())
-            with self._shared.begin() as connection:
-                self._first_rows = {
-                    table: [dict(row) for row in connection.execute(table.select()).mappings()]
-                    for table in metadata.sorted_tables
-                }
-        with self._shared.begin() as connection:
-            connection.exec_driver_sql(_EMPTY)
-            for table, rows in self._first_rows.items():
-                if rows:
-                    connection.execute(table.insert(), rows)
-            connection.exec_driver_sql(_COUNT_ON)
-        return self._shared.url.render_as_string()
-
-    def own_records(self) -> str:
-        """The URL of new records; a new database takes half a second."""
-        url = self.url(self.database())
-        Store.open(url, station="line-2", folder=self.folder, clock=FakeClock()).close()
-        return url
-
     def database(self) -> str:
         """The name of a new database."""
         self._made += 1
@@ -90,13 +48,6 @@ class Server:
             connection.autocommit = True
             connection.execute(f"CREATE DATABASE {name}".encode())
         return name
-
-    def restart(self) -> None:
-        """End it as at the evening, and start it with nothing in its memory."""
-        if self._shared is not None:
-            self._shared.dispose()
-        self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", "fast", "-w", "stop")
-        self._start()
 
     def start(self) -> None:
         data = self.folder / "data"
@@ -112,8 +63,6 @@ class Server:
         self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", f"{where} {_FAST}", "start")
 
     def stop(self, mode: str = "immediate") -> None:
-        if self._shared is not None:
-            self._shared.dispose()
         self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", mode, "stop")
 
     def _run(self, program: str, *words: str) -> None:

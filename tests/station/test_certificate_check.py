@@ -25,7 +25,6 @@ from flasher.station.records.signatures import SigningKey
 from flasher.station.sealed import CheckedCertificate
 from tests.loops import each
 from tests.station.factory import SERIAL, Bench
-from tests.station.postgres import Server
 
 MARKS = ("-----BEGIN FLASHER CERTIFICATE-----", "-----END FLASHER CERTIFICATE-----")
 
@@ -111,15 +110,6 @@ def test_its_signed_lines_alone_are_enough(plant: Bench) -> None:
     block = re.search(f"{MARKS[0]}.*?{MARKS[1]}", page(plant), re.DOTALL)
     assert block is not None
     assert checked(plant, block[0].replace("\n", "  \r\n ")).problems == ()
-
-
-def test_records_on_a_server_prove_their_certificates(postgres: Server, tmp_path: Path) -> None:
-    bench = Bench(tmp_path, url=postgres.records())
-    bench.make()
-    text = page(bench)
-    assert checked(bench, text).problems == ()
-    assert is_refused(bench, text.replace("V1r0r4_20220512", "V1r0r5_20220512", 1))
-    bench.store.close()
 
 
 @pytest.mark.slow

@@ -69,8 +69,6 @@ def test_a_station_file_is_read_with_places_beside_it(tmp_path: Path) -> None:
     assert config.records == str(tmp_path / "records.sqlite")
     assert [each.name for each in config.socket] == list("ABCD")
     assert config.socket[3].mock == MockUnits(bad=0.1, slow=0.2, dead=0.05, seed=7)
-    url = "postgresql+psycopg://me@host/plant"
-    assert load_config(written(tmp_path, f'records = "{url}"\n' + USUAL)).records == url
 
 
 def test_the_heads_are_kept_in_one_place_or_in_several(tmp_path: Path) -> None:

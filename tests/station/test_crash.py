@@ -1,8 +1,8 @@
 """The station is killed for real while an operator works: what was shown is true of the units, and
 every unit gets through.
 
-The whole campaign is a command, with kills of a socket's process and with records on a server:
-`python -m tests.campaigns.station_kill --times 60 [--database postgresql]`.
+The whole campaign is a command, with kills of a socket's process:
+`python -m tests.campaigns.station_kill --times 60`.
 """
 
 from __future__ import annotations

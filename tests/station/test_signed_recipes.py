@@ -29,7 +29,6 @@ from flasher.station.runs import with_history
 from flasher.station.unit_checks import signature_measurements
 from tests.release.maker import Maker, chain_of, first_trust, maker, role, trusted
 from tests.station.factory import DAY, HEAD, IMAGES, SERIAL, SERIAL_NUMBER, Bench, target_table
-from tests.station.postgres import Server
 from tests.station.unit_bench import NEW_UNIT, WRITES, UnitBench
 
 __all__ = ["maker"]  # a fixture
@@ -324,17 +323,3 @@ def test_the_process_of_a_socket_checks_for_itself(tmp_path: Path, maker: Maker)
 def test_dates_decide_nothing(tmp_path: Path, maker: Maker) -> None:
     path = recipe_with(tmp_path, table(), released(maker, tmp_path))
     assert load_checked(path, date(2040, 1, 1)).targets
-
-
-@pytest.mark.slow
-def test_records_on_a_server_know_the_counter_of_a_unit(
-    postgres: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = Bench(tmp_path, url=postgres.records())
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    maker = Maker()
-    TrustStore().install(maker.chain)
-    use(bench, recipe_with(tmp_path, table(), released(maker, tmp_path, 4_294_967_295)))
-    passed(bench, claimed(bench), RunState.FAIL)
-    assert claimed(bench).counters_before == {"bms": 4_294_967_295}
-    bench.store.close()

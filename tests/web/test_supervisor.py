@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import re
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -36,7 +35,6 @@ from flasher.web import supervisor
 from flasher.web.query_processes import Answer, Question
 from flasher.web.supervisor import SupervisorPages, open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
-from tests.station.postgres import Server
 from tests.web.answering import app_of, app_with, client_of
 
 IMAGE = IMAGES[TARGET].sha256
@@ -102,36 +100,6 @@ def _links(html: str) -> dict[str, str]:
     return parser.found
 
 
-# -- records on a server ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "page",
-    [
-        "/runs?search=w260500&state=fail",
-        "/runs.csv?lot=L2",
-        "/runs/3",
-        "/units?serial=W2605003",
-        *(f"/yield?by={by.value}" for by in By),
-        "/times",
-        f"/images?image={IMAGE[:12]}",
-        f"/images.csv?sha256={IMAGE}",
-    ],
-)
-def test_a_server_is_shown_as_a_file_is(
-    client: TestClient, server_client: TestClient, page: str
-) -> None:
-    in_file, on_server = (each.get(page, follow_redirects=True) for each in (client, server_client))
-    assert in_file.status_code == on_server.status_code == 200
-    assert len(in_file.text) > 100
-    assert _without_times(on_server.text) == _without_times(in_file.text)
-
-
-def test_the_trail_and_the_certificate_of_a_server_are_shown(server_client: TestClient) -> None:
-    for page in ("/audit", "/units/certificate?serial=W2605003"):
-        assert server_client.get(page, follow_redirects=True).status_code == 200
-
-
 @pytest.mark.parametrize("path", ["/runs.csv", "/runs.csv?lot=L2", f"/images.csv?sha256={IMAGE}"])
 def test_a_file_in_parts_is_the_whole_file(
     client: TestClient, monkeypatch: pytest.MonkeyPatch, path: str
@@ -162,27 +130,6 @@ def test_a_file_breaks_off_where_a_part_cannot_be_read(
     with closing(pages.store), pytest.raises(RuntimeError, match="cannot be read"):
         client_of(app_with(pages)).get("/runs.csv")
     assert [question.fields.get("after") for question in asked] == [None, "2", "4"]
-
-
-@pytest.fixture(scope="module")
-def server_client(postgres: Server) -> Iterator[TestClient]:
-    url = postgres.records()
-    with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder), url=url)
-        _units(bench)
-        pages = open_supervisor(
-            url, bench.store.files.folder, KeyLocations(bench.keys), DEFAULT_SHIFTS
-        )
-        with closing(bench.store), closing(pages.store):
-            yield client_of(app_with(pages))
-
-
-def _without_times(text: str) -> str:
-    """Two benches are made one after the other: what differs is when, how long it took, and the
-    token of the session.
-    """
-    text = re.sub(r'content="[\w-]{32}"', "", text)
-    return re.sub(r"\d+(?:[:.\-T]\d+)+|\d+ (?=m?s\b)", "#", text)
 
 
 # -- runs ------------------------------------------------------------------------------------------

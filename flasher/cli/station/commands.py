@@ -34,7 +34,6 @@ examples:
   flasher station verify --certificate W2605002.html
   flasher station key
   flasher station pin
-  flasher station roles --database postgresql://flasher_owner@plant-db/flasher
 """
 _RUN_NOTES: Final = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
@@ -99,8 +98,8 @@ class RecordsOptions:
     """Options for the location of the records."""
 
     database: Annotated[str | None, option(
-        "--database", metavar="FILE|URL", panel="records", brief=True,
-        help="the records: an SQLite file or postgresql://USER@HOST/NAME (default: of --sockets, "
+        "--database", metavar="FILE", panel="records", brief=True,
+        help="the records: an SQLite file (default: of --sockets, "
         f"else {DEFAULT_RECORDS} here)",
     )]  # fmt: skip
     files: Annotated[Path | None, _path_option(
@@ -377,18 +376,6 @@ def unit(
 def backup(output: Output, file: Path, records: RecordsOptions) -> int:
     """Copy the records while the station runs."""
     return _call("maintenance.backup", output, records, file)
-
-
-@station.action("roles")
-@option("--station-role", metavar="NAME", default="flasher_station", help="user that adds records")
-@option("--reader-role", metavar="NAME", default="flasher_reader", help="user that reads records")
-@_records_options
-def roles(output: Output, station_role: str, reader_role: str, records: RecordsOptions) -> int:
-    """Grant rights to two users of a PostgreSQL database: one for stations, which adds records, and
-    one that reads them. Neither can delete records, or change tables and triggers. Missing users
-    and records are created. Run it as the owner of the database.
-    """
-    return _call("maintenance.roles", output, records, station_role, reader_role)
 
 
 @station.action("verify")

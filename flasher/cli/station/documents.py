@@ -134,25 +134,6 @@ class UnitDocument:
 
 
 @dataclass(frozen=True)
-class RoleDocument:
-    """A user of the database server."""
-
-    name: str
-    may: str
-    """"add" (adds and reads records) or "read"."""
-    is_new: bool
-    """True for a user that this command created, which has no password yet."""
-
-
-@dataclass(frozen=True)
-class StationRolesDocument:
-    """Database users that received rights."""
-
-    records: str
-    roles: list[RoleDocument]
-
-
-@dataclass(frozen=True)
 class SigningKeyDocument:
     """The key that signs a station's audit trail."""
 
@@ -191,7 +172,6 @@ DOCUMENTS: Final = (
     Backup,
     Examination,
     CheckedCertificate,
-    StationRolesDocument,
     SigningKeyDocument,
     AcceptedDocument,
     PinDocument,

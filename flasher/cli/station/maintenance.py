@@ -1,10 +1,9 @@
-"""`flasher station backup`, `verify`, `key`, `accept`, `upgrade`, `roles`: maintains records."""
+"""`flasher station backup`, `verify`, `key`, `accept`, `upgrade`: maintains records."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -14,17 +13,14 @@ from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.station.commands import RecordsOptions
 from flasher.cli.station.documents import (
     AcceptedDocument,
-    RoleDocument,
     SigningKeyDocument,
-    StationRolesDocument,
 )
 from flasher.cli.station.place import open_to_read, operator_of, records_of, the_station
 from flasher.errors import ExitCode, UsageError
 from flasher.files import read
 from flasher.protocol.text import printable
-from flasher.station.records.database import locate, no_records, open_database
+from flasher.station.records.database import locate_records, no_records
 from flasher.station.records.model import Examination, Problem
-from flasher.station.records.roles import check_roles, grant_roles
 from flasher.station.records.signatures import fingerprint
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.records.upgrade import upgrade as upgrade_records
@@ -201,11 +197,9 @@ def accept(
 
 def upgrade(output: Output, records: RecordsOptions) -> int:
     place = records_of(records)
-    location = locate(place.url, place.files or Path())
-    if location.file is not None:
-        if not location.file.exists():
-            raise no_records(location)
-        location = locate(place.url, place.files)  # the lock of a station is in its own folder
+    location = locate_records(place.url, place.files)
+    if location.file is None or not location.file.exists():
+        raise no_records(location)
     done = upgrade_records(
         location,
         choose=lambda names: place.station or the_station(names),
@@ -223,27 +217,3 @@ def upgrade(output: Output, records: RecordsOptions) -> int:
         output.result(f"  {printable(each)}")
     code = ExitCode.VERIFICATION if done.problems else ExitCode.OK
     return output.document(done, exit_code=code)
-
-
-# -- users of a server -----------------------------------------------------------------------------
-
-
-def roles(output: Output, records: RecordsOptions, station_role: str, reader_role: str) -> int:
-    """Also creates missing records, since a station may not create tables."""
-    place = records_of(records)
-    location = locate(place.url, Path())
-    check_roles(location, station_role, reader_role)
-    with closing(
-        open_database(location, datetime.now(UTC), lock_timeout_s=place.lock_timeout_s)
-    ) as database:
-        made = grant_roles(database, station_role, reader_role)
-    documents = [
-        RoleDocument(name=station_role, may="add", is_new=station_role in made),
-        RoleDocument(name=reader_role, may="read", is_new=reader_role in made),
-    ]
-    for role in documents:
-        new = ", new" if role.is_new else ""
-        output.result(f"{printable(role.name)}: may {role.may} records{new}")
-    for name in made:
-        output.progress(f"Give {printable(name)} a password: in psql, \\password {printable(name)}")
-    return output.document(StationRolesDocument(records=location.shown, roles=documents))

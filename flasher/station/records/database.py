@@ -12,18 +12,18 @@ import importlib
 import os
 import re
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from uuid import uuid4
 
 from filelock import FileLock, Timeout
-from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, select
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.pool import StaticPool
@@ -50,16 +50,11 @@ from flasher.station.records.schema import (
 )
 from flasher.station.records.triggers import trigger_statements
 
-if TYPE_CHECKING:
-    from flasher.station.records.server import ServerLock
-
 _SYNCHRONOUS_FULL: Final = 2
 _IMMEDIATE: Final = "flasher_immediate"
 _POSTGRESQL: Final = "postgresql+psycopg"
 _OPENED: Final = "flasher_file"
 """Key of a connection's `info`: identity of the database file that it opened."""
-_CHANGE_LIMIT_S: Final = 3600.0
-"""Statement timeout of a server while the schema is changed."""
 _BEFORE_ALEMBIC: Final = 2
 """Schema version of records that have no Alembic revision."""
 
@@ -112,6 +107,21 @@ def locate(url: str, folder: Path | None = None) -> Location:
     return Location(parsed, folder, shown)
 
 
+def locate_records(url: str, folder: Path | None = None) -> Location:
+    """`locate` for a station's records, which are in a file. Raises UsageError for a server."""
+    location = locate(url, folder or Path())
+    if location.url.get_backend_name() != "sqlite":
+        raise UsageError(
+            f"The records of a station are in a file on its own PC, not at {location.shown}.",
+            cause="a station with its records on a server would stop whenever that is away",
+            remedy='In the station file: records = "records.sqlite", and the server as `plant`,'
+            " which collects the records of all stations; flasher plant report, pages and units"
+            " read it. Records that a station has on a server remain there, for the flasher that"
+            " made them.",
+        )
+    return location if folder else locate(url)
+
+
 def _no_database(url: str) -> UsageError:
     """Shows only the scheme, if there is one: any other part may be a password."""
     scheme, separator, _ = url.partition("://")
@@ -139,31 +149,16 @@ class Database:
         self._changes_schema = changes_schema
         self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
         self.engine = self._engine()
-        self._check_station: Callable[[], None] = lambda: None
-
-    @property
-    def backend(self) -> str:
-        return self.engine.dialect.name
 
     @contextmanager
-    def writing(self, *locks: str) -> Iterator[Connection]:
-        """Open a write transaction; it is on disk when the block ends without an error.
-
-        SQLite has one writer at a time; on a server, transactions with a lock of the same name
-        exclude each other. Raises RecordError: then nothing was saved.
+    def writing(self) -> Iterator[Connection]:
+        """Open a write transaction, one at a time; it is on disk when the block ends without an
+        error. Raises RecordError: then nothing was saved.
         """
-        self._check_station()
         with mapped(self.location.shown, writes=True), self.engine.connect() as bare:
             connection = bare.execution_options(**{_IMMEDIATE: True})
             self._check_place(bare)
             with connection.begin():
-                if self.backend == "postgresql":
-                    for name in locks:
-                        connection.execute(
-                            # A table's lock would need rights that a station has not.
-                            text("SELECT pg_advisory_xact_lock(7052, hashtext(:name))"),
-                            {"name": name},
-                        )
                 yield connection
             self._check_place(bare, has_log=True)
 
@@ -174,7 +169,7 @@ class Database:
             mapped(self.location.shown, writes=False),
             self.engine.connect() as connection,
         ):
-            if self.backend == "postgresql":
+            if self.engine.dialect.name == "postgresql":
                 connection.execution_options(
                     isolation_level="REPEATABLE READ", postgresql_readonly=True
                 )
@@ -199,23 +194,12 @@ class Database:
                 remedy="Put it back with the files beside it; else start the station again.",
             )
 
-    def station_lock(self, station: str) -> StationLock | ServerLock:
-        """Lock that lets one process run as this station, on all computers that use a server."""
-        if self.backend == "postgresql":
-            lock: ServerLock = _server().ServerLock(self.engine, station, self.location.shown)
-            self._check_station = lock.check
-            return lock
-        return StationLock(station, self.location.folder)
-
     def close(self) -> None:
         self.engine.dispose()
 
     def _engine(self) -> Engine:
         if self.location.url.get_backend_name() != "sqlite":
-            limit_s = _CHANGE_LIMIT_S if self._changes_schema else None
-            made: Engine = _server().make_engine(
-                self.location.url, self._lock_timeout_ms / 1000, limit_s
-            )
+            made: Engine = _server().make_engine(self.location.url, self._lock_timeout_ms / 1000)
             return made
         options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
         if self.location.file is None:
@@ -299,9 +283,9 @@ def _server() -> ModuleType:
         return importlib.import_module("flasher.station.records.server")
     except ImportError as error:
         raise UsageError(
-            "Records in PostgreSQL need a driver that is not installed.",
+            "A plant's database needs a driver that is not installed.",
             cause=printable(str(error)),
-            remedy=how_to_install("station,postgres"),
+            remedy=how_to_install("plant"),
             code=ErrorCode.PACKAGE_MISSING,
         ) from error
 
@@ -395,13 +379,12 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
     cause = "they were made by an older flasher"
     if number < _BEFORE_ALEMBIC:
         raise SchemaVersionError(what, where=where, cause=cause, remedy="Use that older flasher.")
-    backup = (
-        "Back them up (pg_dump), then, as their owner"
-        if database.location.file is None
-        else ("Start the station, which backs them up and brings them up to date, or")
-    )
     raise OldSchemaError(
-        what, where=where, cause=cause, remedy=f"{backup}: flasher station upgrade."
+        what,
+        where=where,
+        cause=cause,
+        remedy="Start the station, which backs them up and brings them up to date, or: flasher"
+        " station upgrade.",
     )
 
 
@@ -414,22 +397,13 @@ def revision_of(connection: Connection) -> str:
     return "" if version is None else str(version)
 
 
-def pin_search_path(connection: Connection) -> None:
-    """Make the functions of triggers prefer the records' tables to temporary ones (PostgreSQL)."""
-    connection.execute(
-        text("SELECT set_config('search_path', quote_ident(current_schema()) || ', pg_temp', true)")
-    )
-
-
 def _create(database: Database, now: datetime) -> None:
     """Create all tables and triggers in one transaction, unless another process just did."""
-    with database.writing("creation") as connection:
-        if database.backend == "postgresql":
-            pin_search_path(connection)
+    with database.writing() as connection:
         if inspect(connection).has_table(schema_info.name):
             return
         metadata.create_all(connection)
-        for statement in trigger_statements(database.backend):
+        for statement in trigger_statements():
             connection.exec_driver_sql(statement)
         connection.execute(
             schema_info.insert().values(
@@ -445,14 +419,10 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
     """Copy a database in use to `path`, and its attachments to `NAME.files` beside it.
 
     An existing backup is replaced only by a complete one. Raises RecordError, UsageError for a
-    server (which has tools of its own) or a path that is the database itself.
+    path that is the database itself.
     """
     source = database.location.file
-    if source is None:
-        raise UsageError(
-            f"flasher makes no backups of {database.backend} databases.",
-            remedy="Use the backup of the database itself (pg_dump), and copy the files folder.",
-        )
+    assert source is not None  # noqa: S101  a station's records are in a file
     if path.resolve() == source.resolve():
         raise UsageError("A backup cannot replace the database itself.", remedy="Name another.")
     with mapped(printable(str(path)), writes=True):

@@ -218,7 +218,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "42501": (
         RecordsReadOnlyError,
         "this user of the database lacks the right",
-        "The owner of the database grants it: flasher station roles, or flasher plant init.",
+        "The owner of the plant's database grants it: flasher plant init.",
     ),
     "53": (
         DiskFullError,

@@ -186,7 +186,7 @@ class Examiner:
         self._add_progress(
             0
         )  # shows the bar: what comes first takes minutes where there are many runs
-        if self._database.backend == "sqlite" and since is None:
+        if since is None:
             yield from _sqlite_problems(connection)
         yield from self._trails(connection, records_id, kept)
         gone = select(audit.run_id).outerjoin(schema.run, run.id == audit.run_id).distinct()

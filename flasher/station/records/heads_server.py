@@ -71,12 +71,6 @@ class ServerPlace:
         with self.connected() as connection:
             return list(connection.execute(query).scalars()) if _is_there(connection) else []
 
-    def holds(self, location: Location) -> bool:
-        mine, other = self.location.url, location.url
-        return (mine.host, mine.port or 5432, mine.database) == (
-            other.host, other.port or 5432, other.database,
-        )  # fmt: skip
-
     @contextmanager
     def connected(self, *, writes: bool = False) -> Iterator[Connection]:
         """A transaction in a new connection, as hours may pass between two. Raises RecordError."""

@@ -13,8 +13,6 @@ from pathlib import Path
 
 from platformdirs import user_data_path
 
-from flasher.errors import ErrorCode, UsageError
-from flasher.station.records.database import Location
 from flasher.station.records.heads import HeadsFile
 from flasher.station.records.places import FolderPlace, Place, file_name, place_of
 
@@ -62,14 +60,3 @@ class KeyLocations:
         """Paths of the examined part of these records and of the examiner's key."""
         note = self.keys_folder / file_name("examined", records_id, ".examined")
         return note, note.with_suffix(".verifier")
-
-    def check(self, location: Location) -> None:
-        """Check that no heads are stored in the database of the records. Raises UsageError."""
-        for each in self.elsewhere:
-            if each.holds(location):
-                raise UsageError(
-                    f"The heads cannot be kept in {each.shown}: the records are there.",
-                    cause="whoever can change the records could change their heads as well",
-                    remedy="Name a database of its own, best on another server.",
-                    code=ErrorCode.RECORDS,
-                )

@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 from flasher.errors import ErrorCode, FlasherError, UsageError, how_to_install
 from flasher.protocol.text import printable
-from flasher.station.records.database import Location, locate
+from flasher.station.records.database import locate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
@@ -53,9 +53,6 @@ class Place(Protocol):
     def stations(self, records_id: str) -> Iterable[str]:
         """Stations with heads of these records in this place."""
 
-    def holds(self, location: Location) -> bool:
-        """True if the place is the database of the records."""
-
 
 class FolderPlace:
     """A folder of this computer, or a network share."""
@@ -75,9 +72,6 @@ class FolderPlace:
             first = HeadsFile(path).first()
             if first and path.name == file_name(first.station, records_id, ".heads"):
                 yield first.station
-
-    def holds(self, location: Location) -> bool:
-        return False
 
 
 def place_of(text: str) -> Place:

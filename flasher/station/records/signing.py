@@ -108,7 +108,7 @@ class Signer:
         self.copies = []
 
     @contextmanager
-    def writing(self, *locks: str) -> Iterator[chain.Trail]:
+    def writing(self) -> Iterator[chain.Trail]:
         """Open a write transaction that can append to the chain; on disk, with its head stored,
         when the block ends without an error. Raises RecordError: then it may be tried again.
         """
@@ -117,7 +117,7 @@ class Signer:
                 "This process is not the station: it has not looked for interrupted runs.",
                 remedy="Call recover() first.",
             )
-        with self._database.writing(*locks, f"chain of {self._station}") as connection:
+        with self._database.writing() as connection:
             trail = chain.Trail(connection, self._station, self._key)
             yield trail
         self._unkept += trail.heads

@@ -35,7 +35,9 @@ from flasher.station.records.chain import Trail, digests_of
 from flasher.station.records.claims import Claiming, check_order, check_signatures
 from flasher.station.records.database import (
     Database,
-    locate,
+    Location,
+    StationLock,
+    locate_records,
     make_backup,
     open_database,
 )
@@ -90,6 +92,9 @@ class SystemClock:
 class Store:
     """The records of a station. Open with `Store.open`; a context manager."""
 
+    located: Callable[[str, Path | None], Location] = staticmethod(locate_records)
+    """Finds the records that `open` is given."""
+
     def __init__(
         self,
         database: Database,
@@ -103,7 +108,7 @@ class Store:
         self.signer = Signer(database, station, clock.utc, key_locations)
         self.read = Records(database)
         self._clock = clock
-        self._lock = database.station_lock(station)
+        self._lock = StationLock(station, database.location.folder)
 
     @classmethod
     def open(  # noqa: PLR0913  each setting of the records
@@ -119,16 +124,15 @@ class Store:
         key_locations: KeyLocations = _USUAL,
         report: Callable[[str], None] = lambda _text: None,
     ) -> Self:
-        """Open records at an SQLAlchemy URL or in an SQLite file, which is created with `create`.
+        """Open records in an SQLite file, which is created with `create`.
 
-        `folder` holds the attachments (by default beside an SQLite file). A file with an older
+        `folder` holds the attachments (by default beside the file). A file with an older
         schema is upgraded after a backup (`upgrade`). `read_only` changes nothing, not even the
         journal. `report` is called with a sentence before a long operation. Raises UsageError for
         an invalid location, SchemaVersionError, RecordError.
         """
         clock = clock or SystemClock()
-        location = locate(url, folder)
-        key_locations.check(location)
+        location = cls.located(url, folder)
         opened = partial(
             open_database,
             location,
@@ -140,8 +144,7 @@ class Store:
         try:
             database = opened()
         except OldSchemaError:
-            # The owner of a server upgrades its records, after a backup by the server's tools.
-            if read_only or location.file is None:
+            if read_only:
                 raise
             report(f"Records of an older flasher: copies, then changes {location.shown} (minutes).")
             upgrade(
@@ -224,8 +227,8 @@ class Store:
         now = self._clock.utc()
         order = check_order(order, recipe, now)
         signatures = check_signatures(recipe)
-        # One claim at a time in all stations: two must not take the last place of a lot.
-        with self.signer.writing("claims") as trail:
+        # One claim at a time: two must not take the last place of a lot.
+        with self.signer.writing() as trail:
             return Claiming(trail, order, recipe, signatures, now).begin(self._clock.monotonic_s())
 
     # -- while it runs ----------------------------------------------------------------------------

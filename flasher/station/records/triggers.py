@@ -1,20 +1,16 @@
 # ruff: noqa: S608  all of this SQL is written here, no value comes from outside
 """Database triggers for rules over several rows, which bind every program.
 
-The conditions are written once, in SQL that SQLite and PostgreSQL share. The fingerprint of the
-schema shows later whether a rule was removed or weakened.
+The fingerprint of the schema shows later whether a rule was removed or weakened.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from sqlalchemy import Connection, text
-
-from flasher.station.records.schema import metadata
 
 
 class Rule(NamedTuple):
@@ -203,111 +199,32 @@ def _rules() -> Iterator[Rule]:
 RULES: Final = tuple(_rules())
 
 
-def trigger_statements(dialect: str) -> list[str]:
-    statements = _statements(dialect, RULES)
-    if dialect == "postgresql":
-        # TRUNCATE deletes all rows, and no trigger of a row sees it; SQLite has no such command.
-        name = "truncate_is_refused"
-        statements.append(_function(name, f"RAISE EXCEPTION '{_NOT_DELETED}'"))
-        statements += [
-            f"CREATE TRIGGER {table}_truncate BEFORE TRUNCATE ON {table}"
-            f" FOR EACH STATEMENT EXECUTE FUNCTION {name}()"
-            for table in metadata.tables
-        ]
-    return statements
+def trigger_statements() -> list[str]:
+    return [
+        f"CREATE TRIGGER {rule.name} BEFORE {rule.event} ON {rule.table} WHEN {rule.when}"
+        f" BEGIN SELECT RAISE(ABORT, '{rule.text}'); END"
+        for rule in RULES
+    ]
 
 
 def drop_triggers(connection: Connection) -> None:
-    """Drop all triggers and, on a server, their functions."""
-    if connection.dialect.name == "sqlite":
-        query, drop = "SELECT name FROM sqlite_master WHERE type = 'trigger'", "DROP TRIGGER {}"
-    else:
-        query, drop = _FUNCTIONS, "DROP FUNCTION {}() CASCADE"
-    for name in connection.execute(text(query)).scalars().all():
+    query = text("SELECT name FROM sqlite_master WHERE type = 'trigger'")
+    for name in connection.execute(query).scalars().all():
         quoted = connection.dialect.identifier_preparer.quote(name)
-        connection.exec_driver_sql(drop.format(quoted))
+        connection.exec_driver_sql(f"DROP TRIGGER {quoted}")
 
 
-_FUNCTIONS: Final = """
-SELECT DISTINCT p.proname
-FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid JOIN pg_proc p ON p.oid = t.tgfoid
-WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
-    AND p.pronamespace = c.relnamespace
-"""
-
-
-def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
-    found = []
-    for rule in rules:
-        trigger = f"CREATE TRIGGER {rule.name} BEFORE {rule.event} ON {rule.table}"
-        if dialect == "sqlite":
-            refuse = f"SELECT RAISE(ABORT, '{rule.text}')"
-            found.append(f"{trigger} WHEN {rule.when} BEGIN {refuse}; END")
-            continue
-        refuse = f"RAISE EXCEPTION '{rule.text}' USING ERRCODE = 'check_violation'"
-        result = "OLD" if rule.event == "DELETE" else "NEW"
-        body = f"IF {rule.when} THEN {refuse}; END IF; RETURN {result}"
-        found.append(_function(rule.name, body))
-        found.append(f"{trigger} FOR EACH ROW EXECUTE FUNCTION {rule.name}()")
-    return found
-
-
-def _function(name: str, body: str) -> str:
-    # The search path at creation: temporary tables of a session must not hide the records.
-    return (
-        f"CREATE OR REPLACE FUNCTION {name}() RETURNS trigger LANGUAGE plpgsql"
-        f" SET search_path FROM CURRENT AS $$ BEGIN {body}; END $$"
-    )
-
-
-_SQLITE: Final = """
-SELECT type || ' ' || name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_stat%'
-"""
-_POSTGRESQL: Final = """
-SELECT 'trigger ' || t.tgname, pg_get_triggerdef(t.oid) || t.tgenabled::text
-FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid
-WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
-UNION ALL
-SELECT 'function ' || proname, pg_get_functiondef(oid) FROM pg_proc
-WHERE pronamespace = current_schema()::regnamespace AND prokind = 'f'
-UNION ALL
-SELECT 'constraint ' || c.relname || '.' || conname, pg_get_constraintdef(o.oid)
-FROM pg_constraint o JOIN pg_class c ON c.oid = o.conrelid
-WHERE connamespace = current_schema()::regnamespace AND contype <> 'n'
-UNION ALL
-SELECT 'index ' || indexname, indexdef FROM pg_indexes WHERE schemaname = current_schema()
-UNION ALL
-SELECT 'column ' || c.relname || '.' || attname,
-    format_type(atttypid, atttypmod) || attnotnull::text
-FROM pg_attribute JOIN pg_class c ON c.oid = attrelid
-WHERE c.relnamespace = current_schema()::regnamespace AND c.relkind = 'r'
-    AND attnum > 0 AND NOT attisdropped
-"""
-
-
-_IN_RESTORED: Final = re.compile(
-    r"ANY \(ARRAY\[(\('[^']*'::character varying\)::text(?:, |(?=\])))+\]\)"
+_SCHEMA: Final = text(
+    "SELECT type || ' ' || name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_stat%'"
 )
-_AND_RESTORED: Final = re.compile(r"CHECK \(\((\([^()]*\) AND \([^()]*\)) AND \(\(")
-"""PostgreSQL prints `x IN ('A', 'B')` and `a AND b AND (c AND d)` differently after dump and
-restore."""
 
 
 def fingerprint_of(connection: Connection) -> dict[str, str]:
-    """Short hash of each table, index, trigger, ... by name; the same after dump and restore."""
-    query = _SQLITE if connection.dialect.name == "sqlite" else _POSTGRESQL
+    """Short hash of each table, index, trigger, ... by name."""
     return {
-        name: hashlib.sha256(_as_created(sql or "").encode()).hexdigest()[:16]
-        for name, sql in connection.execute(text(query)).all()
+        name: hashlib.sha256((sql or "").encode()).hexdigest()[:16]
+        for name, sql in connection.execute(_SCHEMA).all()
     }
-
-
-def _as_created(sql: str) -> str:
-    def words(found: re.Match[str]) -> str:
-        named = ", ".join(re.findall(r"'[^']*'::character varying", found[0]))
-        return f"ANY ((ARRAY[{named}])::text[])"
-
-    return _AND_RESTORED.sub(r"CHECK (((\1) AND ((", _IN_RESTORED.sub(words, sql))
 
 
 def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator[tuple[str, str]]:

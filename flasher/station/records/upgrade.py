@@ -23,9 +23,9 @@ from flasher.station.records.chain import Trail
 from flasher.station.records.database import (
     Database,
     Location,
+    StationLock,
     check_schema,
     copy_checked,
-    pin_search_path,
     revision_of,
 )
 from flasher.station.records.errors import (
@@ -33,12 +33,10 @@ from flasher.station.records.errors import (
     OldSchemaError,
     RecordError,
     RecordsDamagedError,
-    RecordsReadOnlyError,
     mapped,
 )
 from flasher.station.records.files import whole_file
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.roles import grant_again
 from flasher.station.records.signing import Signer
 from flasher.station.records.triggers import (
     drop_triggers,
@@ -60,7 +58,7 @@ class Upgraded:
     """Schema version before the upgrade."""
     after: str
     backup: Path | None
-    """The backup; None on a server, or if nothing was changed."""
+    """The backup; None if nothing was changed."""
     problems: tuple[str, ...]
     """Differences between the old schema and the one that the audit trail records."""
 
@@ -100,20 +98,20 @@ def upgrade(
                 f" {', '.join(map(printable, begun))}.",
             )
         for name in begun:
-            lock = database.station_lock(name)
+            lock = StationLock(name, location.folder)
             held.callback(lock.release)
             lock.acquire()
         with database.reading() as connection:
             if revision_of(connection) == NEWEST:  # another process was faster
                 return Upgraded(NEWEST, NEWEST, None, ())
-        with _unchanged_on_error(before, database), _backup(location.file, before) as backup:
+        with _unchanged_on_error(before), _backup(location.file, before) as backup:
             if station is None:
-                with database.writing("schema") as connection:
+                with database.writing() as connection:
                     _change(connection)
                 return Upgraded(before, NEWEST, backup, ())
             signer = Signer(database, station, now, key_locations)
             signer.begin()
-            with signer.writing("schema") as trail:
+            with signer.writing() as trail:
                 problems = _change_signed(trail, now())
             return Upgraded(before, NEWEST, backup, problems)
 
@@ -128,12 +126,10 @@ def _stations(connection: Connection) -> tuple[str, ...]:
 
 
 @contextmanager
-def _unchanged_on_error(before: str, database: Database) -> Iterator[None]:
+def _unchanged_on_error(before: str) -> Iterator[None]:
     try:
         yield
     except RecordError as error:
-        if isinstance(error, RecordsReadOnlyError) and database.location.file is None:
-            error.remedy = "Give --database the URL of the owner of the records."
         error.what = error.what.replace(
             NOT_SAVED, f"The records were not brought to schema {NEWEST}, they keep schema {before}"
         )
@@ -191,10 +187,7 @@ def _change(connection: Connection) -> None:
     from alembic import command  # noqa: PLC0415
     from alembic.config import Config  # noqa: PLC0415
 
-    is_file = connection.dialect.name == "sqlite"
-    missing = _missing_rows(connection) if is_file else []
-    if not is_file:
-        pin_search_path(connection)
+    missing = _missing_rows(connection)
     drop_triggers(connection)
     before = revision_of(connection)
     if not inspect(connection).has_table(schema.alembic_version.name):
@@ -204,13 +197,11 @@ def _change(connection: Connection) -> None:
     config.set_main_option("script_location", CHANGES)
     config.attributes["connection"] = connection
     command.upgrade(config, NEWEST)
-    for statement in trigger_statements(connection.dialect.name):
+    for statement in trigger_statements():
         connection.exec_driver_sql(statement)
     connection.execute(update(schema.schema_info).values(version=schema.SCHEMA_VERSION))
-    if is_file and _missing_rows(connection) != missing:
+    if _missing_rows(connection) != missing:
         raise RecordsDamagedError(f"{NOT_SAVED}: rows would refer to missing rows.")
-    if not is_file:
-        grant_again(connection)
 
 
 def _missing_rows(connection: Connection) -> list[Any]:

@@ -1,15 +1,14 @@
-"""Records of schema 2, the last one before schema changes by Alembic: 50 runs of all kinds on each
-back end, with keys, heads and traces. They were made once, by the flasher of that schema:
+"""Records of schema 2, the last one before schema changes by Alembic: 50 runs of all kinds, with
+keys, heads and traces. They were made once, by the flasher of that schema:
 
     python -m tests.station.records.old_records
 
-It writes `schema_2/sqlite.zip` and `schema_2/postgresql.zip`. Never make them anew with a later
+It writes `schema_2/sqlite.zip`. Never make them anew with a later
 flasher: the tests need what a plant has.
 """
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 import zipfile
 from datetime import timedelta
@@ -17,10 +16,8 @@ from pathlib import Path
 
 from flasher.station.records.model import AuditEvent, Measurement, RunState, StepState
 from tests.station.factory import USUAL, Bench
-from tests.station.postgres import OWNER, Server, find_programs, running_server
 
 FOLDER = Path(__file__).parent / "schema_2"
-DUMP = "dump.sql"
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nshift_starts = ["00:00"]\n'
 _VERSIONS = {
     kind: f'duplicate = "{kind}"\n' + USUAL.replace('"4"', f'"{revision}"')
@@ -99,34 +96,12 @@ def _pack(folder: Path, names: tuple[str, ...], target: Path) -> None:
                     packed.write(path, path.relative_to(folder))
 
 
-def unpack(back_end: str, folder: Path) -> None:
-    """The old records of a back end; keys are readable by their user only, as a station wants."""
-    with zipfile.ZipFile(FOLDER / f"{back_end}.zip") as packed:
+def unpack(folder: Path) -> None:
+    """The old records; keys are readable by their user only, as a station wants."""
+    with zipfile.ZipFile(FOLDER / "sqlite.zip") as packed:
         packed.extractall(folder)
     for path in (folder / "keys").iterdir():
         path.chmod(0o600)
-
-
-def restore(server: Server, dump: Path) -> str:
-    """The URL of a new database with the contents of a dump."""
-    name = server.database()
-    subprocess.run(
-        [server.programs / "psql", "-q", "-X", "-v", "ON_ERROR_STOP=1", "-h", "127.0.0.1",
-         "-p", str(server.port), "-U", OWNER, "-d", name, "-f", dump],
-        check=True, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
-    return server.url(name)
-
-
-def _dump(server: Server, url: str) -> str:
-    """The dump of a database, without what only the program `psql` understands."""
-    words = ("--no-owner", "--no-privileges", "--dbname", url.replace("+psycopg", ""))
-    done = subprocess.run(
-        [server.programs / "pg_dump", *words], check=True, capture_output=True, text=True
-    )
-    return "".join(
-        line for line in done.stdout.splitlines(True) if line[:1] != "\\" or line[:2] == "\\."
-    )
 
 
 def main() -> None:
@@ -136,15 +111,6 @@ def main() -> None:
         bench.store.close()
         kept = ("records.sqlite", "records.sqlite.files", "keys")
         _pack(bench.folder, kept, FOLDER / "sqlite.zip")
-    programs = find_programs()
-    assert programs is not None
-    with tempfile.TemporaryDirectory() as made, running_server(programs) as server:
-        url = server.own_records()
-        bench = Bench(Path(made), url=url)
-        fill(bench)
-        bench.store.close()
-        (bench.folder / DUMP).write_text(_dump(server, url), encoding="utf-8")
-        _pack(bench.folder, (DUMP, "files", "keys"), FOLDER / "postgresql.zip")
 
 
 if __name__ == "__main__":

@@ -18,14 +18,14 @@ OTHER = "W2605003"
 
 
 @pytest.fixture
-def examined(any_bench: Bench) -> Bench:
+def examined(bench: Bench) -> Bench:
     """Records of two units that were examined, and found good."""
-    any_bench.make()
-    any_bench.make(serial=OTHER)
-    found = any_bench.store.examine()
+    bench.make()
+    bench.make(serial=OTHER)
+    found = bench.store.examine()
     assert not found.problems
     assert found.since is None
-    return any_bench
+    return bench
 
 
 def go_on(bench: Bench) -> Examination:
@@ -58,7 +58,7 @@ def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) 
     assert examined.store.examine().traces == 3
 
 
-def test_more_runs_are_no_more_statements(any_bench: Bench) -> None:
+def test_more_runs_are_no_more_statements(bench: Bench) -> None:
     """All rows of many runs are read together: an examination of a million runs asks for each page
     of the database about once.
     """
@@ -67,12 +67,12 @@ def test_more_runs_are_no_more_statements(any_bench: Bench) -> None:
     def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
         asked.append(statement)
 
-    event.listen(any_bench.store.database.engine, "before_cursor_execute", note)
+    event.listen(bench.store.database.engine, "before_cursor_execute", note)
     counts = []
     for serial in ("W2605002", "W2605003", "W2605004"):
-        any_bench.make(serial=serial)
+        bench.make(serial=serial)
         asked.clear()
-        assert not any_bench.store.examine().problems
+        assert not bench.store.examine().problems
         counts.append(len(asked))
     assert counts == counts[:1] * 3
     reads = [statement for statement in asked if " step" in statement]

@@ -8,13 +8,12 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing, nullcontext
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import create_engine
-from sqlalchemy.exc import DBAPIError
 
 from flasher.station.records.chain import canonical, row_hash
 from flasher.station.records.keys import KeyLocations
@@ -22,7 +21,6 @@ from flasher.station.records.model import Problem, RunId, RunState
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.station.factory import BMS_VERSION, IMAGES, SERIAL, Bench
-from tests.station.postgres import Server
 from tests.station.traces import run_messages, write_trace
 
 OTHER = "W2605003"
@@ -86,7 +84,6 @@ class Forger:
 
     def restate(self, run_id: int, folder: Path, **change: Any) -> None:
         """Let the audit row of a finished run state what the run is now."""
-        from sqlalchemy import create_engine  # noqa: PLC0415
 
         from flasher.station.records.chain import digests_of  # noqa: PLC0415
 
@@ -165,37 +162,6 @@ def test_a_changed_row_is_told(
 ) -> None:
     problems = examined(plant, tmp_path, lambda forger, _: forger(statement))
     assert told(problems, where, what), problems
-
-
-def test_a_changed_row_on_a_server_is_told(
-    postgres: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each in a transaction of its own, which is examined and then rolled back: that is quicker."""
-    made = Bench(tmp_path, url=postgres.records())
-    fill(made)
-    key_locations, files = KeyLocations(made.keys), made.store.files
-    engine = create_engine(postgres_url := str(made.url))
-    refused = []
-    with Store.open(
-        postgres_url, station="x", folder=files.folder, read_only=True, key_locations=key_locations
-    ) as store:
-        for statement, where, what in PLAIN:
-            with engine.connect() as connection:
-                connection.exec_driver_sql("SET session_replication_role = replica")
-                monkeypatch.setattr(store.database, "reading", lambda c=connection: nullcontext(c))
-                try:
-                    connection.exec_driver_sql(statement)
-                except DBAPIError:  # by a type, or a constraint, which no setting takes away
-                    refused.append(statement)
-                else:
-                    if not statement.startswith("UPDATE step SET run_id"):
-                        problems = store.examine().problems
-                        assert told(problems, where, what), (statement, problems)
-                connection.rollback()
-    engine.dispose()
-    made.store.close()
-    assert len(PLAIN) - len(refused) >= 25
-    assert all("'GOOD'" in each or "'x'" in each or "X'00FF'" in each for each in refused), refused
 
 
 def to_pass(forger: Forger, folder: Path) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection, create_engine, select, text
 
-from flasher.errors import UsageError
 from flasher.station.board import Board
 from flasher.station.health import HealthWatch
 from flasher.station.records import schema
@@ -30,18 +29,14 @@ from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.station.factory import Bench
 from tests.station.postgres import Server
-from tests.station.records.conftest import BACK_ENDS
 
 OTHER = "W2605003"
 
 
-@pytest.fixture(params=BACK_ENDS)
-def line(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Bench]:
     """A line with three units, whose heads are kept beside the key and on a share."""
-    url = None
-    if request.param == "postgresql":
-        url = request.getfixturevalue("postgres").records()
-    made = Bench(tmp_path, url=url, heads=(tmp_path / "share",))
+    made = Bench(tmp_path, heads=(tmp_path / "share",))
     for serial in ("W2605002", OTHER, "W2605004"):
         made.make(serial=serial)
     yield made
@@ -51,16 +46,12 @@ def line(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
 @contextmanager
 def forging(bench: Bench) -> Iterator[Connection]:
     """The records without their rules, by somebody who owns the database."""
-    engine = create_engine(bench.url or f"sqlite:///{bench.path}")
+    engine = create_engine(f"sqlite:///{bench.path}")
     with engine.begin() as connection:
-        rules: dict[str, str] = {}
-        if bench.url is None:
-            query = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
-            rules = dict(connection.execute(text(query)).all())
-            for name in rules:
-                connection.exec_driver_sql(f"DROP TRIGGER {name}")
-        else:
-            connection.exec_driver_sql("SET session_replication_role = replica")
+        query = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
+        rules: dict[str, str] = dict(connection.execute(text(query)).all())
+        for name in rules:
+            connection.exec_driver_sql(f"DROP TRIGGER {name}")
         yield connection
         for statement in rules.values():
             connection.exec_driver_sql(statement)
@@ -71,7 +62,7 @@ def verified(bench: Bench, key_locations: KeyLocations | None = None) -> Examina
     bench.store.close()
     files = bench.store.files.folder
     with Store.open(
-        bench.url or str(bench.path), station="x", folder=files, read_only=True,
+        str(bench.path), station="x", folder=files, read_only=True,
         key_locations=key_locations or bench.key_locations,
     ) as store:  # fmt: skip
         return store.examine()
@@ -206,12 +197,6 @@ def test_heads_on_a_server_report_a_forgery_and_only_grow(postgres: Server, tmp_
         with pytest.raises(Exception, match="neither changed nor deleted"), engine.begin() as other:
             other.exec_driver_sql(statement)
     engine.dispose()
-
-
-def test_the_records_own_database_is_no_other_place(postgres: Server, tmp_path: Path) -> None:
-    url = postgres.records()
-    with pytest.raises(UsageError, match="the records are there"):
-        Bench(tmp_path, url=url, heads=(url,))
 
 
 def test_a_place_that_is_gone_stops_no_line_and_is_caught_up(tmp_path: Path) -> None:

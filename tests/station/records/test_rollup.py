@@ -6,7 +6,7 @@ import random
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,6 +16,7 @@ import pytest
 from sqlalchemy import insert, select, text
 
 from flasher.station.records import rollup, schema
+from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.overview import By, Overview, Span
@@ -23,7 +24,9 @@ from flasher.station.records.queries import Records
 from flasher.station.records.rollup import Rollup
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.supervisor import shifts_of, spans_of
+from tests.plant.factory import Plant
 from tests.station.factory import Bench
+from tests.station.postgres import OWNER
 
 BEGIN = datetime(2026, 3, 27, 20, tzinfo=UTC)
 """Before a night in which clocks are set forward in Europe, and a month ends."""
@@ -36,13 +39,13 @@ ENDED = ("PASS", "FAIL", "PASS", "PASS", "ERROR", "ABORTED", "INTERRUPTED")
 class Lines:
     """Random runs of two sockets, two recipes, some lots; units come again, days later too."""
 
-    bench: Bench
+    database: Database
     chance: random.Random
     runs: int = 1
 
     def add(self, count: int) -> None:
         """Add runs of any order in time, past the rules of the database."""
-        with self.bench.store.database.engine.connect() as connection:
+        with self.database.engine.connect() as connection:
             is_server = connection.dialect.name == "postgresql"
             if is_server:
                 connection.exec_driver_sql("SET session_replication_role = replica")
@@ -101,9 +104,9 @@ class Lines:
             )  # fmt: skip
 
 
-def name_things(bench: Bench) -> None:
+def name_things(database: Database) -> None:
     """A second socket and recipe, lots, units."""
-    with bench.store.database.engine.connect() as connection:
+    with database.engine.connect() as connection:
         recipe = dict(connection.execute(select(schema.recipe)).mappings().one())
         connection.execute(insert(schema.socket).values(id=2, station_id=1, name="B"))
         connection.execute(
@@ -157,7 +160,7 @@ def figures_of(overview: Overview, records: Records, chance: random.Random) -> l
 
 def check(lines: Lines) -> None:
     """Compare the sums, as they are, with the records."""
-    database = lines.bench.store.database
+    database = lines.database
     seed = lines.chance.random()
     found = []
     for file in (Rollup(database)._file, Path("nowhere")):
@@ -174,28 +177,54 @@ def lines(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Lines]:
     zone, backend = request.param
-    url = request.getfixturevalue("postgres").records() if backend == "postgresql" else None
     monkeypatch.setenv("TZ", zone)
     time.tzset()
     monkeypatch.setattr(rollup, "_RUNS_AT_ONCE", 90)
-    bench = Bench(tmp_path, url=url)
-    bench.make(RunState.PASS, "W2605001")
-    name_things(bench)
-    with closing(bench.store):
-        yield Lines(bench, random.Random(zone))
+    made = of_a_plant(request, tmp_path) if backend == "postgresql" else of_a_station(tmp_path)
+    with made as database:
+        name_things(database)
+        yield Lines(database, random.Random(zone))
     monkeypatch.undo()
     time.tzset()
 
 
+@contextmanager
+def of_a_station(folder: Path) -> Iterator[Database]:
+    """Records with a run."""
+    bench = Bench(folder)
+    bench.make(RunState.PASS, "W2605001")
+    with closing(bench.store):
+        yield bench.store.database
+
+
+@contextmanager
+def of_a_plant(request: pytest.FixtureRequest, folder: Path) -> Iterator[Database]:
+    """A plant's database with a run, for its owner."""
+    plant = Plant(request.getfixturevalue("postgres"), folder)
+    with closing(plant.sender("line-2")) as sender:
+        sender.bench.make(RunState.PASS, "W2605001")
+        sender.send()
+    database = Database(locate(plant.url(OWNER), folder / "desk"), 5.0)
+    database.location.folder.mkdir()
+    with closing(database), database.engine.connect() as connection:
+        connection.exec_driver_sql("SET session_replication_role = replica")
+        connection.exec_driver_sql("UPDATE run SET id = 1")  # as that of a station
+        for table in ("run_target", "step", "device_write", "attachment"):
+            of_run = schema.metadata.tables[table]
+            connection.execute(of_run.update().values(run_id=1))
+        connection.commit()
+        yield database
+
+
 def add_up(lines: Lines, now: datetime = NOW) -> None:
-    sums = Rollup(lines.bench.store.database)
+    sums = Rollup(lines.database)
     while sums.add(now):
         pass
 
 
 def summed_up_to(lines: Lines) -> int | None:
     """The last run in the sums; None where the records do not use them."""
-    with Rollup(lines.bench.store.database).rolled(RunFilter()) as rolled:
+    with Rollup(lines.database).rolled(RunFilter()) as rolled:
         return None if rolled is None else rolled.run
 
 
@@ -236,31 +265,30 @@ def made(bench: Bench) -> Lines:
     """Four runs of a day."""
     for number in range(1, 5):
         bench.make(RunState.PASS, f"W260500{number}")
-    return Lines(bench, random.Random(1), runs=4)
+    return Lines(bench.store.database, random.Random(1), runs=4)
 
 
-def test_a_day_that_goes_on_is_read_from_the_records(made: Lines) -> None:
-    now = made.bench.clock.now
+def test_a_day_that_goes_on_is_read_from_the_records(made: Lines, bench: Bench) -> None:
+    now = bench.clock.now
     add_up(made, now)
     assert summed_up_to(made) is None
     add_up(made, now + timedelta(days=2))
     assert summed_up_to(made) == 4
 
 
-def test_sums_end_before_a_run_that_goes_on(made: Lines) -> None:
-    run_id = made.bench.claim("W2605005").run_id
-    made.bench.make(RunState.PASS, "W2605006", "B")
-    later = made.bench.clock.now + timedelta(days=2)
+def test_sums_end_before_a_run_that_goes_on(made: Lines, bench: Bench) -> None:
+    run_id = bench.claim("W2605005").run_id
+    bench.make(RunState.PASS, "W2605006", "B")
+    later = bench.clock.now + timedelta(days=2)
     add_up(made, later)
     assert summed_up_to(made) == run_id - 1
-    made.bench.work(run_id)
-    made.bench.store.finish(run_id, made.bench.ending(trace=made.bench.traced("W2605005")))
+    bench.work(run_id)
+    bench.store.finish(run_id, bench.ending(trace=bench.traced("W2605005")))
     add_up(made, later)
     assert summed_up_to(made) == run_id + 1
 
 
-def test_sums_of_records_that_were_restored_are_made_anew(made: Lines) -> None:
-    bench = made.bench
+def test_sums_of_records_that_were_restored_are_made_anew(made: Lines, bench: Bench) -> None:
     backup = bench.folder / "backup.sqlite"
     bench.store.backup(backup)
     bench.make(RunState.PASS, "W2605005")
@@ -277,29 +305,31 @@ def test_sums_of_records_that_were_restored_are_made_anew(made: Lines) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no database" * 500])
-def test_a_file_that_holds_no_sums_is_no_obstacle(made: Lines, content: bytes) -> None:
-    file = made.bench.store.files.folder / "figures.sqlite"
+def test_a_file_that_holds_no_sums_is_no_obstacle(
+    made: Lines, bench: Bench, content: bytes
+) -> None:
+    file = bench.store.files.folder / "figures.sqlite"
     file.write_bytes(content)
     assert summed_up_to(made) is None
-    add_up(made, made.bench.clock.now + timedelta(days=2))
+    add_up(made, bench.clock.now + timedelta(days=2))
     assert summed_up_to(made) == 4
 
 
-def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines) -> None:
-    add_up(made, made.bench.clock.now + timedelta(days=2))
-    file = made.bench.store.files.folder / "figures.sqlite"
+def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines, bench: Bench) -> None:
+    add_up(made, bench.clock.now + timedelta(days=2))
+    file = bench.store.files.folder / "figures.sqlite"
     with closing(sqlite3.connect(file)) as damaged:
         damaged.execute("UPDATE times SET content = x'00'")
         damaged.commit()
     with pytest.raises(RecordError, match="Delete the file") as found:
-        Overview(made.bench.store.database).step_times(RunFilter())
+        Overview(bench.store.database).step_times(RunFilter())
     assert found.value.where == str(file)
 
 
-def test_sums_of_which_nobody_knows_the_end_are_made_anew(made: Lines) -> None:
-    later = made.bench.clock.now + timedelta(days=2)
+def test_sums_of_which_nobody_knows_the_end_are_made_anew(made: Lines, bench: Bench) -> None:
+    later = bench.clock.now + timedelta(days=2)
     add_up(made, later)
-    file = made.bench.store.files.folder / "figures.sqlite"
+    file = bench.store.files.folder / "figures.sqlite"
     with closing(sqlite3.connect(file)) as damaged:
         damaged.execute("UPDATE state SET content = '{'")
         damaged.commit()
@@ -309,15 +339,15 @@ def test_sums_of_which_nobody_knows_the_end_are_made_anew(made: Lines) -> None:
     assert summed_up_to(made) == 4
 
 
-def test_a_folder_that_is_not_there_is_not_made(made: Lines) -> None:
-    sums = Rollup(made.bench.store.database)
-    sums._file = made.bench.folder / "nowhere" / "figures.sqlite"
+def test_a_folder_that_is_not_there_is_not_made(bench: Bench) -> None:
+    sums = Rollup(bench.store.database)
+    sums._file = bench.folder / "nowhere" / "figures.sqlite"
     with pytest.raises(OSError, match="nowhere"):
         sums.add(NOW)
 
 
 def test_a_process_adds_until_nothing_is_missing_and_again_later(
-    made: Lines, monkeypatch: pytest.MonkeyPatch
+    made: Lines, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rollup, "_RUNS_AT_ONCE", 2)
     waited: list[float] = []
@@ -327,21 +357,21 @@ def test_a_process_adds_until_nothing_is_missing_and_again_later(
         if len(waited) == 5:
             raise TimeoutError
 
-    later = made.bench.clock.now + timedelta(days=2)
+    later = bench.clock.now + timedelta(days=2)
     with pytest.raises(TimeoutError):
-        Rollup(made.bench.store.database).keep_up(lambda: later, wait)
+        Rollup(bench.store.database).keep_up(lambda: later, wait)
     assert [seconds < 1 for seconds in waited] == [True, True, False, False, False]
     assert summed_up_to(made) == 4
 
 
-def test_a_process_goes_on_where_another_one_adds(made: Lines) -> None:
-    later = made.bench.clock.now + timedelta(days=2)
+def test_a_process_goes_on_where_another_one_adds(made: Lines, bench: Bench) -> None:
+    later = bench.clock.now + timedelta(days=2)
     add_up(made, later)
-    file = made.bench.store.files.folder / "figures.sqlite"
+    file = bench.store.files.folder / "figures.sqlite"
     with closing(sqlite3.connect(file, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(TimeoutError):
-            Rollup(made.bench.store.database).keep_up(lambda: later, _end)
+            Rollup(bench.store.database).keep_up(lambda: later, _end)
         assert summed_up_to(made) == 4
 
 

@@ -18,7 +18,6 @@ from flasher.station.records.errors import (
     DiskFullError,
     OldSchemaError,
     RecordsLockedError,
-    RecordsReadOnlyError,
     RuleBrokenError,
     SchemaVersionError,
     StationBusyError,
@@ -39,9 +38,8 @@ class Old:
 
     def __init__(self, folder: Path, url: str) -> None:
         self.folder, self.url = folder, url
-        self.is_file = "://" not in url
-        self.files = folder / ("records.sqlite.files" if self.is_file else "files")
-        self.engine = create_engine(f"sqlite:///{url}" if self.is_file else url)
+        self.files = folder / "records.sqlite.files"
+        self.engine = create_engine(f"sqlite:///{url}")
 
     @property
     def place(self) -> dict[str, Any]:
@@ -76,29 +74,15 @@ class Old:
             }
 
 
-ON_A_SERVER = pytest.mark.parametrize("old", ["postgresql"], indirect=True)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def old(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Old]:
-    old_records.unpack(request.param, tmp_path)
-    url = str(tmp_path / "records.sqlite")
-    if request.param == "postgresql":
-        url = old_records.restore(request.getfixturevalue("postgres"), tmp_path / old_records.DUMP)
-    made = Old(tmp_path, url)
-    yield made
-    made.engine.dispose()
-
-
 @pytest.fixture
-def old_file(tmp_path: Path) -> Iterator[Old]:
-    old_records.unpack("sqlite", tmp_path)
+def old(tmp_path: Path) -> Iterator[Old]:
+    old_records.unpack(tmp_path)
     made = Old(tmp_path, str(tmp_path / "records.sqlite"))
     yield made
     made.engine.dispose()
 
 
-def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureRequest) -> None:
+def test_old_records_are_taken_over_whole(old: Old) -> None:
     before = old.rows()
     done = old.upgrade()
     assert (done.before, done.after, done.problems) == ("2", NEWEST, ())
@@ -107,11 +91,8 @@ def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureReque
     assert added[4] == "migrated"
     assert before.pop("audit")
     assert after == before
-    if old.is_file:
-        fresh = Old(old.folder, str(old.folder / "fresh.sqlite"))
-        Store.open(fresh.url, station="x").close()
-    else:
-        fresh = Old(old.folder, request.getfixturevalue("postgres").own_records())
+    fresh = Old(old.folder, str(old.folder / "fresh.sqlite"))
+    Store.open(fresh.url, station="x").close()
     assert old.catalogue() == fresh.catalogue()
     fresh.engine.dispose()
     with old.open() as store:
@@ -129,19 +110,19 @@ def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureReque
         assert not other.examine().problems
 
 
-def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old_file: Old) -> None:
-    before = old_file.rows()
+def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old: Old) -> None:
+    before = old.rows()
     said: list[str] = []
-    with old_file.open(report=said.append) as store:
+    with old.open(report=said.append) as store:
         assert "minutes" in said[0]
         assert not store.examine().problems
         assert store.recover() != ()
-    (copy,) = old_file.folder.glob("*.schema-2")
-    kept = Old(old_file.folder, str(copy))
+    (copy,) = old.folder.glob("*.schema-2")
+    kept = Old(old.folder, str(copy))
     assert kept.rows() == before
     kept.engine.dispose()
-    with old_file.open():
-        assert [copy] == list(old_file.folder.glob("*.schema-2*"))
+    with old.open():
+        assert [copy] == list(old.folder.glob("*.schema-2*"))
 
 
 def test_who_reads_changes_no_schema(old: Old) -> None:
@@ -152,36 +133,25 @@ def test_who_reads_changes_no_schema(old: Old) -> None:
     assert old.catalogue() == before
 
 
-@ON_A_SERVER
-def test_records_on_a_server_wait_for_their_owner(old: Old) -> None:
-    with pytest.raises(OldSchemaError) as caught:
-        old.open()
-    assert "pg_dump" in caught.value.remedy
-    assert caught.value.exit_code is ExitCode.USAGE
-
-
-def test_a_station_that_the_records_do_not_know_changes_nothing(old_file: Old) -> None:
+def test_a_station_that_the_records_do_not_know_changes_nothing(old: Old) -> None:
     with pytest.raises(FlasherError, match="line-9 is none") as caught:
-        old_file.open("line-9")
+        old.open("line-9")
     assert "line-2, line-3" in caught.value.remedy
-    assert not list(old_file.folder.glob("*.schema-2*"))
+    assert not list(old.folder.glob("*.schema-2*"))
 
 
 def test_nothing_is_changed_while_another_station_of_the_records_runs(old: Old) -> None:
-    place = database.locate(old.url, old.files)
-    with closing(database.Database(place, 0.2)) as other:
-        lock = other.station_lock("line-3")
-        lock.acquire()
-        with pytest.raises(StationBusyError):
-            old.upgrade()
-        lock.release()
+    lock = database.StationLock("line-3", old.files)
+    lock.acquire()
+    with pytest.raises(StationBusyError):
+        old.upgrade()
+    lock.release()
     assert old.upgrade().after == NEWEST
 
 
 def test_a_rule_that_was_taken_away_before_is_told_and_stays_told(old: Old) -> None:
     with old.engine.begin() as connection:
-        where = "" if old.is_file else " ON run"
-        connection.execute(text(f"DROP TRIGGER run_update{where}"))
+        connection.execute(text("DROP TRIGGER run_update"))
         connection.execute(text("CREATE INDEX foreign_one ON unit (part)"))
     done = old.upgrade()
     assert "schema, trigger run_update: it was removed" in done.problems
@@ -189,36 +159,6 @@ def test_a_rule_that_was_taken_away_before_is_told_and_stays_told(old: Old) -> N
     with old.open(read_only=True) as store:
         told = [each.what for each in store.examine().problems]
     assert told == [f"found at the upgrade: {problem}" for problem in done.problems]
-
-
-@ON_A_SERVER
-def test_roles_keep_their_rights_and_get_those_of_new_tables(old: Old) -> None:
-    with old.engine.begin() as connection:
-        for role, rights in (("old_line", "SELECT, INSERT"), ("old_reader", "SELECT")):
-            connection.execute(text(f"CREATE ROLE {role} LOGIN"))
-            connection.execute(text(f"GRANT {rights} ON ALL TABLES IN SCHEMA public TO {role}"))
-    url = old.url.replace("postgres@", "old_line@")
-    with old.engine.begin() as connection:
-        connection.execute(text("ALTER ROLE old_line PASSWORD 'x'"))
-    by_station = Old(old.folder, url.replace("old_line@", "old_line:x@"))
-    with pytest.raises(RecordsReadOnlyError, match="keep schema 2") as caught:
-        by_station.upgrade()
-    assert "owner" in caught.value.remedy
-    old.upgrade()
-    with old.engine.begin() as connection:
-        may = "has_table_privilege('{}', 'alembic_version', '{}')"
-        wanted = {
-            ("old_line", "SELECT"): True,
-            ("old_line", "INSERT"): False,
-            ("old_reader", "SELECT"): True,
-            ("old_reader", "UPDATE"): False,
-        }
-        for (role, right), is_allowed in wanted.items():
-            found = connection.execute(text(f"SELECT {may.format(role, right)}")).scalar_one()
-            assert found is is_allowed
-        for role in ("old_line", "old_reader"):
-            connection.execute(text(f"DROP OWNED BY {role}"))
-            connection.execute(text(f"DROP ROLE {role}"))
 
 
 # -- what goes wrong ------------------------------------------------------------------------------
@@ -296,8 +236,8 @@ def test_a_table_that_is_made_anew_keeps_rules_and_rows(old: Old, planted: Any) 
     assert old.rows()["run"] == runs
 
 
-def test_a_full_disk_leaves_everything(old_file: Old, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = old_file.rows()
+def test_a_full_disk_leaves_everything(old: Old, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = old.rows()
     prepare = database.Database._prepare_sqlite
 
     def small(self: database.Database, connection: Any, record: Any) -> None:
@@ -307,53 +247,51 @@ def test_a_full_disk_leaves_everything(old_file: Old, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(database.Database, "_prepare_sqlite", small)
     with pytest.raises(DiskFullError):
-        old_file.open()
+        old.open()
     monkeypatch.undo()
-    assert old_file.rows() == rows
-    assert not list(old_file.folder.glob("*.schema-2*"))
+    assert old.rows() == rows
+    assert not list(old.folder.glob("*.schema-2*"))
 
 
 def test_a_copy_for_which_there_is_no_room_stops_the_change(
-    old_file: Old, monkeypatch: pytest.MonkeyPatch
+    old: Old, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(upgrade, "copy_checked", full)
-    before = old_file.catalogue()
+    before = old.catalogue()
     with pytest.raises(DiskFullError, match="No space left"):
-        old_file.open()
-    assert old_file.catalogue() == before
+        old.open()
+    assert old.catalogue() == before
 
 
-def test_without_its_package_nothing_is_changed(
-    old_file: Old, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_its_package_nothing_is_changed(old: Old, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     with pytest.raises(UsageError, match="alembic") as caught:
-        old_file.open()
+        old.open()
     assert ".[station]" in caught.value.remedy
-    assert not list(old_file.folder.glob("*.schema-2*"))
+    assert not list(old.folder.glob("*.schema-2*"))
 
 
-def test_records_that_another_program_holds_are_not_changed(old_file: Old) -> None:
-    with closing(sqlite3.connect(old_file.url, isolation_level=None)) as holder:
+def test_records_that_another_program_holds_are_not_changed(old: Old) -> None:
+    with closing(sqlite3.connect(old.url, isolation_level=None)) as holder:
         holder.execute("BEGIN IMMEDIATE")
         with pytest.raises(RecordsLockedError, match="keep schema 2"):
-            old_file.open()
-    assert not list(old_file.folder.glob("*.schema-2*"))
-    old_file.open().close()
+            old.open()
+    assert not list(old.folder.glob("*.schema-2*"))
+    old.open().close()
 
 
 @pytest.mark.parametrize("revision", [str(schema.SCHEMA_VERSION + 1), "1a2b3c"])
-def test_a_revision_that_is_not_known_is_refused(old_file: Old, revision: str) -> None:
-    old_file.upgrade()
-    with old_file.engine.begin() as connection:
+def test_a_revision_that_is_not_known_is_refused(old: Old, revision: str) -> None:
+    old.upgrade()
+    with old.engine.begin() as connection:
         connection.execute(schema.alembic_version.update().values(version_num=revision))
     with pytest.raises(SchemaVersionError, match=revision):
-        old_file.upgrade()
+        old.upgrade()
     with pytest.raises(SchemaVersionError, match=revision) as caught:
-        old_file.open()
+        old.open()
     assert caught.value.exit_code is ExitCode.USAGE
     assert "newer" in caught.value.remedy
 

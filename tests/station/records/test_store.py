@@ -34,12 +34,6 @@ from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
 
 
-@pytest.fixture
-def bench(any_bench: Bench) -> Bench:
-    """All of it holds on every back end."""
-    return any_bench
-
-
 def refusal(bench: Bench, serial: str = SERIAL, socket: str = "A", **more: Any) -> Refusal:
     with pytest.raises(ClaimRefusedError) as caught:
         bench.claim(serial, socket, **more)
