@@ -78,10 +78,14 @@ class Waits:
 
     @property
     def silence_in_transfer_s(self) -> float:
-        """The same in a transfer, which must not become a pause that ends it (tx_12)."""
+        """The same in a transfer."""
+        return self.in_transfer_s(self.silence_s)
+
+    def in_transfer_s(self, for_s: float) -> float:
+        """As much of `for_s` as does not become a pause that ends a transfer (tx_12)."""
         if self._profile.choice("tx_12") == "waits":
-            return self.silence_s
-        return min(self.silence_s, _NO_PAUSE * self._limit("pause_s"))
+            return for_s
+        return min(for_s, _NO_PAUSE * self._limit("pause_s"))
 
     @property
     def answer_s(self) -> float:

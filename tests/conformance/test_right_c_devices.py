@@ -53,6 +53,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (10, "UP-01"),  # an update command before packet 1 is ignored
         (24, "BU-01"),  # a lost end of transfer was awaited for longer than its pause
         (2, "FR-09"),  # an empty frame splits a message
+        (32, "CO-04"),  # a burst of one, and deaf before it
     ),
 )
 def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
@@ -75,6 +76,13 @@ def test_an_early_end_may_end_the_upgrade_and_start_the_old_application() -> Non
     times |= {"WINDOW_US": 200_000, "START_US": 795_000}
     device = dataclasses.replace(device, choices={**device.choices, **times})
     assert faults_of(9, Selection(cases=("EN-02",)), make=lambda _: device) == []
+
+
+def test_a_babbling_node_and_the_wait_for_an_ack_make_no_pause() -> None:
+    device = right_c_device(18)
+    given: dict[str, Value] = {"limits.pause_s": 2.3, "limits.ack_s": 1.5, "en_04": "none"}
+    given |= {"device.largest_image_bytes": device.choices["LARGEST_BYTES"]}
+    assert verdict(18, "CO-01", given) in HELD
 
 
 def verdict(seed: int, case_id: str, given: dict[str, Value]) -> CaseVerdict:

@@ -136,7 +136,8 @@ def end_early_and_twice(bench: Bench) -> None:
             # A NAK of any number (R6) and no other message.
             bench.expect(Reply.NAK, within_s=bench.limit("complete_s"))
             bench.judge.note_stimulus(heard=True)
-            bench.expect_silence(bench.limit("ack_s"), ignoring=(Reply.BOOT_VERSION,))
+            quiet_s = bench.waits.in_transfer_s(bench.limit("ack_s"))
+            bench.expect_silence(quiet_s, ignoring=(Reply.BOOT_VERSION,))
             bench.send_packet(image, stored + 1)
             reply = bench.wait_for(Reply.ACK, Reply.NAK, Reply.BOOT_VERSION)
             if str(reply) == f"ACK {stored + 1}":

@@ -75,7 +75,8 @@ def endless(bench: Bench) -> None:
     for number, (name, frames) in enumerate(floods.items(), 1):
         with bench.step(f"in a transfer, before packet {number}: {name}"):
             bench.send(frames)
-            bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
+            late_s = bench.limit("ack_s") + bench.limit("inter_frame_s")
+            bench.collect(bench.waits.in_transfer_s(late_s))
             bench.packet(image, number)
     with bench.step("in a pause of the transfer"):
         if bench.choice("tx_12") == "announces":
@@ -182,7 +183,8 @@ def _continue_transfer(bench: Bench, image: bytes, stored: int) -> int:
     """Send the next packet or end of transfer. A device that left the transfer has to accept a
     complete upgrade instead. Returns the packets stored, 0 without a transfer.
     """
-    bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
+    late_s = bench.limit("ack_s") + bench.limit("inter_frame_s")
+    bench.collect(bench.waits.in_transfer_s(late_s))
     if stored < packet_count(len(image)):
         bench.send_packet(image, stored + 1)
         if bench.wait_for(Reply.ACK, unlike=lambda one: one.number != stored + 1) is not None:
