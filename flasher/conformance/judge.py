@@ -25,6 +25,9 @@ from flasher.conformance.results import (
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Received, Reply, describe
 
+_IN_TRANSFER: Final = (Reply.ACK, Reply.COMPLETE)
+"""Answers of a device that has not left the transfer."""
+
 
 class TimeName:
     """Names of measured times that several cases or questions use."""
@@ -99,7 +102,7 @@ class Judge:
         expected: str,
         got: object,
         *,
-        by: Mapping[str, float] | None = None,
+        by: Mapping[str, str | float] | None = None,
     ) -> bool:
         """Record a check; returns `ok`. `by` are the profile keys that decide it (default: the
         choices of the case, and the limits of the last wait if no message came in it).
@@ -113,7 +116,7 @@ class Judge:
         expected: str,
         got: object,
         *,
-        by: Mapping[str, float] | None = None,
+        by: Mapping[str, str | float] | None = None,
     ) -> None:
         """Record a check; a failure ends the case by CaseStopped."""
         if not self.check(ok, expected, got, by=by):
@@ -161,8 +164,16 @@ class Judge:
         while received is not None and received.kind in ignoring and received.kind is not kind:
             received = self._tester.next_message(deadline - self._tester.now)
         found = self.require_received(received, expected, limit_s)
-        self.require(found.kind is kind and number in (None, found.number), expected, found)
+        has_left = found.kind is Reply.BOOT_VERSION and kind in _IN_TRANSFER
+        by = self._ends_of_transfer() if has_left else None
+        self.require(found.kind is kind and number in (None, found.number), expected, found, by=by)
         return found
+
+    def _ends_of_transfer(self) -> dict[str, str | float]:
+        """The keys that decide whether a device may leave a transfer."""
+        profile = self._tester.profile
+        pause = {"tx_12": profile.choice("tx_12"), "tx_13": profile.choice("tx_13")}
+        return {**pause, **limits_of(profile.limit("pause_s"))}
 
     def expect_silence(
         self, for_s: float | None = None, *, ignoring: Sequence[Reply] = (), why: str = "no answer"
@@ -262,7 +273,7 @@ class Judge:
         outcome: CheckOutcome,
         expected: str,
         got: str,
-        by: Mapping[str, float] | None = None,
+        by: Mapping[str, str | float] | None = None,
     ) -> None:
         is_failure, stalled_s = outcome is CheckOutcome.FAIL, self._tester.stalled_s
         if is_failure and stalled_s and all(one.outcome is not outcome for one in self.checks):

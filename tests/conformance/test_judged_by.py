@@ -61,6 +61,13 @@ def _waits_for_an_application(bench: Bench) -> None:
     bench.check_application()
 
 
+def _makes_a_pause(bench: Bench) -> None:
+    bench.start_transfer(len(bench.good_image))
+    bench.packet(bench.good_image, 1)
+    bench.wait(bench.limit("pause_s") + 1.0)
+    bench.end_transfer()
+
+
 def _fails_at_once(bench: Bench) -> None:
     bench.fail("one", "two")
 
@@ -80,17 +87,19 @@ def _fails_at_once(bench: Bench) -> None:
         ),
         (_compares_the_flash_in_a_transfer, {"device.buffer_bytes": 0}),
         (_waits_for_an_application, {"limits.start_s": 5.0}),
+        (_makes_a_pause, {"tx_12": "either", "tx_13": "either", "limits.pause_s": 5.0}),
         (_fails_at_once, {}),
     ),
 )
 def test_a_failed_check_has_the_limits_that_it_waited_for(
-    action: Callable[[Bench], None], keys: dict[str, float]
+    action: Callable[[Bench], None], keys: dict[str, float | str]
 ) -> None:
     report = run_case(action, profile=ConformanceProfile({"limits.start_s": 5.0}))
     failure = one(report, "FR-00").first_failure
     assert failure is not None
     assert failure.judged_by == keys
-    assert all(f"{key} = {value:g}" in str(failure) for key, value in keys.items())
+    values = {key: value if isinstance(value, str) else f"{value:g}" for key, value in keys.items()}
+    assert all(f"{key} = {value}" in str(failure) for key, value in values.items())
 
 
 def test_a_time_keeps_its_limits_in_sums_and_differences_and_products() -> None:
