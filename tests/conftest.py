@@ -14,6 +14,13 @@ gc.disable()
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
 
+ENGINE_COVERAGE = "FLASHER_TEST_COVERAGE"
+"""With this variable the engines' own tests run under coverage, as in the gate."""
+if ENGINE_COVERAGE in os.environ:  # before flasher is imported
+    from tests.engine_coverage import EngineCoverage
+
+    _engine_coverage = EngineCoverage()
+
 import flasher.python_can  # noqa: E402, F401  before a test imports python-can
 
 if TYPE_CHECKING:
@@ -30,6 +37,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """`pytest` alone runs the first lane; `pytest -m slow` the second; what is named runs whole."""
     if config.args_source is not pytest.Config.ArgsSource.ARGS and not config.option.markexpr:
         config.option.markexpr = "not slow and not kernel"
+    if ENGINE_COVERAGE in os.environ:
+        config.pluginmanager.register(_engine_coverage)
     # How long an example may take depends on the computer, and on what else it does.
     hypothesis.settings.register_profile("any computer", deadline=None)
     hypothesis.settings.load_profile("any computer")
