@@ -30,7 +30,7 @@ def missing(*programs: str) -> str:
 
 
 def make(what: str, folder: Path, *settings: str, source: Path = SOURCE) -> str:
-    """`make host` or `make arm` of the example into a folder; returns the output."""
+    """`make host`, `make arm` or one file of the example into a folder; returns the output."""
     made = subprocess.run(
         ["make", "-C", source, what, f"BUILD={folder}", *settings],
         capture_output=True,
