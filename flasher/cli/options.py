@@ -14,8 +14,7 @@ from typing import Annotated, Any, Final
 
 import click
 
-from flasher.api import Connection, as_dialect, connect, connect_mock, find_release
-from flasher.api import bit_rate as settle_bit_rate
+from flasher import api
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.detect import DetectedAdapter
 from flasher.bus.fallback import Fallback
@@ -115,7 +114,7 @@ class ImageOptions(SentSelection):
 
     def find_release(self, given: str | None = None) -> Release | None:
         """Read the manifest `given`, else the one beside the image; see `api.find_release`."""
-        return None if given is None and self.is_piped else find_release(self.image, given)
+        return None if given is None and self.is_piped else api.find_release(self.image, given)
 
     @cached_property
     def _piped(self) -> io.BytesIO:
@@ -216,6 +215,8 @@ _KEYWORDS: Final = ("interface", "channel", "bitrate", "fd", "data_bitrate")
 """Options with the names of python-can's keywords."""
 _FILTER: Final = re.compile(r"([0-9A-Fa-f]+)([:~])([0-9A-Fa-f]+)")
 _INVERTED: Final = 0x20000000
+_RIDING: Final = DeviceProfile(battery_use="riding")
+"""A model with visible traffic."""
 """python-can's flag for a filter that accepts all other ids."""
 
 
@@ -299,7 +300,7 @@ class Bus:
     @property
     def dialect(self) -> Dialect:
         """Protocol dialect in use."""
-        return as_dialect(self.dialect_name)
+        return api.as_dialect(self.dialect_name)
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -336,29 +337,39 @@ class Bus:
         """Bit rate, read once so that all output agrees. Raises UsageError and BusError."""
         if self.mock:
             return BitRate(self.dialect.bitrate_bps, "the dialect's")
-        return settle_bit_rate(self.dialect, fallback=self.fallback, **self.config)
+        return api.bit_rate(self.dialect, fallback=self.fallback, **self.config)
 
     def connect(
-        self, target: Target, *, asks: bool = True
-    ) -> contextlib.AbstractContextManager[Connection]:
-        """Open the adapter, or a whole bicycle with the model of `target`. With `asks` False
-        nothing may be sent.
+        self,
+        target: Target,
+        *,
+        asks: bool = True,
+        profile: DeviceProfile | None = _RIDING,
+        system: bool = True,
+        has_application: bool = True,
+    ) -> contextlib.AbstractContextManager[api.Connection]:
+        """Open the adapter or, with --mock, the model of `target`: of this profile, in a whole
+        bicycle, with an application. With `asks` False nothing may be sent.
         """
         if self.mock:
-            riding = DeviceProfile(battery_use="riding")  # so that traffic is visible
-            return connect_mock(
-                target, self.dialect, speed=self.mock_speed, system=True, profile=riding
+            return api.connect_mock(
+                target,
+                self.dialect,
+                speed=self.mock_speed,
+                system=system,
+                has_application=has_application,
+                profile=profile,
             )
-        return connect(
+        return api.connect(
             self.dialect,
-            holder=holder() if asks else None,
+            holder=_holder() if asks else None,
             sends=asks,
             fallback=self.fallback,
             **self.config,
         )
 
 
-def holder() -> str:
+def _holder() -> str:
     """Name of this command for other programs, while it locks the adapter."""
     return " ".join(click.get_current_context().command_path.split()[:2])
 

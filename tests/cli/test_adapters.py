@@ -70,7 +70,6 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
         monkeypatch.setattr(f"{place}.slcan_ports", lambda: machine.ports)
     for place in ("flasher.cli.adapters", "flasher.bus.bit_rate"):
         monkeypatch.setattr(f"{place}.read_interface", lambda _name: machine.interface)
-    monkeypatch.setattr("flasher.cli.options.connect", machine.open)
     monkeypatch.setattr("flasher.api.connect", machine.open)
     return machine
 

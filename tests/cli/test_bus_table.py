@@ -183,7 +183,7 @@ def test_where_it_names_an_adapter_none_is_looked_for(
         assert fallback.bus["channel"] == "PCAN_USBBUS3"
         yield wire
 
-    monkeypatch.setattr("flasher.cli.options.connect", connected)
+    monkeypatch.setattr("flasher.api.connect", connected)
     monkeypatch.setattr("flasher.cli.adapters.detect_adapters", lambda **_: 1 / 0)
     assert flasher("read", "history").code == ExitCode.OK
 

@@ -349,9 +349,7 @@ def test_the_devices_choices_decide_the_exit_code(
     profile = set_option(DeviceProfile(), key, value)
     monkeypatch.setattr(
         "flasher.api.connect_mock",
-        lambda target, dialect, *, speed, has_application: connect_mock(
-            target, dialect, speed=speed, has_application=has_application, profile=profile
-        ),
+        lambda *where, **how: connect_mock(*where, **{**how, "profile": profile}),
     )
     run = flasher("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
     assert run.code == code

@@ -15,7 +15,7 @@ MOCK = ("--mock", "--mock-speed", "0")
 def battery(monkeypatch: pytest.MonkeyPatch) -> Battery:
     """What stands on the bus in place of the device model."""
     battery = Battery()
-    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(battery))
+    monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(battery))
     return battery
 
 
@@ -154,7 +154,7 @@ def test_a_device_in_its_bootloader_is_reported_with_the_way_on(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
     bootloader = Battery(silent=frozenset(range(0x10000)), repeats=((0x725, 0xC109, b"BMSV1.0.0"),))
-    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(bootloader))
+    monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(bootloader))
     run = flasher(*words, "-t", "bms", *MOCK, "--json")
     assert run.code == run.document["exit_code"] == ExitCode.NO_ANSWER
     assert "The BMS is in its bootloader (BMS V1.0.0)" in run.document["error"]["what"]

@@ -21,7 +21,7 @@ MOCK = ("--mock", "--mock-speed", "0")
 def battery(monkeypatch: pytest.MonkeyPatch) -> Battery:
     """What stands on the bus in place of the device model."""
     battery = Battery()
-    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(battery))
+    monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(battery))
     return battery
 
 

@@ -14,7 +14,7 @@ SILENT = frozenset(ANSWERS)
 
 def on_the_bus(monkeypatch: pytest.MonkeyPatch, *batteries: Battery) -> None:
     """Put these in place of the device model."""
-    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(*batteries))
+    monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(*batteries))
 
 
 @pytest.mark.parametrize(

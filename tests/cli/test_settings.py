@@ -53,7 +53,6 @@ class Settings:
 def battery(monkeypatch: pytest.MonkeyPatch) -> Settings:
     stage = Stage()
     monkeypatch.setattr("flasher.api.connect", stage.connect)
-    monkeypatch.setattr("flasher.cli.options.connect", stage.connect)
     return Settings(stage)
 
 

@@ -51,7 +51,6 @@ def on(monkeypatch: pytest.MonkeyPatch) -> Callable[[Connection], None]:
             yield wire
 
         monkeypatch.setattr("flasher.api.connect_mock", opened)
-        monkeypatch.setattr("flasher.cli.options.connect_mock", opened)
 
     return put
 

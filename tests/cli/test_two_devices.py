@@ -33,7 +33,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
         profile=replace(SMALL, serial_number="W2605002"),
     )
     made.bus.attach(Slow(other, 0.012))
-    monkeypatch.setattr("flasher.cli.options.connect_mock", made.connect)
+    monkeypatch.setattr("flasher.api.connect_mock", made.connect)
     return made
 
 
@@ -87,7 +87,7 @@ def test_a_write_that_two_confirm_is_an_error(stage: Stage) -> None:
 
 def test_one_battery_is_reported_as_such(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = Stage()
-    monkeypatch.setattr("flasher.cli.options.connect_mock", alone.connect)
+    monkeypatch.setattr("flasher.api.connect_mock", alone.connect)
     run = flasher("info", *MOCK, "--json")
     assert run.document["two_devices"] is None
     assert "two devices" not in run.err

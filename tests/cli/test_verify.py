@@ -27,7 +27,7 @@ class Comparison:
 
     def __call__(self, stage: Stage, *words: str, image: Image = IMAGE) -> Run:
         self._path.write_bytes(image.data)
-        self._patch.setattr("flasher.cli.options.connect", stage.connect)
+        self._patch.setattr("flasher.api.connect", stage.connect)
         stage.heard.clear()
         at = ("-t", stage.target.name, "-i", "virtual")
         run = self._flasher("verify", self._path, "--base", f"{BASE:#x}", *at, *words)
@@ -74,7 +74,7 @@ def test_another_version_decides_without_reading_the_memory(
 def test_an_image_that_names_another_target_is_compared_with_a_warning(
     flasher: Flasher, flashed: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flasher.cli.options.connect", flashed.connect)
+    monkeypatch.setattr("flasher.api.connect", flashed.connect)
     run = flasher("verify", SAMPLES / "wmc.hex", "-t", "bms", "-i", "virtual")
     assert run.code == ExitCode.VERIFICATION
     assert "warning: the image names the WMC inside, not the BMS" in run.err
@@ -153,7 +153,7 @@ def test_a_raw_binary_without_a_base_is_compared_by_its_version(
     flasher: Flasher, flashed: Stage, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "image.bin").write_bytes(IMAGE.data)
-    monkeypatch.setattr("flasher.cli.options.connect", flashed.connect)
+    monkeypatch.setattr("flasher.api.connect", flashed.connect)
     run = flasher("verify", tmp_path / "image.bin", "-t", "bms", "-i", "virtual")
     assert run.code == ExitCode.OK, run.err
     assert "memory:  not compared: a raw binary has no addresses: --base gives" in run.out

@@ -7,7 +7,7 @@ import json
 import shlex
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -27,7 +27,6 @@ from flasher.cli.options import (
     Bus,
     ImageOptions,
     bus_options,
-    holder,
     image_options,
     profile_option,
     target_option,
@@ -269,7 +268,7 @@ class _Walk:
         try:
             with self._step("bus") as done:
                 done.what = self._look_at_bus()
-            with self._connect() as connection:
+            with self.bus.connect(target, profile=None) as connection:
                 if not self.bus.mock:
                     self._hardware = printable(connection.name)
                     self._is_practice = not connection.link.is_physical
@@ -525,12 +524,6 @@ class _Walk:
             for name in STEPS
             if name not in tried
         ]
-
-    def _connect(self) -> AbstractContextManager[api.Connection]:
-        bus, target = self.bus, self.job.plan.target
-        if bus.mock:
-            return api.connect_mock(target, bus.dialect, speed=bus.mock_speed, system=True)
-        return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     # -- the report --------------------------------------------------------------------------------
 

@@ -18,13 +18,13 @@ from typing import Final
 import click
 from platformdirs import user_state_path
 
-from flasher.api import CallOptions, Connection, Job, connect
+from flasher.api import CallOptions, Connection, Job
 from flasher.bus.opening import bus_config
 from flasher.bus.physical import is_physical
 from flasher.cli.adapters import describe_adapter, detect_until, slcan_ports, with_adapter
 from flasher.cli.files import write_whole
 from flasher.cli.look.backup import DEVICE_MODEL, backup_folder, backup_of, own_backup_path
-from flasher.cli.options import Bus, holder
+from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, recording
 from flasher.cli.stop import Stop, stop_on_signal
@@ -236,9 +236,7 @@ class Adapters(_Place):
         return self._buses[adapter.name]
 
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
-        bus = self.bus(adapter)
-        asking = holder() if asks else None
-        return connect(self.dialect, holder=asking, sends=asks, fallback=bus.fallback, **bus.config)
+        return self.bus(adapter).connect(BMS, asks=asks)
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from flasher.bike import (
 )
 from flasher.cli.adapters import check_heard, choose_adapter
 from flasher.cli.framework import rebuild_command_line
-from flasher.cli.options import Bus, ImageOptions, holder
+from flasher.cli.options import Bus, ImageOptions
 from flasher.cli.output import ClosingLine, Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
 from flasher.cli.stop import Stop, stop_on_signal
@@ -202,7 +202,7 @@ class BikeUpgrade:
         output = self.output
         error: FlasherError | None = None
         with ExitStack() as stack:
-            connection = stack.enter_context(self._connect())
+            connection = stack.enter_context(self.bus.connect(BMS, profile=None))
             stop = stack.enter_context(
                 stop_on_signal(lambda: output.error_line("stopping at the end of the message ..."))
             )
@@ -264,12 +264,6 @@ class BikeUpgrade:
             devices.sort(key=lambda each: targets.index(each.part.target))
             names = ", ".join(each.name for each in devices)
             output.progress(f"order: {names}: {ORDER_REASON}")
-
-    def _connect(self) -> AbstractContextManager[api.Connection]:
-        bus = self.bus
-        if bus.mock:
-            return api.connect_mock(BMS, bus.dialect, speed=bus.mock_speed, system=True)
-        return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     def _upgrade(
         self, device: _Device, connection: api.Connection, stop: Stop

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,7 +23,6 @@ from flasher.cli.options import (
     Bus,
     ImageOptions,
     bus_options,
-    holder,
     image_options,
     target_option,
 )
@@ -252,7 +251,12 @@ class _Upgrade:
         upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
         upgrade_run.keeps_settings = self.choices.keeps_settings(profile)
         result = upgrade_run.write_planned(
-            lambda: self._connect(at_power_up=job.options.at_power_up),
+            lambda: self.bus.connect(
+                self.target,
+                profile=None,
+                system=False,
+                has_application=not job.options.at_power_up,
+            ),
             lambda connection, record: self._watching(upgrade_run.job, connection, record),
         )
         # Print the bundle before the error, so that the verdict is last.
@@ -303,14 +307,6 @@ class _Upgrade:
                 device = connection.device(self.target, dialect=self.bus.dialect)
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
             yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}
-
-    def _connect(self, *, at_power_up: bool) -> AbstractContextManager[api.Connection]:
-        bus = self.bus
-        if bus.mock:
-            return api.connect_mock(
-                self.target, bus.dialect, speed=bus.mock_speed, has_application=not at_power_up
-            )
-        return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     def _add_repair(self, error: FlasherError) -> None:
         """Add the command that repairs a device left without an application."""
