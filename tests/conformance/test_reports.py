@@ -151,6 +151,17 @@ def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:
     assert len(result["findings"]) == CHECKS_KEPT
 
 
+@each("verbose", (False, True))
+def test_a_long_reason_is_shown_whole_on_request(verbose: bool) -> None:
+    checks = [
+        Check("step", CheckOutcome.FAIL, "silence", f"{'ACK 1, ' * 50}{last}", 0.1)
+        for last in ("the last one", "the very last one")
+    ]
+    report = with_status(CaseVerdict.FAIL, checks=tuple(checks))
+    text = "\n".join(report_lines(report, verbose=verbose))
+    assert ("the last one" in text, "the very last one" in text) == (verbose, verbose)
+
+
 def test_times_are_told_with_their_histogram() -> None:
     values = [index / 1000 for index in range(1, 102)]
     measured = tuple(MeasuredTime("t", value, 0.002) for value in values)

@@ -30,6 +30,8 @@ from flasher.conformance.side_by_side import SideBySide
 from flasher.protocol.text import printable
 
 _TEXT_LIMIT: Final = 160
+_REASON_LIMIT: Final = 240
+"""Of why a case did not pass; -v shows all of it."""
 _CELL: Final = 40
 _NOTES_SHOWN: Final = 12
 FAILED: Final = frozenset(
@@ -110,14 +112,14 @@ def _case_lines(
     """
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     reason, failure = result.reason, result.first_failure
-    limit = _TEXT_LIMIT
+    limit = _REASON_LIMIT
     if failure is not None:  # the profile keys in it take no room from the rest
         limit += len(failure.expected_by) - len(failure.expected)
     if result.verdict is CaseVerdict.DEVIATION:
         reason = f"{reason} (profile: {text.deviation})"
     head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
     replay = f" | replay: {result.replay}" if result.replay else ""
-    yield printable(f"{head}: {_short(reason, limit)}") + replay
+    yield printable(f"{head}: {reason if verbose else _short(reason, limit)}") + replay
     crash, *printed = result.reason.split(LINE_JOINT)
     place = _ADDRESS.sub("", crash)
     if printed and place not in crashes:
@@ -128,7 +130,7 @@ def _case_lines(
         for label, content in text.clauses.items():
             yield printable(f"    {label}: {content}")
         for one in failed[1:]:
-            yield printable(f"    also: {_short(str(one))}")
+            yield printable(f"    also: {one}")
     elif len(failed) > 1:
         yield f"    and {counted(len(failed) - 1, 'more failed check')}"
 

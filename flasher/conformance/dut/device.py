@@ -333,9 +333,9 @@ class CompiledDevice(Machine):
         except FlashError as error:
             row = pipes.RANGE if asked is PipeMessage.FLASH_READ else pipes.PLACE
             offset = row.unpack_from(data)[asked is not PipeMessage.FLASH_READ]
-            raise FlashError(
-                f"{asked.name.lower()} at offset 0x{offset:X}: {error.what}", where=error.where
-            ) from error
+            # The bootloader knows offsets; addresses are those of the simulated application.
+            what = error.what.replace(f" at 0x{self.flash.start + offset:08X}", "")
+            raise FlashError(f"{asked.name.lower()} at offset 0x{offset:X}: {what}") from error
 
     def _flash_operation(self, asked: PipeMessage, data: bytes) -> bytes | None:
         """Read, erase or write flash; None when the power was cut."""
