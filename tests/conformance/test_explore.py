@@ -211,7 +211,7 @@ def test_nothing_found_is_exit_code_0(flasher: Flasher) -> None:
 def test_it_walks_for_a_time_and_tells_what_was_covered(flasher: Flasher) -> None:
     ran = flasher("conformance", "explore", "-t", "bms", "--mock", "--for", "0.01")
     assert ran.code == 0
-    assert " 1 walks, " in ran.out
+    assert " 1 walk, " in ran.out
     assert "pairs of phase and step were covered" in ran.out
     assert ran.out.splitlines()[-1] == "nothing was found"
     sooner = flasher("conformance", "explore", "-t", "bms", "--mock", "--for", "99", "--steps", "3")

@@ -26,7 +26,7 @@ from flasher.cli.bench.conformance_export import check_export, export, export_op
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line, typed_values
 from flasher.cli.options import Bus, adapter_options
-from flasher.cli.output import Output
+from flasher.cli.output import Output, counted
 from flasher.conformance.bench_options import BenchOptions
 from flasher.conformance.results import ExploreResult
 from flasher.errors import ExitCode
@@ -160,8 +160,8 @@ def _tell(explored: ExploreResult, output: Output, trace_file: Path | None, code
     words.insert(words.index("conformance") + 1, "explore")
     met = sum(bool(each.count) for each in explored.coverage)
     output.result(
-        f"{printable(explored.subject)}: {explored.walks} walks, {explored.steps} steps, seed "
-        f"{printable(explored.seed)}"
+        f"{printable(explored.subject)}: {counted(explored.walks, 'walk')}, "
+        f"{counted(explored.steps, 'step')}, seed {printable(explored.seed)}"
     )
     output.result(f"{met} of {len(explored.coverage)} pairs of phase and step were covered")
     if explored.not_covered and output.verbosity > 0:
