@@ -330,8 +330,9 @@ class _Exporter:
         return ExportedTest(code, len(stimuli), frames)
 
     def _shows(self, stimuli: Sequence[Stimulus], demand: Demand) -> bool:
-        return not self._meets(self._subject, stimuli, demand) and self._meets(
-            self._model, stimuli, demand
+        # The model first: it needs no process, and does not meet most shorter sequences.
+        return self._meets(self._model, stimuli, demand) and not self._meets(
+            self._subject, stimuli, demand
         )
 
     def _meets(self, subject: Subject, stimuli: Sequence[Stimulus], demand: Demand) -> bool:
