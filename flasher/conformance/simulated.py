@@ -6,8 +6,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NoReturn, TypeVar
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
@@ -51,19 +50,22 @@ class SimulatedPort:
     def send(self, frame: RawFrame) -> None:
         made = Frame(*frame)
         self._pending.append((made, frame))
-        with REPORT_CRASHES:
+        try:
             self._link.send(made)
+        except FlasherError as error:
+            _raise_crash(error)
 
     def receive(self, deadline: float) -> Arrival | None:
         arrived = self._arrived
         if not arrived:
             self._receives_until = deadline
             try:
-                with REPORT_CRASHES:
-                    while not arrived and self.now() < deadline:
-                        self.bus.advance(deadline)
-                        if not arrived:
-                            self._take_reports()
+                while not arrived and self.now() < deadline:
+                    self.bus.advance(deadline)
+                    if not arrived:
+                        self._take_reports()
+            except FlasherError as error:
+                _raise_crash(error)
             finally:
                 self._receives_until = _AT_ONCE
             if not arrived:
@@ -125,9 +127,11 @@ class SimulatedSubject(Generic[DeviceT]):
         self.bus = self.port.bus
 
     def power(self, *, on: bool) -> None:
-        with REPORT_CRASHES:
-            switch = self.device.power_on if on else self.device.power_cut
+        switch = self.device.power_on if on else self.device.power_cut
+        try:
             switch(self.port.now())
+        except FlasherError as error:
+            _raise_crash(error)
 
     def readback(self) -> bytes:
         return self.device.readback()
@@ -136,15 +140,11 @@ class SimulatedSubject(Generic[DeviceT]):
         self.device.bus_off(self.port.now(), for_s)
 
 
-class _CrashReporter(AbstractContextManager[None]):
-    """Converts a device model's exception to DeviceCrashed: it did something impossible on
-    hardware.
+def _raise_crash(error: FlasherError) -> NoReturn:
+    """Raise DeviceCrashed for a device model's error, as it did something impossible on hardware,
+    and an error of the adapter as it is.
     """
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, FlasherError) and not isinstance(error, BusError):
-            cause = f" ({error.cause})" if error.cause else ""
-            raise DeviceCrashed(f"the device stopped: {error.what}{cause}") from error
-
-
-REPORT_CRASHES: Final = _CrashReporter()
+    if isinstance(error, BusError):
+        raise error
+    cause = f" ({error.cause})" if error.cause else ""
+    raise DeviceCrashed(f"the device stopped: {error.what}{cause}") from error

@@ -305,7 +305,8 @@ class BusTester:
             )
         if self._stopped():
             raise RunStopped("the run was stopped")
-        self._note_stall(now - self._left_port_at)
+        if now - self._left_port_at > self._stall_s:
+            self._note_stall(now - self._left_port_at)
         until = float(min(deadline, self.ends_at, now + self._poll_s))
         try:
             arrival = port.receive(until)

@@ -81,6 +81,9 @@ class FaultInjector:
         return self.device.done
 
     def receive(self, frame: Frame, now: float) -> None:
+        if self._cut is None and self._power_due_at == inf:  # as for most frames
+            self.device.receive(frame, now)
+            return
         self._cut_when_due(now)
         self.device.receive(frame, now)
         self._watch_operation()
@@ -94,6 +97,8 @@ class FaultInjector:
 
     def deadline(self) -> float | None:
         wanted = self.device.deadline()
+        if self._cut is None and self._power_due_at == inf:
+            return wanted
         due_at = min(self._due_at, self._power_due_at, inf if wanted is None else wanted)
         return None if due_at == inf else due_at
 

@@ -31,7 +31,7 @@ class _LibraryPipe(Pipe):
 
     def write(self, kind: PipeMessage, *parts: bytes) -> None:
         data = b"".join(parts)
-        self._input += HEADER.pack(kind.value, len(data)) + data
+        self._input += HEADER.pack(kind, len(data)) + data
 
     def fill(self) -> bool:
         data, self._input = self._input, b""

@@ -136,12 +136,15 @@ class CompiledDevice(Machine):
         self._call_when_free(now)
 
     def deadline(self) -> float | None:
-        wanted = [inf if (found := super().deadline()) is None else found]
+        due_at = inf if (found := super().deadline()) is None else found
         if self._process.is_running:
-            wanted.append(self._busy_until if self._received else self._next_turn_at)
-        if self._to_send and not self.is_off_bus:
-            wanted.append(self._to_send[0][1])
-        due_at = min(wanted)
+            turn_at = self._busy_until
+            if not self._received and self._tick_at > turn_at:
+                turn_at = self._tick_at
+            if turn_at < due_at:  # noqa: PLR1730  as in the machine
+                due_at = turn_at
+        if self._to_send and self._to_send[0][1] < due_at and not self.is_off_bus:
+            due_at = self._to_send[0][1]
         return None if due_at == inf else due_at
 
     def next_frame(self, now: float) -> Frame | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import astuple
-from enum import Enum
+from enum import IntEnum
 from struct import Struct
 from typing import Final
 
@@ -35,7 +35,7 @@ _SIZES: Final = tuple(Facts.__dataclass_fields__)[:8]
 """Fields of the facts that are numbers."""
 
 
-class PipeMessage(Enum):
+class PipeMessage(IntEnum):
     """Type of a message: its first byte."""
 
     FACTS = ord("f")
@@ -53,6 +53,9 @@ class PipeMessage(Enum):
     DONE = ord(".")
 
 
+_KINDS: Final = {kind.value: kind for kind in PipeMessage}
+
+
 class Pipe:
     """Reads and writes messages on two file descriptors."""
 
@@ -64,7 +67,7 @@ class Pipe:
     def write(self, kind: PipeMessage, *parts: bytes) -> None:
         """Send a message. Raises BrokenPipeError when the other side has ended."""
         data = b"".join(parts)
-        view = memoryview(HEADER.pack(kind.value, len(data)) + data)
+        view = memoryview(HEADER.pack(kind, len(data)) + data)
         while view:
             view = view[os.write(self._write_fd, view) :]
 
@@ -73,11 +76,10 @@ class Pipe:
         if len(self._buffer) < HEADER.size:
             return None
         kind, size = HEADER.unpack_from(self._buffer)
-        try:
-            found = PipeMessage(kind)
-        except ValueError:
+        found = _KINDS.get(kind)
+        if found is None:
             wrote = bytes(self._buffer[:16])
-            raise ValueError(f"it wrote {wrote!r}, which is not a message") from None
+            raise ValueError(f"it wrote {wrote!r}, which is not a message")
         end = HEADER.size + size
         if len(self._buffer) < end:
             return None

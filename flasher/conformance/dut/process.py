@@ -35,6 +35,7 @@ _FILE_MAX_SIZE: Final = 64 * 1024 * 1024
 _DUMP_MARK: Final = "Shadow bytes around"
 """Start of the memory dump after AddressSanitizer's readable report."""
 _STDIN, _STDOUT, _STDERR = range(3)
+_CALLS: Final = {kind: f"flasher_dut_{kind.name.lower()}" for kind in PipeMessage}
 _LIBRARY: Final = frozenset((".so", ".dylib"))
 
 
@@ -123,14 +124,14 @@ class BootloaderProcess:
         Returns the final message (DONE, APPLICATION or RESET) with its data, or None when `during`
         killed the process. Raises BootloaderError when the process ends or does not return.
         """
-        doing = f"flasher_dut_{kind.name.lower()}"
+        doing = _CALLS[kind]
         try:
             self._pipe.write(kind, *parts)
             while True:
                 asked, data = self._next(doing)
                 if asked is PipeMessage.DONE:
                     return asked, data
-                if asked in {PipeMessage.APPLICATION, PipeMessage.RESET}:
+                if asked in (PipeMessage.APPLICATION, PipeMessage.RESET):
                     self.kill()
                     return asked, data
                 reply = during(asked, data)
