@@ -85,6 +85,14 @@ def test_a_babbling_node_and_the_wait_for_an_ack_make_no_pause() -> None:
     assert verdict(18, "CO-01", given) in HELD
 
 
+def test_a_reset_that_waited_for_the_end_of_an_erase_may_restart_the_bootloader() -> None:
+    """It announces itself once, so soon after request transfer that this looks like a leftover."""
+    given: dict[str, Value] = {"limits.erase_s": 27.0, "limits.ack_s": 0.54, "limits.start_s": 4.5}
+    given |= {"limits.first_version_s": 0.5, "limits.feedback_s": 0.2, "limits.window_s": 0.1514}
+    given |= {"tx_13": "restarts", "tx_12": "waits", "up_04": "rejected", "rs_02": "restarts"}
+    assert verdict(23, "BU-01", given) in HELD
+
+
 def verdict(seed: int, case_id: str, given: dict[str, Value]) -> CaseVerdict:
     """Of that case with the sizes of the device, and `given`."""
     device = right_c_device(seed)

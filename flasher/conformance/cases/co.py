@@ -93,7 +93,6 @@ _MEMORY_READ: Final = 0x4308
     "5 ms after end of transfer",
     expectation="nothing fails under load; the upgrade continues after the babbling node stops",
     requires={DESTRUCTIVE, LONG},
-    choices=("up_04_burst",),
 )
 def load(bench: Bench) -> None:
     image = bench.good_image
@@ -142,7 +141,6 @@ def load(bench: Bench) -> None:
     "frames of the device's own upgrade",
     expectation="no crosstalk: every packet is acknowledged once, and the image is right",
     requires={DESTRUCTIVE, LONG},
-    choices=("up_04_burst",),
 )
 def two_upgrades(bench: Bench) -> None:
     image = bench.good_image
