@@ -64,12 +64,17 @@ class Waits:
         return max(_LATE_VERSION * spacing_s, spacing_s + off_s)
 
     @property
+    def incomplete_s(self) -> float:
+        """After this time no partial message is left in the device."""
+        return _INCOMPLETE * self._limit("inter_frame_s")
+
+    @property
     def settle_s(self) -> float:
         """From the last frame of damaged or incomplete messages to the last answer to them: the
         device notices that the rest is missing, and then takes as long as for any answer. No
         partial message is left in it then.
         """
-        return _INCOMPLETE * self._limit("inter_frame_s") + self._limit("ack_s")
+        return self.incomplete_s + self._limit("ack_s")
 
     @property
     def silence_s(self) -> float:

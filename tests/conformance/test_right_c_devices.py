@@ -54,6 +54,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (24, "BU-01"),  # a lost end of transfer was awaited for longer than its pause
         (2, "FR-09"),  # an empty frame splits a message
         (32, "CO-04"),  # a burst of one, and deaf before it
+        (33, "BU-01"),  # what came soon after half an end of transfer belonged to that
     ),
 )
 def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:

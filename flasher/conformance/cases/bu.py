@@ -302,7 +302,8 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            within_s = min(bench.waits.silence_s, max(give_up_at - bench.now, 0.0))
+            left_s = max(give_up_at - bench.now, bench.waits.incomplete_s)
+            within_s = min(bench.waits.silence_s, left_s)
             reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
         if disturbance.hits_answer:
             break
