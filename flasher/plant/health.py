@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
+from textwrap import shorten
 from typing import Final
 
 from flasher.errors import FlasherError
@@ -16,6 +17,8 @@ from flasher.station.records.model import utc_moment
 
 STALE_S: Final = 4 * RETRY_MAX_S
 """Age of the last attempt after which the process that sends is regarded as dead."""
+_REASON_MAX: Final = 120
+"""Characters on the operator page."""
 
 
 def check(folder: Path, station: str, now: datetime) -> HealthCheck:
@@ -30,7 +33,11 @@ def check(folder: Path, station: str, now: datetime) -> HealthCheck:
     elif not state.at or abs((now - utc_moment(state.at)).total_seconds()) > STALE_S:
         sentence = text("the process that sends to the plant does not report")
     elif state.fault:
-        sentence = text("{count} rows wait: sending to the plant failed", count=state.unsent)
+        sentence = text(
+            "{count} rows wait: sending to the plant failed: {reason}",
+            count=state.unsent,
+            reason=shorten(printable(state.fault), _REASON_MAX, placeholder="..."),
+        )
     else:
         return HealthCheck(name, is_good=True, text=text("sent to the plant"))
     return HealthCheck(name, is_good=False, text=sentence)

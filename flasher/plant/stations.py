@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
-from sqlalchemy import text
+from sqlalchemy import Connection, text
 
 from flasher.plant.central import Central
 
@@ -29,8 +29,10 @@ class StationStatus:
     role: str
     reported_at: datetime | None
     """Time of its last report, by the database's clock; null: it never connected."""
+    now: datetime
+    """The time of this answer, by the database's clock."""
     silent_s: float | None
-    """Seconds since then."""
+    """Seconds since the last report."""
     version: str
     """Version of flasher."""
     head_number: int
@@ -52,10 +54,14 @@ class StationStatus:
 def stations_of(central: Central) -> list[StationStatus]:
     """All stations, by name. Raises RecordError."""
     with central.reading() as connection:
-        rows = [dict(row) for row in connection.execute(_QUERY).mappings()]
+        return statuses(connection)
+
+
+def statuses(connection: Connection) -> list[StationStatus]:
+    """All stations, by name."""
     found = []
-    for row in rows:
-        now, reported_at = row.pop("now"), row["reported_at"]
-        silent_s = None if reported_at is None else (now - reported_at).total_seconds()
+    for row in connection.execute(_QUERY).mappings():
+        reported_at = row["reported_at"]
+        silent_s = None if reported_at is None else (row["now"] - reported_at).total_seconds()
         found.append(StationStatus(**row, silent_s=silent_s))
     return found

@@ -8,11 +8,13 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from decimal import Decimal
 from functools import cached_property
 from typing import Any, Final
 
 from flasher.protocol.text import no_formula
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
+from flasher.station.records.capability import Capability
 from flasher.station.records.model import (
     Figures,
     ReportedRun,
@@ -42,6 +44,10 @@ class Report:
         """The runs, oldest first."""
         return self.records.table(self.chosen)
 
+    @cached_property
+    def capabilities(self) -> list[Capability]:
+        return self.records.capabilities(self.chosen)
+
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON types; times are UTC texts."""
         shares = {
@@ -55,6 +61,7 @@ class Report:
                 for name, value in asdict(self.chosen).items()
             },
             "figures": asdict(self.figures) | shares,
+            "measurements": [asdict(each) for each in self.capabilities],
             "runs": [vars(run) for run in self.runs],
         }
 
@@ -64,6 +71,11 @@ class Report:
     def to_csv(self) -> str:
         """The runs as CSV with a line of headings; "" without runs."""
         return csv_text([*map(vars, self.runs[:1]), *(vars(run).values() for run in self.runs)])
+
+    def to_measurements_csv(self) -> str:
+        """The measurements with limits as CSV with a line of headings; "" without any."""
+        rows = [vars(each) for each in self.capabilities]
+        return csv_text([*rows[:1], *(map(_exact, row.values()) for row in rows)])
 
     def to_junit(self) -> str:
         """The runs as JUnit XML test cases: FAIL is a failure, ERROR and INTERRUPTED are errors,
@@ -82,6 +94,11 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     out = io.StringIO()
     csv.writer(out, lineterminator="\r\n").writerows(map(csv_cell, row) for row in rows)
     return out.getvalue()
+
+
+def _exact(value: object) -> object:
+    """A number with its leading digits, however small it is."""
+    return Decimal(f"{value:.9g}") if isinstance(value, float) else value
 
 
 def csv_cell(value: object) -> str:

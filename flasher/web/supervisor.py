@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, time, timedelta
@@ -36,12 +36,14 @@ from flasher.station.certificate import (
 )
 from flasher.station.certificate_check import check_certificate
 from flasher.station.records import chain
+from flasher.station.records.capability import VALUES_MIN
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
     AttachmentFile,
+    Measurement,
     RunDetails,
     RunFilter,
     RunId,
@@ -80,6 +82,7 @@ _NAMES: Final = {
     "/units": text("Units"),
     "/yield": text("Yield and causes"),
     "/times": text("Times"),
+    "/measurements": text("Measurements"),
     "/images": text("Images"),
     "/audit": text("Audit trail"),
     CHECK: text("Check a certificate"),
@@ -92,6 +95,7 @@ BY_WORDS: Final = {
     By.RECIPE: text("recipe"),
     By.LOT: text("lot"),
     By.SHIFT: text("shift"),
+    By.STATION: text("station"),
 }
 PART_SIZE: Final = 2000
 """Rows of a spreadsheet file that are read at once."""
@@ -132,13 +136,23 @@ class SupervisorPages:
     def answer(self, question: Question) -> Answer:
         """Render a page; an error page if there is none."""
         try:
-            return PAGES[question.path](self, question)
+            return self.routes()[question.path](self, question)
         except NotFoundError as error:
             return self._trouble(question, 404, error)
         except (UsageError, UnprovenError) as error:
             return self._trouble(question, 400, error)
         except RecordError as error:
             return self._trouble(question, 503, error)
+
+    @staticmethod
+    def routes() -> Mapping[str, Callable[[Any, Question], Answer]]:
+        """Methods by route."""
+        return PAGES
+
+    @property
+    def names(self) -> Mapping[str, str]:
+        """Titles in the menu, by path."""
+        return _NAMES
 
     def _trouble(self, question: Question, status: int, error: FlasherError) -> Answer:
         return self._page(question, "trouble.html", http=status, error=error, path="")
@@ -147,7 +161,7 @@ class SupervisorPages:
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
         translate = translator(question.language)
-        shown = frame(question, self.now()) | context
+        shown = frame(question, self.now(), self.names) | context
         text = self._pages.text(template, translate, question.token, outcomes=RUN_WORDS, **shown)
         return Answer(text.encode("utf-8", "backslashreplace"), status=http)
 
@@ -160,9 +174,8 @@ class SupervisorPages:
             question,
             "runs.html",
             page=page,
-            recipes=self.overview.recipes(),
-            sockets=self.overview.sockets(),
             codes=list(codes.CODES),
+            **self._choices(),
         )
 
     def file_of_runs(self, question: Question) -> Answer:
@@ -299,6 +312,14 @@ class SupervisorPages:
 
     # -- figures ----------------------------------------------------------------------------------
 
+    def _choices(self) -> dict[str, Any]:
+        """What the form of a filter offers."""
+        return {
+            "recipes": self.overview.recipes(),
+            "sockets": self.overview.sockets(),
+            "stations": self.store.read.stations(),
+        }
+
     def _figured(self, question: Question) -> tuple[RunFilter, Span]:
         """Filter and period of a page with figures."""
         chosen = filter_of(question)
@@ -351,8 +372,7 @@ class SupervisorPages:
             )
             if causes
             else "",
-            sockets=self.overview.sockets(),
-            recipes=self.overview.recipes(),
+            **self._choices(),
         )
 
     def _causes(
@@ -395,9 +415,29 @@ class SupervisorPages:
             "times.html",
             span=span,
             rows=rows,
-            sockets=self.overview.sockets(),
-            recipes=self.overview.recipes(),
+            **self._choices(),
         )
+
+    def measurements(self, question: Question) -> Answer:
+        translate = translator(question.language)
+        chosen, span = self._figured(question)
+        return self._page(
+            question,
+            "measurements.html",
+            span=span,
+            rows=self.store.read.capabilities(chosen),
+            limits_of=lambda each: limits_of(
+                Measurement(each.name, each.mean, each.unit, each.low, each.high)
+            ),
+            digits=lambda value: translate.numbers(f"{value:.5g}"),
+            values_min=VALUES_MIN,
+            **self._choices(),
+        )
+
+    def file_of_measurements(self, question: Question) -> Answer:
+        report = Report(self.store.read, self._figured(question)[0])
+        made = report.to_measurements_csv()
+        return Answer(made.encode("utf-8"), _CSV, file_name="measurements.csv")
 
     # -- the audit trail --------------------------------------------------------------------------
 
@@ -417,11 +457,11 @@ class SupervisorPages:
         )
 
 
-def frame(question: Question, now: datetime) -> dict[str, Any]:
-    """Values of the frame that all supervisor pages share."""
+def frame(question: Question, now: datetime, names: Mapping[str, str] = _NAMES) -> dict[str, Any]:
+    """Values of the frame that all supervisor pages share. `names`: titles in the menu."""
     return {
         "layout": "supervise.html",
-        "menu": _NAMES if question.sign_in is None else _NAMES | _SIGN_INS,
+        "menu": {**names} if question.sign_in is None else {**names, **_SIGN_INS},
         "path": question.path,
         "fields": question.fields,
         "here": _Addresses(question),
@@ -451,12 +491,13 @@ def open_supervisor(
     key_locations: KeyLocations,
     shifts: Sequence[time],
     kind: type[Store] = Store,
+    make: Callable[[Store, Sequence[time]], SupervisorPages] = SupervisorPages,
 ) -> SupervisorPages:
     """Open records read-only. Raises as `Store.open`."""
     store = kind.open(
         url, station="pages", folder=folder, read_only=True, key_locations=key_locations
     )
-    return SupervisorPages(store, shifts)
+    return make(store, shifts)
 
 
 def serve_supervisor(
@@ -465,9 +506,10 @@ def serve_supervisor(
     key_locations: KeyLocations,
     shifts: Sequence[time],
     kind: type[Store] = Store,
+    make: Callable[[Store, Sequence[time]], SupervisorPages] = SupervisorPages,
 ) -> SupervisorPages:
     """Open records read-only, and update the daily sums while this process runs."""
-    supervisor = open_supervisor(url, folder, key_locations, shifts, kind)
+    supervisor = open_supervisor(url, folder, key_locations, shifts, kind, make)
     rollup = Rollup(supervisor.store.database)
     Thread(
         target=rollup.keep_up, args=(lambda: datetime.now(UTC), sleep), name="sums", daemon=True
@@ -475,7 +517,7 @@ def serve_supervisor(
     return supervisor
 
 
-PAGES: Final[dict[str, Callable[[SupervisorPages, Question], Answer]]] = {
+PAGES: Final[Mapping[str, Callable[[SupervisorPages, Question], Answer]]] = {
     "/runs": SupervisorPages.runs,
     **dict.fromkeys(_FILES, SupervisorPages.file_of_runs),
     f"/runs/{RUN}": SupervisorPages.run,
@@ -488,6 +530,8 @@ PAGES: Final[dict[str, Callable[[SupervisorPages, Question], Answer]]] = {
     "/images.csv": SupervisorPages.file_of_holders,
     "/yield": SupervisorPages.yields,
     "/times": SupervisorPages.times,
+    "/measurements": SupervisorPages.measurements,
+    "/measurements.csv": SupervisorPages.file_of_measurements,
     "/audit": SupervisorPages.audit,
 }
 """Methods by route."""
@@ -513,6 +557,7 @@ def filter_of(question: Question) -> RunFilter:
         state=None if outcome is None else RunState(outcome),
         code=fields.get("code"),
         socket=fields.get("socket"),
+        station=fields.get("station"),
     )
 
 

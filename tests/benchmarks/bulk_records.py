@@ -41,11 +41,11 @@ _TOOK_S: Final = sum(seconds for _, seconds in STEPS)
 _Row = dict[str, Any]
 
 
-def fill(bench: Bench, runs: int, traces: int = 0) -> None:
-    """Make it `runs` runs, the last `traces` of them with a trace."""
+def fill(bench: Bench, runs: int, traces: int = 0, first_day: datetime = FIRST_DAY) -> None:
+    """Make it `runs` runs from `first_day` on, the last `traces` of them with a trace."""
     store = bench.store
     with store.database.engine.connect() as connection, _bulk(connection) as rows:
-        made = _Plant(bench, connection, rows, runs, traces)
+        made = _Plant(bench, connection, rows, runs, traces, first_day)
         made.name_things()
         for run_id in range(2, runs + 1):
             made.add_run(run_id)
@@ -120,8 +120,15 @@ class _Plant:
     """Rows of many runs, with the end of the chain."""
 
     def __init__(
-        self, bench: Bench, connection: Connection, write: _Rows, runs: int, traces: int
+        self,
+        bench: Bench,
+        connection: Connection,
+        write: _Rows,
+        runs: int,
+        traces: int,
+        first_day: datetime,
     ) -> None:
+        self._first_day = first_day
         self._bench, self._connection, self._write = bench, connection, write
         self._runs, self._traces = runs, traces
         self._chance = random.Random(7)
@@ -194,7 +201,7 @@ class _Plant:
             )
         bad = not self._was_bad and self._chance.random() < 0.11
         self._was_bad = bad
-        at = FIRST_DAY + timedelta(days=run_id / RUNS_A_DAY)
+        at = self._first_day + timedelta(days=run_id / RUNS_A_DAY)
         share = run_id / self._runs
         trace = self._trace(run_id) if run_id > self._runs - self._traces else None
         sha256 = f"{run_id:064x}" if trace is None else trace[0]

@@ -129,6 +129,24 @@ def test_status_and_send(flasher: Flasher, plant: Plant) -> None:
     both = flasher("plant", "status", "--database", url, "--json")
     hold_output(json.loads(SCHEMA.read_text("utf-8")), both.out, both.code)
     assert PASSWORD not in both.out + run.out + sent.out + sent.err
+    assert both.document["checks"]["line-2"][0] == {
+        "kind": "refused", "state": "ok", "text": "its records are accepted",
+    }  # fmt: skip
+    assert "  not known: yield: too few units in this shift: 0 of 20" in run.out.splitlines()
+    alert = flasher("plant", "status", "--database", url, "--silent", "0")
+    assert alert.code == ExitCode.PARTIAL
+    assert alert.out.splitlines()[-1].startswith("ALERT line-2: silent for ")
+
+
+def test_what_is_wrong_with_the_options_is_found_before_the_server_is_asked(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    away = ("plant", "report", "--database", "postgresql://desk:s3cr3t@127.0.0.1:1/plant")
+    assert "'soon' is not a time" in flasher(*away, "--since", "soon").err
+    nowhere = tmp_path / "nowhere" / "m.csv"
+    assert "--measurements" in flasher(*away, "--measurements", nowhere).err
+    run = flasher(*away)
+    assert "where: postgresql://desk:***@127.0.0.1:1/plant" in run.err
 
 
 def test_a_refused_chain_is_named_by_send_and_by_status(

@@ -6,11 +6,14 @@ from contextlib import closing
 from datetime import UTC, datetime
 
 from flasher.plant.store import PlantStore
+from flasher.station.records.capability import Capability
 from flasher.station.records.model import RunFilter
 from flasher.station.records.rollup import Rollup
+from flasher.web.plant import PlantPages
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages, open_supervisor
 from tests.plant.factory import READER, Plant, Sender
+from tests.station.records.test_capability import VALUES, measure
 
 LATER = datetime(2026, 6, 1, tzinfo=UTC)
 
@@ -69,3 +72,54 @@ def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender)
         assert "line-3" in page(pages, "/units", serial="W2605003", part="BAT-36")
         refused = page(pages, "/units/certificate", serial="W2605003", part="BAT-36")
         assert "records of the station that made the run" in refused
+
+
+def test_the_page_of_stations_leads_to_the_runs_of_one(plant: Plant, sender: Sender) -> None:
+    other = plant.sender("line-3")
+    sender.bench.make()
+    other.bench.make(serial="W2605003")
+    for each in (sender, other):
+        each.send()
+    other.close()
+    pages = open_supervisor(
+        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore,
+        PlantPages,
+    )  # fmt: skip
+    with closing(pages.store):
+        shown = page(pages, "/stations")
+        assert '<a href="/runs?station=line-3">line-3</a>' in shown
+        assert "There is no alert." in shown
+        assert 'aria-current="page">Stations' in shown
+        of_one = page(pages, "/runs", station="line-3")
+        assert "W2605003" in of_one
+        assert "W2605002" not in of_one
+        assert '<option value="line-3" selected>' in page(pages, "/yield", station="line-3")
+        for language in ("de", "zh"):
+            assert pages.answer(Question("/stations", {}, language=language)).status == 200
+        with plant.connect() as owner:
+            owner.execute("UPDATE plant_station SET reported_at = now() - interval '6 min'")
+        assert "silent for 6 min" in page(pages, "/stations")
+
+
+def _rounded(each: Capability) -> dict[str, object]:
+    return {
+        name: round(value, 12) if isinstance(value, float) else value
+        for name, value in vars(each).items()
+    }
+
+
+def test_capability_is_computed_as_at_the_station(plant: Plant, sender: Sender) -> None:
+    measure(sender.bench, VALUES)
+    measure(sender.bench, [8.0], high=None, serial="W2605003", socket="B")
+    sender.send()
+    own = sender.bench.store.read.capabilities()
+    with closing(opened(plant)) as store:
+        assert [*map(_rounded, store.read.capabilities())] == [*map(_rounded, own)]
+    pages = open_supervisor(
+        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore
+    )
+    with closing(pages.store):
+        shown = page(pages, "/measurements")
+        assert f"{own[0].ppk:.2f}" in shown
+        assert "from 7 to 14 V" in shown
+        assert "fewer than 30 values" in shown

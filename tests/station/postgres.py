@@ -21,6 +21,7 @@ host all {OWNER} 127.0.0.1/32 trust
 host all all 127.0.0.1/32 scram-sha-256
 """
 _FAST = "-c fsync=off -c synchronous_commit=off -c full_page_writes=off -c max_connections=60"
+_DURABLE = "-c shared_buffers=1GB -c max_wal_size=4GB -c max_connections=60"
 
 
 @dataclass
@@ -30,6 +31,8 @@ class Server:
     programs: Path
     folder: Path
     port: int
+    is_durable: bool = False
+    """Each commit waits for the disk."""
     _made: int = 0
 
     def url(self, database: str, user: str = OWNER) -> str:
@@ -60,7 +63,8 @@ class Server:
         data = self.folder / "data"
         where = f"-p {self.port} -c listen_addresses=127.0.0.1 -k {self.folder}"
         log = str(self.folder / "log")
-        self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", f"{where} {_FAST}", "start")
+        settings = f"{where} {_DURABLE if self.is_durable else _FAST}"
+        self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", settings, "start")
 
     def stop(self, mode: str = "immediate") -> None:
         self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", mode, "stop")
@@ -88,7 +92,9 @@ def find_programs() -> Path | None:
 
 
 @contextmanager
-def running_server(programs: Path, kept: Path | None = None) -> Iterator[Server]:
+def running_server(
+    programs: Path, kept: Path | None = None, *, is_durable: bool = False
+) -> Iterator[Server]:
     """A server from start to end; with a folder that is `kept`, its databases are there again."""
     # A short path, since the server's socket lies in it.
     folder = kept or Path(tempfile.mkdtemp(prefix="flasher-pg-"))
@@ -97,7 +103,7 @@ def running_server(programs: Path, kept: Path | None = None) -> Iterator[Server]
             shutil.chown(folder, OWNER)
         with socket.create_server(("127.0.0.1", 0)) as probe:
             port = probe.getsockname()[1]
-        server = Server(programs, folder, port)
+        server = Server(programs, folder, port, is_durable)
         server.start()
         try:
             yield server

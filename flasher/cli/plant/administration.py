@@ -11,18 +11,26 @@ from pathlib import Path
 from sqlalchemy import make_url
 
 from flasher.cli.output import Output, byte_count, counted, duration
+from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import PlantInitDocument, PlantSendDocument, PlantStatusDocument
 from flasher.errors import ExitCode, UsageError
+from flasher.plant.activity import Yield
+from flasher.plant.alerts import (
+    Bounds,
+    CheckKind,
+    CheckState,
+    StationOverview,
+    alerts,
+    overviews,
+)
 from flasher.plant.central import Central, plant_location
 from flasher.plant.process import Sending
 from flasher.plant.setup import create_database, role_of, setup
-from flasher.plant.stations import StationStatus, stations_of
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
 from flasher.station.records.database import Location
-
-SILENT_S = 60.0
-"""A station that has not reported for this time is shown as silent."""
+from flasher.station.records.model import RunState
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 
 
 def init(
@@ -93,30 +101,49 @@ def _after(location: Location, roles: Mapping[str, str], created: Collection[str
 # -- status ----------------------------------------------------------------------------------------
 
 
-def status(output: Output, url: str) -> int:
-    with closing(Central(url)) as central:
-        found = stations_of(central)
+def bounds_of(options: BoundsOptions) -> Bounds:
+    return Bounds(**vars(options) | {"yield_min": options.yield_min / 100})
+
+
+def status(output: Output, url: str, options: BoundsOptions) -> int:
+    now = datetime.now().astimezone()
+    with closing(Central(url)) as central, central.reading() as connection:
+        found = overviews(connection, bounds_of(options), DEFAULT_SHIFTS, now)
     for each in found:
         output.results(_lines(each))
     if not found:
         output.result("no stations: flasher plant init --station NAME --database URL adds one")
-    code = ExitCode.VERIFICATION if any(each.refusal for each in found) else ExitCode.OK
-    return output.document(PlantStatusDocument(found), exit_code=code)
+    for station, check in alerts(found):
+        output.result(printable(f"ALERT {station}: {check.text}"))
+    code = ExitCode.PARTIAL if any(alerts(found)) else ExitCode.OK
+    if any(each.status.refusal for each in found):
+        code = ExitCode.VERIFICATION
+    document = PlantStatusDocument(
+        [each.status for each in found],
+        {each.status.station: each.activity for each in found},
+        {each.status.station: each.checks for each in found},
+    )
+    return output.document(document, exit_code=code)
 
 
-def _lines(each: StationStatus) -> Iterator[str]:
-    name = printable(each.station)
-    if each.reported_at is None:
+def _lines(of: StationOverview) -> Iterator[str]:
+    each, name = of.status, printable(of.status.station)
+    if each.silent_s is None:
         yield f"{name}: has never connected"
         return
-    silent_s = each.silent_s or 0.0
-    seen = "SILENT for" if silent_s > SILENT_S else "reported"
-    ago = "" if silent_s > SILENT_S else " ago"
-    yield f"{name}: {seen} {duration(silent_s)}{ago}, flasher {printable(each.version)}"
+    silent = next(check for check in of.checks if check.kind is CheckKind.SILENT)
+    seen = "SILENT for" if silent.state is CheckState.ALERT else "reported"
+    ago = "" if silent.state is CheckState.ALERT else " ago"
+    yield f"{name}: {seen} {duration(each.silent_s)}{ago}, flasher {printable(each.version)}"
     if each.refusal:
         yield printable(f"  REFUSED: {each.refusal}")
     at = f", of {printable(each.head_at)}" if each.head_at else ""
     yield f"  last row:  {each.head_number:,}{at}, hash {(each.head_hash or 'none')[:16]}"
+    if (last := of.activity.last_run) is not None:
+        code = "" if last.state is RunState.PASS else f" {last.code}"
+        begun = f"{last.begun_at:%Y-%m-%d %H:%M:%S} UTC"
+        yield printable(f"  last run:  {last.serial}, {begun}, {last.state.value}{code}")
+    yield f"  yield:     shift {_yield_text(of.activity.shift)}, day {_yield_text(of.activity.day)}"
     if each.unsent:
         oldest = printable(each.oldest_unsent_at or "")
         yield f"  unsent:    {counted(each.unsent, 'row')}, the first of {oldest}"
@@ -124,6 +151,14 @@ def _lines(each: StationStatus) -> Iterator[str]:
         yield f"  clock:     {each.clock_offset_s:+.1f} s"
     if each.disk_free_bytes is not None:
         yield f"  disk:      {byte_count(each.disk_free_bytes)} free"
+    for check in of.checks:
+        if check.state is CheckState.UNKNOWN:
+            yield printable(f"  not known: {check.kind.value}: {check.text}")
+
+
+def _yield_text(found: Yield) -> str:
+    share = "" if found.share is None else f" ({found.share:.1%})"
+    return f"{found.passed:,} of {counted(found.units, 'unit')}{share}"
 
 
 # -- sending ---------------------------------------------------------------------------------------

@@ -6,8 +6,9 @@ Those need the extra `plant` and are imported when called.
 from __future__ import annotations
 
 import importlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from flasher.cli import values
 from flasher.cli.extras import need
@@ -47,7 +48,7 @@ def __getattr__(name: str) -> tuple[type, ...]:
     raise AttributeError(name)
 
 
-@group(epilog=_EXAMPLES, exit_codes=(ExitCode.VERIFICATION, ExitCode.INTERRUPTED))
+@group(epilog=_EXAMPLES, exit_codes=(ExitCode.VERIFICATION, ExitCode.PARTIAL, ExitCode.INTERRUPTED))
 def plant() -> None:
     """Collect the records of all stations of a plant in one PostgreSQL database. Each station keeps
     its own records and sends them when the server can be reached; no station waits for it. The
@@ -100,13 +101,52 @@ def init(
     return _call("administration.init", output, database, stations, renew, prints=prints)
 
 
+_ALERTS: Final = "bounds of alerts"
+
+
+@dataclass(frozen=True)
+class BoundsOptions:
+    """Options: bounds of the alerts, as in `flasher.plant.alerts.Bounds`."""
+
+    yield_min: Annotated[float, option(
+        "--yield-min", type=values.percent, default=90.0, metavar="PERCENT", panel=_ALERTS,
+        brief=True, help="alert if fewer units of the shift passed in their last run",
+    )]  # fmt: skip
+    units_min: Annotated[int, option(
+        "--yield-units", "units_min", type=values.count, default="20", metavar="N", panel=_ALERTS,
+        help="units of the shift from which its yield is judged",
+    )]  # fmt: skip
+    silent_s: Annotated[float, option(
+        "--silent", "silent_s", type=values.seconds, default=300.0, metavar="S", panel=_ALERTS,
+        brief=True, help="alert if a station has not reported for this time",
+    )]  # fmt: skip
+    repeats: Annotated[int, option(
+        "--repeats", type=values.count, default="5", metavar="N", panel=_ALERTS, brief=True,
+        help="alert if the last N runs of a socket, within 24 hours, ended with the same code",
+    )]  # fmt: skip
+    unsent_s: Annotated[float, option(
+        "--unsent", "unsent_s", type=values.seconds, default=3600.0, metavar="S", panel=_ALERTS,
+        help="alert if a record has waited at its station for longer",
+    )]  # fmt: skip
+    clock_s: Annotated[float, option(
+        "--clock", "clock_s", type=values.seconds, default=5.0, metavar="S", panel=_ALERTS,
+        help="alert if a station's clock differs from the database's by more",
+    )]  # fmt: skip
+    disk_bytes: Annotated[int, option(
+        "--disk", "disk_bytes", type=values.number, default="500M", metavar="BYTES", panel=_ALERTS,
+        help="alert if a station's disk has less free space",
+    )]  # fmt: skip
+
+
 @plant.action("status")
+@option_set("bounds", BoundsOptions)
 @_database_option
-def status(output: Output, database: str) -> int:
-    """List the stations: last report, last row, unsent rows, clock, disk, version. Exit code 10 if
-    the database refuses the records of one.
+def status(output: Output, bounds: BoundsOptions, database: str) -> int:
+    """List the stations with their checks: last report, last row, last run, yield, unsent rows,
+    clock, disk, version. Exit code 10 if the database refuses the records of one, else 12 if there
+    is an alert. A check that cannot be judged, such as a yield of too few units, is "not known".
     """
-    return _call("administration.status", output, database)
+    return _call("administration.status", output, database, bounds)
 
 
 @plant.action("verify")
@@ -143,11 +183,16 @@ def report(output: Output, options: ReportOptions, database: str) -> int:
     help="address of the pages; a port alone: on this computer only",
 )  # fmt: skip
 @pages_options
+@option_set("bounds", BoundsOptions)
 @_database_option
-def pages(output: Output, web: Address, pages: PagesOptions, database: str) -> int:
-    """Serve the supervisor pages over the records of all stations until Ctrl-C."""
+def pages(
+    output: Output, web: Address, pages: PagesOptions, bounds: BoundsOptions, database: str
+) -> int:
+    """Serve the supervisor pages over the records of all stations until Ctrl-C: the page of all
+    stations with their alerts, and those of a station.
+    """
     need("The supervisor pages", "web")
-    return _call("reading.pages", output, web, pages, database)
+    return _call("reading.pages", output, web, pages, database, bounds)
 
 
 @plant.action("send")

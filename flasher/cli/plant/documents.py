@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from flasher.cli.station.documents import StationReportDocument
+from flasher.plant.activity import Activity
+from flasher.plant.alerts import StationCheck
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
@@ -29,6 +31,10 @@ class PlantStatusDocument:
     """The stations of a plant."""
 
     stations: list[StationStatus]
+    activity: dict[str, Activity]
+    """What each station has done lately, by its name."""
+    checks: dict[str, tuple[StationCheck, ...]]
+    """Checks of each station by its name."""
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output, counted
+from flasher.cli.plant.administration import bounds_of
+from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import PlantUnitsDocument
 from flasher.cli.station.commands import Address, PagesOptions, RecordsOptions, ReportOptions
 from flasher.cli.station.maintenance import problem_lines
@@ -105,7 +108,12 @@ def report(output: Output, options: ReportOptions, url: str) -> int:
     return station_report(output, options, _records(url), PlantStore)
 
 
-def pages(output: Output, address: Address, options: PagesOptions, url: str) -> int:
+def pages(
+    output: Output, address: Address, options: PagesOptions, url: str, bounds: BoundsOptions
+) -> int:
     from flasher.cli.station.pages import serve  # noqa: PLC0415  an extra
+    from flasher.web.plant import PLANT_PAGES, STATIONS, PlantPages  # noqa: PLC0415  an extra
 
-    return serve(output, address, options, _records(url), PlantStore)
+    make = partial(PlantPages, bounds=bounds_of(bounds))
+    paths = dict.fromkeys([STATIONS, *PLANT_PAGES])
+    return serve(output, address, options, _records(url), PlantStore, make, tuple(paths))

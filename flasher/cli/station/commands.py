@@ -47,7 +47,8 @@ next safe point; scan them again. Exit code 12 if a unit did not pass.
 """
 
 _PAGES_NOTES: Final = """\
-Open the printed address: /runs, /units, /yield, /times, /images, /audit, /certificate. A station
+Open the printed address: /runs, /units, /yield, /times, /measurements, /images, /audit,
+/certificate. A station
 that runs with --web serves these pages too, beside its operator page.
 """
 
@@ -322,6 +323,9 @@ class ReportOptions:
     serial: Annotated[str | None, option(
         "--serial", metavar="SERIAL", panel=_WHICH, help="runs of this serial number",
     )]  # fmt: skip
+    station: Annotated[str | None, option(
+        "--station", metavar="NAME", panel=_WHICH, help="runs of this station",
+    )]  # fmt: skip
     since: Annotated[str | None, option(
         "--since", metavar="TIME", panel=_WHICH, brief=True,
         help="runs begun at this time or later: 2026-05-17, or 2026-05-17T06:00",
@@ -338,6 +342,10 @@ class ReportOptions:
     junit: Annotated[Path | None, _path_option(
         "--junit", panel=_WRITTEN, help="JUnit XML with a test case for each run",
     )]  # fmt: skip
+    measurements: Annotated[Path | None, _path_option(
+        "--measurements", panel=_WRITTEN,
+        help="a table (CSV) with a row for each measurement with limits: mean, s, Cpk, Ppk",
+    )]  # fmt: skip
     certificates: Annotated[Path | None, _path_option(
         "--certificates", metavar="DIR", panel=_WRITTEN, help="a certificate (HTML) for each unit"
     )]  # fmt: skip
@@ -347,7 +355,9 @@ class ReportOptions:
 @option_set("options", ReportOptions)
 @_records_options
 def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
-    """Show units, yield, failures and times; write them to files; make certificates."""
+    """Show units, yield, failures, times and the capability of measurements with limits (Cpk, Ppk);
+    write them to files; make certificates.
+    """
     return _call("records.report", output, options, records)
 
 

@@ -7,6 +7,7 @@ from typing import Final, get_args
 
 from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
+from flasher.station.records.capability import Capability
 from flasher.station.records.model import (
     Backup,
     Examination,
@@ -109,6 +110,8 @@ class StationReportDocument:
     """Runs with their figures."""
 
     figures: FiguresDocument
+    measurements: list[Capability]
+    """Measurements with limits."""
     runs: list[ReportedRun]
 
 

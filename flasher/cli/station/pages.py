@@ -14,6 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from datetime import datetime
+from datetime import time as dtime
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -48,7 +49,14 @@ from flasher.web.pages import Pages
 from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server, Tls
 from flasher.web.sign_ins import Note
-from flasher.web.supervisor import CHECK, PAGES, place_of, serve_supervisor, upload_limit
+from flasher.web.supervisor import (
+    CHECK,
+    PAGES,
+    SupervisorPages,
+    place_of,
+    serve_supervisor,
+    upload_limit,
+)
 
 _TURN_S: Final = 0.1
 PASSWORD_MIN: Final = 8
@@ -164,7 +172,10 @@ def serve(
     options: PagesOptions,
     records: RecordsOptions,
     kind: type[Store] = Store,
+    make: Callable[[Store, Sequence[dtime]], SupervisorPages] = SupervisorPages,
+    paths: Sequence[str] = tuple(PAGES),
 ) -> int:
+    """Serve the pages that `make` answers; the first of `paths` is the start page."""
     config = None if records.sockets is None else load_config(records.sockets)
     shifts = DEFAULT_SHIFTS if config is None else config.shifts
     badges = "" if config is None else config.badges
@@ -172,8 +183,12 @@ def serve(
     with closing(open_to_read(records, kind)) as store:  # fails before the pages are served
         place = place_of(store)
     pages = Pages(options.language)
-    answering = QueryProcesses(partial(serve_supervisor, *place, shifts, kind))
-    routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES, [CHECK])]
+    answering = QueryProcesses(partial(serve_supervisor, *place, shifts, kind, make))
+
+    async def start(_request: Request) -> Response:
+        return RedirectResponse(paths[0], 303)
+
+    routes = [Route("/", start), *answer_routes(pages, answering.ask, paths, [CHECK])]
     with (
         closing(answering),
         stop_on_signal() as stopped,
@@ -196,10 +211,6 @@ def serve(
         while not stopped():
             time.sleep(_TURN_S)
     return ExitCode.OK
-
-
-async def _start(_request: Request) -> Response:
-    return RedirectResponse("/runs", 303)
 
 
 # -- access ----------------------------------------------------------------------------------------

@@ -23,7 +23,8 @@ from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records.errors import UnprovenError
+from flasher.station.records.capability import VALUES_MIN, Basis, Capability
+from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
@@ -52,24 +53,28 @@ _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 def report(
     output: Output, options: ReportOptions, records: RecordsOptions, kind: type[Store] = Store
 ) -> int:
+    wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
+        "--csv": (options.csv, Report.to_csv),
+        "--json-report": (options.json_report, Report.to_json),
+        "--junit": (options.junit, Report.to_junit),
+        "--measurements": (options.measurements, Report.to_measurements_csv),
+    }
+    for option, (path, _) in wanted.items():
+        check_writable(path, option)
+    chosen = RunFilter(
+        lot=options.lot,
+        recipe=options.recipe,
+        since=_moment(options.since, "--since"),
+        until=_moment(options.until, "--until"),
+        serial=options.serial,
+        part=options.part,
+        station=options.station,
+    )
     with closing(open_to_read(records, kind)) as store:
-        wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
-            "--csv": (options.csv, Report.to_csv),
-            "--json-report": (options.json_report, Report.to_json),
-            "--junit": (options.junit, Report.to_junit),
-        }
-        for option, (path, _) in wanted.items():
-            check_writable(path, option)
-        chosen = RunFilter(
-            lot=options.lot,
-            recipe=options.recipe,
-            since=_moment(options.since, "--since"),
-            until=_moment(options.until, "--until"),
-            serial=options.serial,
-            part=options.part,
-        )
+        _check_station(store, options.station)
         made = Report(store.read, chosen)
         output.results(figure_lines(made.figures))
+        output.results(capability_lines(made.capabilities))
         for option, (path, make) in wanted.items():
             if path is not None:
                 write_whole(path, make(made).encode("utf-8"), option)
@@ -83,9 +88,20 @@ def report(
             return code  # the runs are read for the document alone
         document = StationReportDocument(
             figures=figures_document(made.figures),
+            measurements=made.capabilities,
             runs=made.runs,
         )
         return output.document(document, exit_code=code)
+
+
+def _check_station(store: Store, station: str | None) -> None:
+    """Raises NotFoundError for a station that has no runs here."""
+    names = store.read.stations()
+    if station is not None and station not in names:
+        raise NotFoundError(
+            f"There is no station {printable(station)} in the records.",
+            remedy=f"Name one of: {', '.join(map(printable, names)) or 'none'}.",
+        )
 
 
 def _moment(text: str | None, option: str) -> datetime | None:
@@ -202,6 +218,27 @@ def figure_lines(figures: Figures) -> Iterator[str]:
         yield f"  longest:  {duration(figures.duration_longest_s)} of those that passed"
     for code, count in figures.failures.items():
         yield f"  {count:7,}  {printable(code)}"
+
+
+def capability_lines(found: Sequence[Capability]) -> Iterator[str]:
+    """Format measurements with limits."""
+    if found:
+        yield "measurements with limits (docs/how-to/station_records.md explains Cpk and Ppk):"
+    for each in found:
+        yield printable(f"  {each.part} {each.step}, {each.name}: {_capability_text(each)}")
+
+
+def _capability_text(each: Capability) -> str:
+    unit = f" {each.unit}" if each.unit else ""
+    values = counted(each.count, "value") + (f", {each.outside:,} outside" if each.outside else "")
+    deviation = "" if each.deviation is None else f", s {each.deviation:.4g}"
+    text = f"{values}; limits {each.limits}{unit}; mean {each.mean:.5g}{deviation}; "
+    if each.basis is Basis.TOO_FEW:
+        return f"{text}no Cpk: fewer than {VALUES_MIN} values"
+    if each.basis is Basis.CONSTANT:
+        return f"{text}no Cpk: all values are equal (s = 0)"
+    cpk = "not computed" if each.cpk is None else f"{each.cpk:.2f}"
+    return f"{text}Cpk {cpk}, Ppk {each.ppk:.2f}"
 
 
 def unit_lines(

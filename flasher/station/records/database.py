@@ -85,12 +85,12 @@ def locate(url: str, folder: Path | None = None) -> Location:
     except (ArgumentError, ValueError) as error:
         raise _no_database(url) from error
     backend = parsed.get_backend_name()
+    shown = printable(parsed.set(query={}).render_as_string(hide_password=True))
     if parsed.drivername == "postgresql":
         parsed = parsed.set(drivername=_POSTGRESQL)
     # An @ or a / of a password that is not written as %40 or %2F lands in host or name.
     if parsed.drivername not in ("sqlite", _POSTGRESQL) or "@" in f"{parsed.host}{parsed.database}":
         raise _no_database(url)
-    shown = printable(parsed.set(query={}).render_as_string(hide_password=True))
     if backend == "sqlite" and parsed.query:
         raise UsageError(
             f"The database {shown} has options in its URL; records use none.",

@@ -58,6 +58,9 @@ def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any
         yield run.recipe_id, select(recipe.id).where(recipe.part == chosen.part)
     if chosen.socket is not None:
         yield run.socket_id, select(socket.id).where(socket.name == chosen.socket)
+    if chosen.station is not None:
+        of_station = select(socket.id).join(schema.station)
+        yield run.socket_id, of_station.where(schema.station.c.name == chosen.station)
 
 
 def units_of(chosen: RunFilter) -> Select[Any] | None:

@@ -434,6 +434,7 @@ class RunFilter:
     state: RunState | None = None
     code: str | None = None
     socket: str | None = None
+    station: str | None = None
 
 
 @dataclass(frozen=True)

@@ -128,6 +128,7 @@ class By(StrEnum):
     RECIPE = "recipe"
     LOT = "lot"
     SHIFT = "shift"
+    STATION = "station"
 
 
 @dataclass(frozen=True)
@@ -431,9 +432,16 @@ def _group_of(
             return shifts[at][1] if at >= 0 and begun_at < ends[at] else None
 
         return run.begun_at, shift_of
-    recipe = schema.recipe.c
+    recipe, socket, station = schema.recipe.c, schema.socket.c, schema.station.c
+    # Sockets of several stations have the same names.
+    several = connection.execute(select(station.id).limit(2)).all()[1:]
+    of_socket = select(socket.id, *([station.name] if several else []), socket.name)
     column, query = {
-        By.SOCKET: (run.socket_id, select(schema.socket.c.id, schema.socket.c.name)),
+        By.SOCKET: (run.socket_id, of_socket.join_from(schema.socket, schema.station)),
+        By.STATION: (
+            run.socket_id,
+            select(socket.id, station.name).join_from(schema.socket, schema.station),
+        ),
         By.RECIPE: (run.recipe_id, select(recipe.id, recipe.name, recipe.revision)),
         By.LOT: (run.lot_id, select(schema.lot.c.id, schema.lot.c.name)),
     }[by]

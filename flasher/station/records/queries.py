@@ -12,6 +12,7 @@ from sqlalchemy import Connection, Select, case, literal, select
 
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
+from flasher.station.records.capability import Capability, capabilities
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError
 from flasher.station.records.filters import JUDGED, counting, filtered
@@ -142,6 +143,11 @@ class Records:
             duration_median_s=statistics.median(ended.durations_s) if ended.durations_s else None,
             duration_longest_s=max(ended.durations_s, default=None),
         )
+
+    def capabilities(self, chosen: RunFilter = _EVERYTHING) -> list[Capability]:
+        """The measurements with limits of the runs of a filter."""
+        with self._database.reading() as connection:
+            return capabilities(connection, chosen)
 
     def stations(self) -> tuple[str, ...]:
         with self._database.reading() as connection:

@@ -1,0 +1,251 @@
+"""Checks of each station of a plant: refused records, silence, backlog, yield, codes, clock, disk.
+
+A check that cannot be judged is neither an alert nor in order. What a station reported itself is
+known only while it reports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, time, timedelta
+from enum import StrEnum
+from typing import Final
+
+from sqlalchemy import Connection
+
+from flasher.i18n import text
+from flasher.plant.activity import Activity, activities
+from flasher.plant.stations import StationStatus, statuses
+from flasher.protocol.text import printable
+from flasher.station.health import LITTLE_BYTES
+from flasher.station.records.model import RunState, utc_moment
+from flasher.validation import json_keys
+
+
+class CheckKind(StrEnum):
+    """What is checked."""
+
+    REFUSED = "refused"
+    """The database refuses the station's audit trail."""
+    SILENT = "silent"
+    """The station has not reported."""
+    UNSENT = "unsent"
+    """Records wait at the station."""
+    YIELD = "yield"
+    """Units of the current shift that passed in their last run."""
+    REPEATED = "repeated"
+    """The last runs of a socket ended with the same code, and not with a PASS."""
+    CLOCK = "clock"
+    """The station's clock differs from the database's."""
+    DISK = "disk"
+    """Free disk space of the station."""
+
+
+class CheckState(StrEnum):
+    """Result of a check."""
+
+    OK = "ok"
+    UNKNOWN = "unknown"
+    """It cannot be judged: no report, or too few runs."""
+    ALERT = "alert"
+
+
+@dataclass(frozen=True)
+class StationCheck:
+    """A check of a station."""
+
+    kind: CheckKind
+    state: CheckState
+    text: str
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds beyond which a check is an alert."""
+
+    yield_min: float = 0.9
+    """Share of units, from 0 to 1."""
+    units_min: int = 20
+    """Fewer units of the shift do not judge its yield."""
+    silent_s: float = 300.0
+    repeats: int = 5
+    """Runs of a socket, one after the other, with the same code."""
+    repeats_within_s: float = 86_400.0
+    """Older runs are not counted."""
+    unsent_s: float = 3600.0
+    """Age of the oldest record that waits."""
+    clock_s: float = 5.0
+    disk_bytes: int = LITTLE_BYTES
+
+
+@json_keys("status activity checks state")
+@dataclass(frozen=True)
+class StationOverview:
+    """A station with its runs and checks."""
+
+    status: StationStatus
+    activity: Activity
+    checks: tuple[StationCheck, ...]
+
+    @property
+    def state(self) -> CheckState:
+        """The worst one of its checks."""
+        return max((each.state for each in self.checks), key=_ORDER.index, default=CheckState.OK)
+
+
+USUAL_BOUNDS: Final = Bounds()
+_ORDER: Final = (CheckState.OK, CheckState.UNKNOWN, CheckState.ALERT)
+
+
+def overviews(
+    connection: Connection, bounds: Bounds, shifts: Sequence[time], now: datetime
+) -> list[StationOverview]:
+    """All stations, by name. `now` gives the time zone of day and shift."""
+    found = activities(connection, shifts, now, bounds.repeats)
+    return [
+        judge(status, found.get(status.station, Activity()), bounds)
+        for status in statuses(connection)
+    ]
+
+
+def judge(status: StationStatus, activity: Activity, bounds: Bounds) -> StationOverview:
+    """Check a station."""
+    checks = (
+        _refused(status),
+        _silent(status, bounds),
+        _unsent(status, bounds),
+        _yield(activity, bounds),
+        _repeated(status.now, activity, bounds),
+        _clock(status, bounds),
+        _disk(status, bounds),
+    )
+    return StationOverview(status, activity, checks)
+
+
+def _check(kind: CheckKind, sentence: str, *, is_alert: bool) -> StationCheck:
+    return StationCheck(kind, CheckState.ALERT if is_alert else CheckState.OK, sentence)
+
+
+def _unknown(kind: CheckKind, sentence: str) -> StationCheck:
+    return StationCheck(kind, CheckState.UNKNOWN, sentence)
+
+
+def _refused(status: StationStatus) -> StationCheck:
+    kind = CheckKind.REFUSED
+    if status.refusal:
+        reason = printable(status.refusal)
+        return _check(kind, text("its records are refused: {reason}", reason=reason), is_alert=True)
+    if status.reported_at is None:
+        return _unknown(kind, text("has never connected"))
+    return _check(kind, text("its records are accepted"), is_alert=False)
+
+
+def _silent(status: StationStatus, bounds: Bounds) -> StationCheck:
+    kind = CheckKind.SILENT
+    if status.silent_s is None:
+        return _unknown(kind, text("has never connected"))
+    seconds = status.silent_s
+    if seconds > bounds.silent_s:
+        sentence = text("silent for {duration}", duration=lasting(seconds))
+        return _check(kind, sentence, is_alert=True)
+    sentence = text("reported {duration} ago", duration=lasting(seconds))
+    return _check(kind, sentence, is_alert=False)
+
+
+def _is_stale(status: StationStatus, bounds: Bounds) -> bool:
+    return status.silent_s is None or status.silent_s > bounds.silent_s
+
+
+def _unsent(status: StationStatus, bounds: Bounds) -> StationCheck:
+    kind = CheckKind.UNSENT
+    if status.unsent and status.oldest_unsent_at:
+        # By the station's clock, as the time of the record.
+        here = status.now + timedelta(seconds=status.clock_offset_s or 0.0)
+        age_s = (here - utc_moment(status.oldest_unsent_at)).total_seconds()
+        sentence = text(
+            "{count} rows wait, the oldest for {duration}",
+            count=status.unsent,
+            duration=lasting(max(age_s, 0.0)),
+        )
+        if age_s > bounds.unsent_s:
+            return _check(kind, sentence, is_alert=True)
+        if not _is_stale(status, bounds):
+            return _check(kind, sentence, is_alert=False)
+    if _is_stale(status, bounds) or status.unsent is None:
+        return _unknown(kind, text("not known while it is silent"))
+    return _check(kind, text("everything is sent"), is_alert=False)
+
+
+def _yield(activity: Activity, bounds: Bounds) -> StationCheck:
+    kind, shift = CheckKind.YIELD, activity.shift
+    if shift.units < bounds.units_min or shift.share is None:
+        sentence = text(
+            "too few units in this shift: {count} of {least}",
+            count=shift.units,
+            least=bounds.units_min,
+        )
+        return _unknown(kind, sentence)
+    sentence = text(
+        "{passed} of {units} units of this shift passed", passed=shift.passed, units=shift.units
+    )
+    return _check(kind, sentence, is_alert=shift.share < bounds.yield_min)
+
+
+def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> StationCheck:
+    """The worst socket."""
+    kind = CheckKind.REPEATED
+    since = now - timedelta(seconds=bounds.repeats_within_s)
+    found = []
+    has_enough = False
+    for socket in activity.sockets:
+        last = [run for run in socket.runs if run.begun_at >= since][: bounds.repeats]
+        if len(last) < bounds.repeats:
+            continue
+        has_enough = True
+        codes = {run.code for run in last if run.state is not RunState.PASS}
+        if len(codes) == 1 and all(run.state is not RunState.PASS for run in last):
+            found.append(f"{socket.name} {codes.pop()}")
+    if found:
+        sentence = text(
+            "the last {count} runs ended alike: {sockets}",
+            count=bounds.repeats,
+            sockets=printable(", ".join(found)),
+        )
+        return _check(kind, sentence, is_alert=True)
+    if not has_enough:
+        sentence = text("no socket has {count} recent runs", count=bounds.repeats)
+        return _unknown(kind, sentence)
+    return _check(kind, text("no code repeats"), is_alert=False)
+
+
+def _clock(status: StationStatus, bounds: Bounds) -> StationCheck:
+    kind = CheckKind.CLOCK
+    if status.clock_offset_s is None or _is_stale(status, bounds):
+        return _unknown(kind, text("not known while it is silent"))
+    sentence = text("its clock differs by {seconds:+.1f} s", seconds=status.clock_offset_s)
+    return _check(kind, sentence, is_alert=abs(status.clock_offset_s) > bounds.clock_s)
+
+
+def _disk(status: StationStatus, bounds: Bounds) -> StationCheck:
+    kind = CheckKind.DISK
+    if status.disk_free_bytes is None or _is_stale(status, bounds):
+        return _unknown(kind, text("not known while it is silent"))
+    sentence = text("{size:.1f} GiB free", size=status.disk_free_bytes / 1024**3)
+    return _check(kind, sentence, is_alert=status.disk_free_bytes < bounds.disk_bytes)
+
+
+def lasting(seconds: float) -> str:
+    """A duration in its largest unit."""
+    for limit, size, name in ((120, 1, "s"), (7200, 60, "min"), (172_800, 3600, "h")):
+        if seconds < limit:
+            return f"{seconds / size:.0f} {name}"
+    return f"{seconds / 86_400:.0f} d"
+
+
+def alerts(stations: Iterable[StationOverview]) -> Iterator[tuple[str, StationCheck]]:
+    """All alerts, with the names of their stations."""
+    for each in stations:
+        for check in each.checks:
+            if check.state is CheckState.ALERT:
+                yield each.status.station, check
