@@ -37,7 +37,12 @@ _SETTINGS = [
 ]
 
 
-def texts() -> Iterator[tuple[str, str]]:
+@pytest.fixture(scope="module")
+def texts() -> list[tuple[str, str]]:
+    return list(_texts())
+
+
+def _texts() -> Iterator[tuple[str, str]]:
     """Every passage that somebody may follow, with the place where it is."""
     for page in [*pages(), ROOT / "flasher" / "error_codes.md"]:
         for block in _FENCE.findall(page.read_text(encoding="utf-8")):
@@ -63,8 +68,8 @@ def faults(text: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_no_passage_leads_a_sample_to_an_adapter() -> None:
-    found = {place: wrong for place, text in texts() if (wrong := faults(text))}
+def test_no_passage_leads_a_sample_to_an_adapter(texts: list[tuple[str, str]]) -> None:
+    found = {place: wrong for place, text in texts if (wrong := faults(text))}
     assert found == {}
 
 
@@ -97,7 +102,7 @@ def test_others_are_let_through(text: str) -> None:
 
 
 @pytest.mark.slow
-def test_every_page_and_every_help_text_is_looked_at() -> None:
-    seen = {place.partition(":")[0] for place, _ in texts()}
+def test_every_page_and_every_help_text_is_looked_at(texts: list[tuple[str, str]]) -> None:
+    seen = {place.partition(":")[0] for place, _ in texts}
     assert {"README.md", "docs/index.md", "flasher/cli/main.py", "docs/tutorials/bike.md"} <= seen
     assert Path("flasher/__init__.py").as_posix() in seen
