@@ -84,7 +84,12 @@ class Central:
     """The plant's database. Each method raises RecordError, ChainRefusedError."""
 
     def __init__(
-        self, url: str, *, database: str | None = None, statement_limit_s: float | None = None
+        self,
+        url: str,
+        *,
+        database: str | None = None,
+        statement_limit_s: float | None = None,
+        lock_timeout_s: float = LOCK_TIMEOUT_S,
     ) -> None:
         self.location = plant_location(url)
         try:
@@ -99,7 +104,7 @@ class Central:
         address = (
             self.location.url if database is None else self.location.url.set(database=database)
         )
-        self._engine = make_engine(address, LOCK_TIMEOUT_S, statement_limit_s)
+        self._engine = make_engine(address, lock_timeout_s, statement_limit_s)
 
     @property
     def shown(self) -> str:

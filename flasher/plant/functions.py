@@ -18,10 +18,10 @@ REFUSED: Final = "FL001"
 
 _OWN: Final = ", ".join(f"'{name}'" for name in OWN_PARTS)
 _SHARED: Final = ", ".join(f"'{name}'" for name in SHARED_PARTS)
-_DEFINER: Final = "SECURITY DEFINER SET search_path = public, pg_temp"
+DEFINER: Final = "SECURITY DEFINER SET search_path = public, pg_temp"
 
 _MY_STATION: Final = f"""
-CREATE OR REPLACE FUNCTION plant_my_station() RETURNS uuid LANGUAGE sql STABLE {_DEFINER} AS $$
+CREATE OR REPLACE FUNCTION plant_my_station() RETURNS uuid LANGUAGE sql STABLE {DEFINER} AS $$
     SELECT station FROM plant_station WHERE role = session_user
 $$
 """
@@ -30,7 +30,7 @@ _ENTER: Final = f"""
 CREATE OR REPLACE FUNCTION plant_enter(
     of_records text, called text,
     OUT station uuid, OUT head_number bigint, OUT head_hash text, OUT now timestamptz
-) LANGUAGE plpgsql {_DEFINER} AS $$
+) LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     mine plant_station;
     wanted uuid := left(encode(sha256(convert_to(of_records || ' ' || called, 'UTF8')), 'hex'), 32);
@@ -60,7 +60,7 @@ _REPORT: Final = f"""
 CREATE OR REPLACE FUNCTION plant_report(
     reporting text, is_unsent bigint, oldest text, offset_s double precision, free_bytes bigint,
     refused text
-) RETURNS void LANGUAGE sql {_DEFINER} AS $$
+) RETURNS void LANGUAGE sql {DEFINER} AS $$
     UPDATE plant_station SET reported_at = clock_timestamp(), version = left(reporting, 100),
         unsent = is_unsent, oldest_unsent_at = left(oldest, 27), clock_offset_s = offset_s,
         disk_free_bytes = free_bytes, refusal = left(refused, 1000)
@@ -70,7 +70,7 @@ $$
 
 _NAMED: Final = f"""
 CREATE OR REPLACE FUNCTION plant_named(in_table text, names text[], key jsonb) RETURNS bigint
-LANGUAGE plpgsql {_DEFINER} AS $$
+LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     found bigint;
     columns text := (SELECT string_agg(quote_ident(n), ', ') FROM unnest(names) n);
@@ -93,7 +93,7 @@ END $$
 
 _ADD_RUN: Final = f"""
 CREATE OR REPLACE FUNCTION plant_add_run(own jsonb, shared jsonb) RETURNS bigint
-LANGUAGE plpgsql {_DEFINER} AS $$
+LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     r run := jsonb_populate_record(NULL::run, own->'run');
     images bigint[];
@@ -169,7 +169,7 @@ END $$
 """Adds a run to the tables of the station's schema; returns its id there."""
 
 _BRING: Final = f"""
-CREATE OR REPLACE FUNCTION plant_bring() RETURNS trigger LANGUAGE plpgsql {_DEFINER} AS $$
+CREATE OR REPLACE FUNCTION plant_bring() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     mine plant_station;
     head chain_row;

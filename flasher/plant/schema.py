@@ -12,6 +12,7 @@ from typing import Final
 
 from sqlalchemy import (
     BigInteger,
+    Boolean,
     CheckConstraint,
     Column,
     DateTime,
@@ -30,7 +31,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "1"
+PLANT_SCHEMA: Final = "2"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -108,6 +109,40 @@ trace: Final = Table(
     CheckConstraint("sha256 = encode(sha256(data), 'hex')", name="trace_is_whole"),
 )
 """Attachments of runs, once each."""
+
+plant_claim: Final = Table(
+    "plant_claim",
+    metadata,
+    Column("token", Text, primary_key=True),
+    Column("station", Uuid, nullable=False),
+    Column("part", Text, nullable=False),
+    Column("serial", Text, nullable=False),
+    Column("socket", Text, nullable=False),
+    Column("claimed_at", DateTime(timezone=True), nullable=False),
+    Column("expires_at", DateTime(timezone=True), nullable=False),
+    Index("claim_of_unit", "part", "serial"),
+    Index("claim_of_station", "station", "expires_at"),
+)
+"""Claims of units by stations whose run has not arrived (`claim_functions`)."""
+
+plant_pass: Final = Table(
+    "plant_pass",
+    metadata,
+    Column("unit_id", BigInteger, nullable=False),
+    Column("is_virtual", Boolean, nullable=False),
+    Column("run_id", BigInteger, nullable=False),
+    Column("station", Uuid, nullable=False),
+    PrimaryKeyConstraint("unit_id", "is_virtual"),
+)
+"""The first PASS of a unit that arrived. Its key lets two that arrive together meet."""
+
+plant_duplicate: Final = Table(
+    "plant_duplicate",
+    metadata,
+    Column("run_id", BigInteger, primary_key=True, autoincrement=False),
+    Column("first_run_id", BigInteger, nullable=False),
+)
+"""A PASS of a unit of which another station's PASS had arrived."""
 
 OWN_PARTS: Final = (
     "run", "unit", "targets", "steps", "measurements", "writes", "attachments",

@@ -1,13 +1,16 @@
+# ruff: noqa: S608  all of this SQL is written here
 """Opens a plant's database with the code of a station's records, for reports and pages."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Final, NoReturn
 
 from platformdirs import user_cache_path
-from sqlalchemy import select
+from sqlalchemy import Connection, select, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import plant_location
@@ -17,7 +20,15 @@ from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import RunExamination, RunId, StationClock
+from flasher.station.records.model import (
+    DUPLICATES,
+    PassedRun,
+    PassedTwice,
+    RunExamination,
+    RunId,
+    StationClock,
+    StepName,
+)
 from flasher.station.records.queries import Records
 from flasher.station.records.store import Store
 
@@ -29,6 +40,42 @@ def cache_folder(url: str) -> Path:
     shown = plant_location(url).shown
     mark = hashlib.sha256(shown.encode()).hexdigest()[:12]
     return user_cache_path("flasher", appauthor=False) / f"plant-{mark}"
+
+
+_ONE: Final = """
+    {of}.id AS {of}_run_id, {of}_station.name AS {of}_station, {of}_socket.name AS {of}_socket,
+    {of}.begun_at AS {of}_begun_at, (SELECT m.text FROM step s JOIN measurement m
+        ON m.step_id = s.id WHERE s.run_id = {of}.id AND s.position = 1 AND s.name = '{step}'
+        AND m.name = '{measured}') AS {of}_duplicates
+"""
+_OF: Final = """
+    JOIN run {of} ON {of}.id = d.{key} JOIN socket {of}_socket ON {of}_socket.id = {of}.socket_id
+    JOIN station {of}_station ON {of}_station.id = {of}_socket.station_id
+"""
+_NAMES: Final = {"step": StepName.PLANT.value, "measured": DUPLICATES}
+_TWICE: Final = text(
+    f"SELECT unit.serial, unit.part, second.is_virtual, {_ONE.format(of='first', **_NAMES)},"
+    f" {_ONE.format(of='second', **_NAMES)} FROM plant_duplicate d"
+    f" {_OF.format(of='first', key='first_run_id')} {_OF.format(of='second', key='run_id')}"
+    " JOIN unit ON unit.id = second.unit_id ORDER BY d.run_id DESC LIMIT :limit"
+)
+
+
+def passed_twice(connection: Connection, limit: int) -> list[PassedTwice]:
+    """The newest units that passed at two stations."""
+    rows = connection.execute(_TWICE, {"limit": limit}).mappings()
+    return [
+        PassedTwice(
+            row["serial"],
+            row["part"],
+            row["is_virtual"],
+            *(
+                PassedRun(*(row[f"{of}_{key.name}"] for key in fields(PassedRun)))
+                for of in ("first", "second")
+            ),
+        )
+        for row in rows
+    ]
 
 
 class PlantFiles(FileStore):
@@ -80,6 +127,11 @@ class PlantStore(Store):
         database.location.folder.mkdir(parents=True, exist_ok=True)
         self.files = PlantFiles(database)
         self.read = PlantRecords(database)
+
+    def passed_twice(self, limit: int) -> Sequence[PassedTwice]:
+        """The newest units that passed at two stations. Raises RecordError."""
+        with self.database.reading() as connection:
+            return passed_twice(connection, limit)
 
     def examine_run(self, run_id: RunId) -> RunExamination:
         _refuse_certificate()

@@ -39,6 +39,7 @@ from flasher.station.scans import Word
 from flasher.station.socket import PAGE, source_words
 
 STEPS: Final = {
+    StepName.PLANT: text("plant"),
     StepName.CONNECT: text("connect"),
     StepName.IDENTIFY: text("identify"),
     StepName.CHECK: text("check"),

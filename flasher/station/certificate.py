@@ -129,7 +129,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
     if last is None:
         raise UsageError(text("{serial} has no run to certify.", serial=life.serial))
     status, word, sentence = UNIT_WORDS[life.state]
-    if life.is_virtual:
+    if life.is_virtual or last.run.is_unchecked:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
     signatures = {target.signature for target in last.targets}

@@ -25,12 +25,13 @@ from collections import Counter
 from datetime import time
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
+from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator, model_validator
 
 from flasher.errors import UsageError
 from flasher.settings.toml_reader import Reader, TomlTable
-from flasher.station.recipe import ShortText
+from flasher.station.recipe import ShortText, Unchecked
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 
@@ -38,6 +39,7 @@ SOCKETS_MAX: Final = 64
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NOT_FOR_BUS: Final = frozenset({"interface", "channel", "serial_number", "usb_path"})
 _PRINTER: Final = re.compile(r"file:.+|tcp://(?:\[[0-9A-Fa-f:.]+\]|[^:/\s\[\]]+):[1-9][0-9]{0,4}")
+_NOT_IN_URL: Final = frozenset(map(chr, (*range(33), 127)))
 Share = Annotated[float, Field(ge=0, le=1)]
 BusValue = bool | int | float | str
 
@@ -162,6 +164,36 @@ class LabelConfig(TomlTable):
         return self
 
 
+class QuestionConfig(TomlTable):
+    """A system of the plant that is asked by HTTP before each unit whether it may be here. It
+    replies with JSON: {"answer": "yes" or "no", "reason": "..."}.
+    """
+
+    url: str
+    """Its address, such as "https://mes.plant/may-begin"."""
+    method: Literal["POST", "GET"] = "POST"
+    """POST sends the facts as JSON, GET in the address."""
+    time_limit_s: float = Field(default=3.0, gt=0, le=30)
+    """Time limit for the answer."""
+    silence: Unchecked = Unchecked.BLOCK
+    """A unit about which no answer came: block refuses it; allow begins, and records it."""
+    certificates: str = ""
+    """File (PEM) with the certificate of the server's issuer; empty: those of this computer."""
+
+    @field_validator("url")
+    @classmethod
+    def _check_url(cls, value: str) -> str:
+        parts = urlsplit(value)
+        is_known = parts.scheme in ("http", "https") and parts.hostname and "@" not in parts.netloc
+        if not is_known or parts.fragment or not value.isascii() or set(value) & _NOT_IN_URL:
+            raise ValueError(f"{value!a:.60} is not http://HOST/PATH or https://HOST/PATH")
+        try:
+            _ = parts.port
+        except ValueError:
+            raise ValueError(f"the port in {value!a:.60} is not a number up to 65535") from None
+        return value
+
+
 class StationConfig(TomlTable):
     """The station file. Relative paths start at its folder."""
 
@@ -188,6 +220,7 @@ class StationConfig(TomlTable):
     sound_volume: float = Field(default=0.3, ge=0, le=1)
     """Volume of the operator page's sounds, from 0 (silent) to 1."""
     label: LabelConfig | None = None
+    question: QuestionConfig | None = None
     scanner: tuple[ScannerConfig, ...] = Field(default=(), max_length=SOCKETS_MAX)
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
@@ -253,7 +286,12 @@ def load_config(path: Path) -> StationConfig:
         if label.printer.startswith("file:"):
             places["printer"] = f"file:{here / label.printer.removeprefix('file:')}"
         label = label.model_copy(update=places)
-    return config.model_copy(update={**changes, "heads": heads, "label": label})
+    question = config.question
+    if question is not None and question.certificates:
+        file = str(here / question.certificates)
+        question = question.model_copy(update={"certificates": file})
+    changed = {**changes, "heads": heads, "label": label, "question": question}
+    return config.model_copy(update=changed)
 
 
 def mock_config(

@@ -44,7 +44,7 @@ class HealthWatch:
         utc: Callable[[], datetime],
         monotonic_s: Callable[[], float],
         unkept: Callable[[], Collection[str]] = tuple,
-        plant: Callable[[], HealthCheck] | None = None,
+        plant: Callable[[], Collection[HealthCheck]] = tuple,
     ) -> None:
         self._plant = plant
         self._unkept = unkept
@@ -59,8 +59,8 @@ class HealthWatch:
         """Run all checks."""
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
-            plant = () if self._plant is None else (self._plant(),)
-            self._looked_at, self._seen = now, (*plant, self._disk(), self._clock())
+            self._looked_at = now
+            self._seen = (*self._plant(), self._disk(), self._clock())
         sentence = board.records_fault or text("every run is saved")
         checks = [HealthCheck(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:

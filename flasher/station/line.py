@@ -37,7 +37,7 @@ from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged,
 from flasher.station.operators import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
-from flasher.station.records.model import AuditEvent, Order, RunState
+from flasher.station.records.model import Admission, AuditEvent, Order, RunState
 from flasher.station.scans import (
     Label,
     NotUnderstood,
@@ -174,7 +174,31 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = Order | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
+@dataclass(frozen=True)
+class AskPlant:
+    """Ask the plant about the unit of an order; then call `Line.answered`."""
+
+    order: Order
+
+
+@dataclass(frozen=True)
+class DropAdmission:
+    """No run begins with this answer of the plant."""
+
+    admission: Admission
+
+
+Effect = (
+    Order
+    | AskPlant
+    | DropAdmission
+    | SaveAgain
+    | AbortRun
+    | CheckPin
+    | Reprint
+    | Audit
+    | StationEvent
+)
 """An `Order` is claimed, and the result fed back; a `StationEvent` is published."""
 
 
@@ -190,6 +214,7 @@ class Line:
 
     `arrival_limit_s`: time that a label with a scanned socket waits for its unit; then the run
     starts and reports the fault. `crew`: people with badges; None: names are not checked.
+    `asks_plant`: a plant is asked before each run.
     """
 
     def __init__(
@@ -202,7 +227,9 @@ class Line:
         arrival_limit_s: float = ARRIVAL_LIMIT_S,
         scans_labels: bool = False,
         crew: Crew | None = None,
+        asks_plant: bool = False,
     ) -> None:
+        self._asks_plant = asks_plant
         self.sockets = {socket.name: socket for socket in sockets}
         self.operator = operator
         self.lot = lot
@@ -836,19 +863,52 @@ class Line:
             came_at_s = max(socket.bound_at_s, socket.arrived_at_s)
             if socket.label and socket.is_unidentified and now >= came_at_s + IDENTIFY_S:
                 self._drop_unidentified(socket)
-            if self.stopped is None and not self.is_closing and socket.is_due(now):
-                serial, socket.label, socket.begin_at_s = socket.label, "", None
-                socket.phase, socket.serial = SocketPhase.CLAIM, serial
-                reason = self._reasons.get(serial, "")
-                whose, lot = self.operator, self.lot
-                order = Order(serial, socket.name, whose, lot, reason, socket.is_virtual)
-                self._effects.append(order)
+            if not self._may_begin(socket, now) or socket.asked:
+                continue
+            if self._asks_plant:
+                # Until the answer the label waits as before, and is dropped with its unit.
+                socket.asked = socket.label
+                self._effects.append(AskPlant(self._order(socket)))
+            else:
+                self._begin(socket, None)
         for socket in self.sockets.values():
             shown = socket.view(self.stopped, is_only=len(self.sockets) == 1)
             if socket.shown != shown and socket.phase is not SocketPhase.CLAIM:
                 socket.shown = shown
                 state, serial, text = shown
                 self._emit(SocketChanged(socket.name, state, serial, text))
+
+    def _may_begin(self, socket: Socket, now: float) -> bool:
+        return self.stopped is None and not self.is_closing and socket.is_due(now)
+
+    def _order(self, socket: Socket, admission: Admission | None = None) -> Order:
+        serial = socket.label
+        return Order(
+            serial,
+            socket.name,
+            self.operator,
+            self.lot,
+            self._reasons.get(serial, ""),
+            socket.is_virtual,
+            admission,
+        )
+
+    def _begin(self, socket: Socket, admission: Admission | None) -> None:
+        """Claim the unit of a socket's label."""
+        order = self._order(socket, admission)
+        socket.label, socket.begin_at_s = "", None
+        socket.phase, socket.serial = SocketPhase.CLAIM, order.serial
+        self._effects.append(order)
+
+    def answered(self, order: Order, admission: Admission, now: float) -> None:
+        """Process the result of `AskPlant`. It counts if the unit and its label are still there."""
+        socket = self.sockets[order.socket]
+        asked, socket.asked = socket.asked, ""
+        if asked == socket.label and self._may_begin(socket, now):
+            self._begin(socket, admission)
+        else:
+            self._effects.append(DropAdmission(admission))
+        self._go_on(now)
 
     def _bind(self, socket: Socket, serial: str, why: Binding, now: float, source: Source) -> None:
         """Assign a label to the unit in this socket, or to the next one."""

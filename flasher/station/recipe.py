@@ -230,6 +230,36 @@ class AfterRestart(StrEnum):
     CONTINUE = "continue"
 
 
+class Unchecked(StrEnum):
+    """Handling of a unit of which something is not known."""
+
+    ALLOW = "allow"
+    BLOCK = "block"
+
+
+class ClockRule(StrEnum):
+    """Handling of a clock that differs from that of the plant's database."""
+
+    REPORT = "report"
+    STOP = "stop"
+
+
+class PlantRule(TomlTable):
+    """Rules for what a plant's database answers before a run (`plant` of the station file)."""
+
+    unchecked: Unchecked = Unchecked.ALLOW
+    """A unit that may have passed at another station, as the database does not answer, or that
+    station has not sent the end of its run: allow marks the run "duplicates not checked"."""
+    time_limit_s: float = Field(default=3.0, gt=0, le=30)
+    """Time limit for the answer of the database."""
+    clock: ClockRule = ClockRule.REPORT
+    """A clock that differs too much: report shows it; stop refuses units as well."""
+    clock_offset_max_s: float = Field(default=5.0, gt=0, le=3600)
+    """Largest accepted difference between the station's clock and that of the database."""
+    clock_unknown: Unchecked = Unchecked.BLOCK
+    """With clock = "stop": a unit while the difference is not known."""
+
+
 class Golden(TomlTable):
     """Known good units that test the sockets at intervals. Figures exclude their runs."""
 
@@ -275,12 +305,15 @@ class Recipe(TomlTable):
     """Handling of a unit that restarts by itself in a run, which may have been exchanged.
     "continue" is for sockets that hold the unit until the run has ended; it is recorded."""
     golden: Golden | None = None
+    plant: PlantRule = PlantRule()
     allow_completed_not_read_back: bool = True
     """Let a target without a version query pass; it is recorded."""
 
     @model_validator(mode="after")
     def _check_targets(self) -> Recipe:
         check_named_once(self.target)
+        if StepName.PLANT in self.step:
+            raise ValueError("[step.plant] has no effect: its time limit is plant.time_limit_s")
         names = [firmware.target for firmware in self.target]
         for key in ("write", "unchanged", "limit"):
             for part in getattr(self, key):

@@ -21,6 +21,7 @@ from flasher.station.records.model import (
     PRODUCT,
     TORN_TRACE,
     TRACE,
+    Admission,
     AttachmentFile,
     Claim,
     RunDetails,
@@ -34,6 +35,9 @@ from flasher.station.records.model import (
 from flasher.station.records.store import Store
 from flasher.station.unit_checks import BEFORE
 
+NOT_CHECKED: Final = "duplicates not checked"
+"""End of the text of a PASS of a unit that may have passed at another station."""
+
 
 @dataclass
 class ActiveRun:
@@ -41,6 +45,7 @@ class ActiveRun:
 
     claim: Claim
     begun_s: float
+    admission: Admission | None = None
     where: str = StepName.CONNECT.value
     """Active step, with its target."""
     journal_error: str = ""
@@ -105,8 +110,14 @@ def _ending(run: ActiveRun, result: RunResult) -> RunEnd:
     log = next((file.sha256 for file in run.attached if file.kind == TRACE), None)
     text = " ".join(filter(None, (sentence(result.text), code.action)))
     if result.outcome is RunState.PASS:
-        text = verified_words(result)
+        text = passed_words(result, run.claim)
     return RunEnd(result.outcome, code.name, text, result.verified, log, tuple(run.attached))
+
+
+def passed_words(result: RunResult, claim: Claim) -> str:
+    """Text of a PASS: what was verified, and what was not checked."""
+    words = verified_words(result)
+    return f"{words}; {NOT_CHECKED}" if claim.unchecked else words
 
 
 def sentence(text: str) -> str:

@@ -149,6 +149,7 @@ def plain(run: RunRecord) -> dict[str, Any]:
         if isinstance(value, datetime)
         else value
         for name, value in asdict(run).items()
+        if name != "duplicates" or value is not None  # as in certificates of older versions
     }
 
 

@@ -139,6 +139,8 @@ class Socket:
     last: LastRun | None = None
     is_last_there: bool = False
     """The unit of the last run may still be there: no frame suggests another one."""
+    asked: str = ""
+    """Label about which the plant is asked; its answer is outstanding."""
     is_chosen: bool = False
     """The card of the socket was scanned, and the label must follow."""
     interrupted: str = ""
@@ -358,6 +360,8 @@ class Socket:
             return state, self.label, self.out_of_service or (self.wanted if self.label else "")
         if stopped is not None:
             return SocketState.STOPPED, "", stopped.reason
+        if self.label and self.label == self.asked:
+            return SocketState.STARTING, self.label, text("The plant is asked about this unit.")
         if self.label:
             own = printable(self.own or "")
             wanted = self.wanted

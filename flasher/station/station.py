@@ -41,6 +41,7 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
+from flasher.station.gate import Gate
 from flasher.station.label_printer import LabelJob, LabelPrinter
 from flasher.station.label_template import values_of
 from flasher.station.line import ARRIVAL_LIMIT_S, Line
@@ -75,7 +76,7 @@ from flasher.station.records.model import (
     WriteId,
 )
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.runs import ActiveRun, save, verified_words, with_history
+from flasher.station.runs import ActiveRun, passed_words, save, with_history
 from flasher.station.scans import Refused
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
@@ -124,6 +125,7 @@ class Station:
         clock: StationClock | None = None,
         launch: Launch = ProcessPort,
         checker: Executor | None = None,
+        gate: Gate | None = None,
     ) -> None:
         self.store = store
         self.recipe = recipe
@@ -140,7 +142,10 @@ class Station:
             arrival_limit_s=self.options.arrival_limit_s,
             scans_labels=self.options.scans_labels,
             crew=crew,
+            asks_plant=gate is not None,
         )
+        self._gate = gate or Gate(recipe.recipe, None, None, self.clock.monotonic_s)
+        self._gate.wake = self._wake
         self._has_badges = crew is not None
         self._labels = labels
         self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
@@ -258,6 +263,7 @@ class Station:
             self.emit(self._published.popleft())
         self._write_notes()
         self._take_scans()
+        self._take_answers()
         if self._is_aborting:
             self._abort_running()
         self.line.tick(self._now)
@@ -275,6 +281,12 @@ class Station:
                 self.line.scan(text, self._now, source)
             self._carry_out()
 
+    def _take_answers(self) -> None:
+        """Pass answers of the plant to the line."""
+        for order, admission in self._gate.take():
+            self.line.answered(order, admission, self._now)
+            self._carry_out()
+
     def close(self) -> None:
         """End all processes. Active runs are aborted, and saved if they report their end in time;
         the next start finds the others.
@@ -288,6 +300,7 @@ class Station:
         while self.is_running and self._now < give_up_at:
             self.turn(TURN_S)
         self.supervisor.close()
+        self._gate.close()
         if self._labels is not None:
             self._labels.close()
             self._publish_labels()
@@ -335,6 +348,10 @@ class Station:
                         self.line.feed(socket, claimed, self._now)
                         if isinstance(claimed, RunStarted):
                             self._begin(claimed)
+                    case line.AskPlant(order):
+                        self._gate.ask(order)
+                    case line.DropAdmission(admission):
+                        self._gate.dropped(admission)
                     case line.AbortRun(socket):
                         self.supervisor.send(socket, Abort())
                     case line.SaveAgain(sockets):
@@ -423,15 +440,17 @@ class Station:
             lives = self.store.read.units(order.serial)
             claim = self.store.claim(order, self.recipe)
         except ClaimRefusedError as error:
+            self._gate.dropped(order.admission)
             stops_line = error.refusal in (Refusal.RECIPE_CHANGED, Refusal.RECIPE_NOT_TRUSTED)
             return line.NotClaimed(error.refusal.value, error.what, error.remedy, stops_line)
         except RecordError as error:
+            self._gate.ended(order.admission)  # whether a run began is not known
             return self._not_saved(socket, order.serial, None, error)
         claim = with_history(claim, lives, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
         at = self.line.sockets[socket]
         claim = replace(claim, trace=trace, presence=at.presence_number, has_card=at.has_card)
-        self._runs[socket] = ActiveRun(claim, self._now)
+        self._runs[socket] = ActiveRun(claim, self._now, order.admission)
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
@@ -443,6 +462,10 @@ class Station:
         """Send the claimed run to the process of its socket."""
         self.emit(started)
         socket = started.socket
+        admission = self._runs[socket].admission
+        if admission is not None and (answer := admission.answer) and answer.text != "yes":
+            words = text("The plant: {answer}.", answer=printable(answer.text))
+            self.emit(OperatorPrompted("", words))
         if not self.supervisor.send(socket, self._runs[socket].claim):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
@@ -523,8 +546,11 @@ class Station:
             self.line.feed(socket, not_saved, self._now)
             return False
         del self._runs[socket]
+        self._gate.ended(run.admission)
         code = CODES[result.code]
-        text = verified_words(result) if result.outcome is RunState.PASS else result.text
+        is_pass = result.outcome is RunState.PASS
+        text = passed_words(result, claim) if is_pass else result.text
+        action = _RECHECK if is_pass and claim.unchecked else code.action
         ended = RunEnded(
             socket,
             claim.serial,
@@ -533,7 +559,7 @@ class Station:
             result.outcome,
             code.name,
             text,
-            code.action,
+            action,
             max(result.duration_s, run.ended_s - run.begun_s),
             tuple(result.verified.items()),
             self.line.sockets[socket].is_virtual,
@@ -544,7 +570,7 @@ class Station:
             self.line.stop(code.name, text, code.action)
         with suppress(RecordError):
             self.emit(FiguresChanged(self.figures))
-        if result.outcome is RunState.PASS:
+        if is_pass:
             self._print(socket, claim)
         return True
 
@@ -605,6 +631,7 @@ class Station:
         return line.NotSaved(error.what, error.remedy)
 
 
+_RECHECK: Final = text("Put it aside: it was not checked whether it has passed at another station.")
 _NOT_PASSED: Final = Refused(
     "NOT_PASSED", text("The unit has not passed."), text("Only a passed unit gets a label.")
 )

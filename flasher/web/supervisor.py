@@ -21,6 +21,7 @@ from urllib.parse import urlencode
 
 from flasher.errors import FlasherError, UsageError
 from flasher.i18n import text
+from flasher.report.base import Status
 from flasher.report.chart import WIDTHS, histogram
 from flasher.report.explain_page import status_of, story_context
 from flasher.station import codes
@@ -97,6 +98,8 @@ BY_WORDS: Final = {
     By.SHIFT: text("shift"),
     By.STATION: text("station"),
 }
+_TWICE_MAX: Final = 5
+"""Units that passed at two stations that the first page shows."""
 PART_SIZE: Final = 2000
 """Rows of a spreadsheet file that are read at once."""
 _CSV: Final = "text/csv; charset=utf-8"
@@ -176,6 +179,8 @@ class SupervisorPages:
             page=page,
             codes=list(codes.CODES),
             **self._choices(),
+            passed_twice=self.store.passed_twice(_TWICE_MAX),
+            warning=Status.WARNING,
         )
 
     def file_of_runs(self, question: Question) -> Answer:

@@ -21,12 +21,13 @@ import pytest
 from flasher.cli.main import COMMANDS, main
 from flasher.settings import bus
 from flasher.settings.toml_reader import Reader
-from flasher.station import config
+from flasher.station import config, recipe
 from tests.documents.blocks import ROOT, Block
 from tests.firmware import shorten
 
 KINDS: Final[Mapping[str, Reader[Any]]] = {
     "bus": bus.READER,
+    "recipe": recipe.RECIPE,
     "station": config.CONFIG,
 }
 """Files of settings that a page shows a part of."""

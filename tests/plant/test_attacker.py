@@ -67,6 +67,20 @@ ATTEMPTS = {
     ),
     "hide a table": ("CREATE TEMPORARY TABLE plant_station (role text)", DENIED),
     "add a run by the inner function": ("SELECT plant_add_run('{{}}', '{{}}')", DENIED),
+    "read claims": ("SELECT * FROM plant_claim", DENIED),
+    "take a claim away": ("DELETE FROM plant_claim", DENIED),
+    "claim for another station": (
+        f"INSERT INTO plant_claim VALUES ('x', {_THEIRS}, 'BAT-36', 'W1', 'A', now(), now())",
+        DENIED,
+    ),
+    "hide a duplicate": ("DELETE FROM plant_duplicate", DENIED),
+    "claim one's own token twice": (
+        "SELECT plant_claim('{token}', 'BAT-36', 'W2605077', false, 'A', 60)", "23505",
+    ),
+    "claim everything": (
+        "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60)"
+        " FROM generate_series(1, 1001) n", REFUSED,
+    ),
     "become the owner": ("SET ROLE postgres", DENIED),
     "make roles": ("CREATE ROLE another SUPERUSER", DENIED),
 }  # fmt: skip
@@ -82,19 +96,28 @@ def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
     ((records,),) = plant.rows("SELECT records_id FROM plant_station WHERE name = 'line-2'")
     query = "SELECT hash FROM chain_row c JOIN plant_station p USING (station)"
     ((head,),) = plant.rows(query + " WHERE name = 'line-2' ORDER BY number DESC LIMIT 1")
+    token = "0" * 32
+    with plant.connect("flasher_line_3") as victim:
+        claim = f"SELECT plant_claim('{token}', 'BAT-36', 'W2605078', false, 'A', 60)"
+        victim.execute(claim.encode())
     before = _everything(plant)
     found = {}
     with plant.connect("flasher_line_2") as attacker:
         attacker.autocommit = True
         for name, (statement, _) in ATTEMPTS.items():
-            known = {"theirs": theirs, "records": records, "head": head}
+            known = {"theirs": theirs, "records": records, "head": head, "token": token}
             with pytest.raises(psycopg.Error) as caught:
                 attacker.execute(statement.format(**known).encode())
             found[name] = caught.value.sqlstate
+        # Without an error, but also without an effect on another station.
+        attacker.execute(f"SELECT plant_release(ARRAY['{token}'])".encode())
+        attacker.execute(f"SELECT plant_renew(ARRAY['{token}'], 600)".encode())
+        assert attacker.execute("SELECT * FROM plant_claims()").fetchall() == []
     assert found == {name: state for name, (_, state) in ATTEMPTS.items()}
     assert _everything(plant) == before
 
 
 def _everything(plant: Plant) -> dict[str, list[tuple[Any, ...]]]:
-    tables = ("chain_row", "shared_part", "trace", "plant_station", "run", "unit", "station")
+    tables = ("chain_row", "shared_part", "trace", "plant_station", "run", "unit", "station",
+              "plant_claim", "plant_pass", "plant_duplicate")  # fmt: skip
     return {table: plant.rows(f"SELECT * FROM {table} ORDER BY 1, 2") for table in tables}

@@ -16,7 +16,7 @@ import pytest
 from flasher.plant import forwarder as forwarder_module
 from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.forwarder import ForwarderState, load_state, state_file
-from flasher.plant.health import check
+from flasher.plant.health import checks
 from flasher.plant.process import keep_sending
 from flasher.plant.setup import setup
 from flasher.station.health import HealthCheck
@@ -251,7 +251,7 @@ def test_runs_that_began_in_the_same_microsecond_both_arrive(plant: Plant, sende
 def check_of(sender: Sender) -> HealthCheck:
     """What the operator page shows."""
     folder, now = sender.bench.store.files.folder, sender.forwarder._clock.utc()
-    return check(folder, sender.station, now)
+    return checks(folder, sender.station, now, 5.0)[0]
 
 
 # -- refused by name -------------------------------------------------------------------------------

@@ -5,14 +5,16 @@ from __future__ import annotations
 from contextlib import closing
 from datetime import UTC, datetime
 
+from flasher.cli.station.records import passed_twice_lines
 from flasher.plant.store import PlantStore
 from flasher.station.records.capability import Capability
-from flasher.station.records.model import RunFilter
+from flasher.station.records.model import Admission, Order, RunFilter
 from flasher.station.records.rollup import Rollup
 from flasher.web.plant import PlantPages
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages, open_supervisor
 from tests.plant.factory import READER, Plant, Sender
+from tests.station.factory import SERIAL
 from tests.station.records.test_capability import VALUES, measure
 
 LATER = datetime(2026, 6, 1, tzinfo=UTC)
@@ -49,6 +51,40 @@ def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
         while sums.add(LATER):
             pass
         assert store.read.figures().units == 2
+
+
+def test_units_that_passed_at_two_stations_are_shown_with_their_marks(
+    plant: Plant, sender: Sender
+) -> None:
+    other = plant.sender("line-3")
+    sender.bench.make()
+    admission = Admission("0" * 32, "the server was away")
+    claim = other.bench.store.claim(
+        Order(SERIAL, "A", "jo", admission=admission), other.bench.recipe
+    )
+    other.bench.work(claim.run_id)
+    other.bench.store.finish(claim.run_id, other.bench.ending())
+    for each in (sender, other):
+        each.send()
+    other.close()
+    with closing(opened(plant)) as store:
+        (found,) = store.passed_twice(100)
+        assert (found.serial, found.first.station, found.second.station) == (
+            SERIAL, "line-2", "line-3",
+        )  # fmt: skip
+        assert found.first.duplicates is None
+        lines = list(passed_twice_lines([found]))
+        assert lines[0] == "passed at two stations: 1 unit"
+        assert lines[1].endswith("duplicates NOT CHECKED")
+    pages = open_supervisor(
+        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore
+    )
+    with closing(pages.store):
+        runs = page(pages, "/runs")
+        assert "passed at two stations" in runs
+        assert runs.count("<small>duplicates not checked</small>") == 2  # table and list
+        unit = page(pages, "/units", serial=SERIAL, part="BAT-36")
+        assert "not checked: the server was away" in unit
 
 
 def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender) -> None:

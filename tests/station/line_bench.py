@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from flasher.station.events import SocketState, StationEvent, StepEnded
+from flasher.station.gate import Gate
 from flasher.station.label_printer import LabelPrinter
 from flasher.station.messages import (
     AdapterReady,
@@ -114,6 +115,7 @@ class LineBench:
         mixes_virtual: bool = False,
         crew: Crew | None = None,
         labels: LabelPrinter | None = None,
+        gate: Gate | None = None,
     ) -> None:
         self.bench = bench
         self.sees_units = sees_units
@@ -138,6 +140,7 @@ class LineBench:
             clock=bench.clock,
             launch=self._launch,
             checker=self.checker,
+            gate=gate,
         )
         self.station.start()
         for name in sockets:

@@ -164,7 +164,14 @@ class World:
                     case line.SaveAgain(sockets):
                         saved = [self.save(name) for name in sockets]
                         self.line.resumed(self.now, all_saved=all(saved))
-                    case line.AbortRun() | line.CheckPin() | line.Reprint() | line.Audit():
+                    case (
+                        line.AbortRun()
+                        | line.CheckPin()
+                        | line.Reprint()
+                        | line.Audit()
+                        | line.AskPlant()
+                        | line.DropAdmission()
+                    ):
                         pass
                     case _:
                         self.look(effect)

@@ -13,6 +13,7 @@ from sqlalchemy import make_url
 from flasher.cli.output import Output, byte_count, counted, duration
 from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import PlantInitDocument, PlantSendDocument, PlantStatusDocument
+from flasher.cli.station.records import TWICE_MAX, passed_twice_lines
 from flasher.errors import ExitCode, UsageError
 from flasher.plant.activity import Yield
 from flasher.plant.alerts import (
@@ -26,6 +27,7 @@ from flasher.plant.alerts import (
 from flasher.plant.central import Central, plant_location
 from flasher.plant.process import Sending
 from flasher.plant.setup import create_database, role_of, setup
+from flasher.plant.store import passed_twice
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
 from flasher.station.records.database import Location
@@ -109,12 +111,14 @@ def status(output: Output, url: str, options: BoundsOptions) -> int:
     now = datetime.now().astimezone()
     with closing(Central(url)) as central, central.reading() as connection:
         found = overviews(connection, bounds_of(options), DEFAULT_SHIFTS, now)
+        twice = passed_twice(connection, TWICE_MAX)
     for each in found:
         output.results(_lines(each))
     if not found:
         output.result("no stations: flasher plant init --station NAME --database URL adds one")
     for station, check in alerts(found):
         output.result(printable(f"ALERT {station}: {check.text}"))
+    output.results(passed_twice_lines(twice))
     code = ExitCode.PARTIAL if any(alerts(found)) else ExitCode.OK
     if any(each.status.refusal for each in found):
         code = ExitCode.VERIFICATION
@@ -122,6 +126,7 @@ def status(output: Output, url: str, options: BoundsOptions) -> int:
         [each.status for each in found],
         {each.status.station: each.activity for each in found},
         {each.status.station: each.checks for each in found},
+        twice,
     )
     return output.document(document, exit_code=code)
 

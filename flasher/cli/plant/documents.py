@@ -11,6 +11,7 @@ from flasher.plant.alerts import StationCheck
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
+from flasher.station.records.model import PassedTwice
 from flasher.station.records.overview import ImageRecord, InstalledUnit
 
 
@@ -35,6 +36,8 @@ class PlantStatusDocument:
     """What each station has done lately, by its name."""
     checks: dict[str, tuple[StationCheck, ...]]
     """Checks of each station by its name."""
+    passed_twice: list[PassedTwice]
+    """The newest 100 units that passed at two stations, without a recipe that asked for it."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from flasher.cli.station.documents import (
     RecipeFindingDocument,
     StationCheckDocument,
 )
-from flasher.cli.station.setup import labels_of
+from flasher.cli.station.setup import check_clock, labels_of
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import check_samples, detect, resolve
@@ -44,11 +44,18 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
         for warning in target.provenance.warnings if target.provenance else ():
             output.error_line(f"warning: {warning}")
     sockets: dict[str, str] = {}
+    clock_offset_s = None
     if station_file is not None:
         config = load_config(station_file)
         if config.badges:
             load_badges(Path(config.badges), recipe.recipe.serial_number)
         labels_of(config, recipe)
+        if config.question is not None:
+            from flasher.station.question import Question  # noqa: PLC0415  few stations ask
+
+            Question(config.question, recipe, config.name)  # reads its certificates
+        if config.plant:
+            clock_offset_s = check_clock(config, recipe, output)
         resolved = resolve(config.socket, detect(config.socket))
         check_samples(resolved, recipe)
         for socket in resolved:
@@ -76,6 +83,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
                 for target in recipe.targets
             ],
             sockets=sockets,
+            clock_offset_s=clock_offset_s,
         )
     )
 

@@ -12,6 +12,7 @@ from flasher.station.records.model import (
     Backup,
     Examination,
     Figures,
+    PassedTwice,
     ReportedRun,
     RunState,
     UnitLife,
@@ -55,6 +56,8 @@ class StationCheckDocument:
     targets: list[CheckedTargetDocument]
     sockets: dict[str, str]
     """With --sockets: the adapter of each socket."""
+    clock_offset_s: float | None = None
+    """With a plant: this computer's clock minus that of the plant's database; null: not known."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,9 @@ class StationReportDocument:
     measurements: list[Capability]
     """Measurements with limits."""
     runs: list[ReportedRun]
+    passed_twice: list[PassedTwice]
+    """Of a plant: the newest 100 units that passed at two stations, without a recipe that asked
+    for it, whatever runs were chosen."""
 
 
 @dataclass(frozen=True)

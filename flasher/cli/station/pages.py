@@ -128,7 +128,7 @@ def operator_page(
         clock.utc,
         clock.monotonic_s,
         store.signer.unkept,
-        partial(_plant_check, store, clock) if config.plant else None,
+        partial(_plant_checks, station) if config.plant else tuple,
     )
     screen = Screen(tally, watch)
     pages = Pages(options.language)
@@ -156,11 +156,12 @@ def operator_page(
             screen.feed.close()
 
 
-def _plant_check(store: Store, clock: StationClock) -> HealthCheck:
-    """Check the sending of records to the plant's database."""
-    from flasher.plant.health import check  # noqa: PLC0415  an extra
+def _plant_checks(station: Station) -> Collection[HealthCheck]:
+    """Check the sending of records to the plant's database, and the clock against it."""
+    from flasher.plant.health import checks  # noqa: PLC0415  an extra
 
-    return check(store.files.folder, store.station, clock.utc())
+    store, most_s = station.store, station.recipe.recipe.plant.clock_offset_max_s
+    return checks(store.files.folder, store.station, station.clock.utc(), most_s)
 
 
 # -- supervisor pages only ------------------------------------------------------------------------

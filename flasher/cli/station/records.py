@@ -26,10 +26,12 @@ from flasher.protocol.text import printable
 from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
+    CHECKED,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
     Figures,
+    PassedTwice,
     RunDetails,
     RunFilter,
     RunId,
@@ -44,6 +46,8 @@ from flasher.station.stories import explained
 from flasher.trace.story import Story
 from flasher.wording import wording
 
+TWICE_MAX: Final = 100
+"""Units that passed at two stations that reports show."""
 _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 
 
@@ -75,6 +79,8 @@ def report(
         made = Report(store.read, chosen)
         output.results(figure_lines(made.figures))
         output.results(capability_lines(made.capabilities))
+        twice = list(store.passed_twice(TWICE_MAX))
+        output.results(passed_twice_lines(twice))
         for option, (path, make) in wanted.items():
             if path is not None:
                 write_whole(path, make(made).encode("utf-8"), option)
@@ -90,6 +96,7 @@ def report(
             figures=figures_document(made.figures),
             measurements=made.capabilities,
             runs=made.runs,
+            passed_twice=twice,
         )
         return output.document(document, exit_code=code)
 
@@ -205,6 +212,22 @@ def _trace_document(
 
 
 # -- as text --------------------------------------------------------------------------------------
+
+
+def passed_twice_lines(found: Sequence[PassedTwice]) -> Iterator[str]:
+    if not found:
+        return
+    yield f"passed at two stations: {counted(len(found), 'unit')}" + (
+        " and more; the newest:" if len(found) == TWICE_MAX else ""
+    )
+    for each in found:
+        runs = (
+            f"{run.station}, socket {run.socket}, {run.begun_at[:19].replace('T', ' ')} UTC"
+            + ("" if run.duplicates in (None, CHECKED) else ", duplicates NOT CHECKED")
+            for run in (each.first, each.second)
+        )
+        nature = ", VIRTUAL" if each.is_virtual else ""
+        yield printable(f"  {each.serial}, part {each.part}{nature}: {'; '.join(runs)}")
 
 
 def figure_lines(figures: Figures) -> Iterator[str]:

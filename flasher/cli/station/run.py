@@ -19,7 +19,7 @@ from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOption
 from flasher.cli.station.documents import StationRunDocument, figures_document
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
-from flasher.cli.station.setup import crew_of, labels_of, scanners_of
+from flasher.cli.station.setup import crew_of, gate_of, labels_of, scanners_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import (
@@ -88,6 +88,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
             known = partial(store.read.known, recipe.recipe.part)
             first = next_number(recipe.recipe.serial_number, known)
         output.has_opened = True
+        gate = None if _is_temporary(options, records) else gate_of(config, recipe, store)
         session.station = Station(
             store,
             recipe,
@@ -111,6 +112,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
                 mixes_virtual=options.mix_virtual,
             ),
             launch=LAUNCH,
+            gate=gate,
         )
         if scans is not None:
             session.file = ScanFile(

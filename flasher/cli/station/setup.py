@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import getpass
 import sys
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
+from flasher.cli.extras import need
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
 from flasher.errors import ErrorCode, UsageError, how_to_install
 from flasher.station.config import StationConfig
+from flasher.station.gate import Gate
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
 from flasher.station.operators import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
-from flasher.station.recipe import SerialNumberRule
+from flasher.station.recipe import ClockRule, SerialNumberRule, Unchecked
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.errors import RecordError
+from flasher.station.records.store import Store, SystemClock
 from flasher.station.scanners import Scanner
 from flasher.station.station import Station
 
@@ -50,6 +55,63 @@ def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | Non
         limit_s=label.time_limit_s,
         prints_each=label.on == "pass",
     )
+
+
+def gate_of(config: StationConfig, recipe: LoadedRecipe, store: Store) -> Gate | None:
+    """What asks the plant before each run; None if the station file names no plant. Raises
+    UsageError.
+    """
+    question, claims = config.question, None
+    if question is None and not config.plant:
+        return None
+    clock = SystemClock()
+    asked = None
+    if question is not None:
+        from flasher.station.question import Question  # noqa: PLC0415  few stations ask
+
+        asked = Question(question, recipe, config.name)
+    if config.plant:
+        from flasher.plant.central import Central  # noqa: PLC0415  an extra
+        from flasher.plant.claims import PlantClaims  # noqa: PLC0415
+
+        limit_s = recipe.recipe.plant.time_limit_s
+        central = Central(config.plant, lock_timeout_s=limit_s, statement_limit_s=limit_s)
+        claims = PlantClaims(central, store.database, config.name, clock)
+    return Gate(recipe.recipe, claims, asked, clock.monotonic_s)
+
+
+def check_clock(config: StationConfig, recipe: LoadedRecipe, output: Output) -> float | None:
+    """Compare the clock with that of the plant's database; None if that does not answer. Raises
+    UsageError for a difference with which the recipe stops.
+    """
+    need("The plant's database", "plant")
+    from flasher.plant.central import Central  # noqa: PLC0415  an extra
+    from flasher.plant.claims import clock_offset_s  # noqa: PLC0415
+
+    rule, offset_s = recipe.recipe.plant, None
+    limit_s = rule.time_limit_s
+    central = Central(config.plant, lock_timeout_s=limit_s, statement_limit_s=limit_s)
+    try:
+        with closing(central):
+            offset_s = clock_offset_s(central, SystemClock())
+    except RecordError as error:
+        words = f"the clock was not compared with the plant's: {error.cause or error.what}"
+        is_good, remedy = False, error.remedy
+    else:
+        words = f"the clock differs by {offset_s:+.2f} s from that of the plant's database"
+        is_good, remedy = abs(offset_s) <= rule.clock_offset_max_s, "Set the clock."
+    is_blocked = offset_s is not None or rule.clock_unknown is Unchecked.BLOCK
+    if not is_good and is_blocked and rule.clock is ClockRule.STOP:
+        raise UsageError(
+            f"{words[0].upper()}{words[1:].rstrip('.')}.",
+            cause=f"the recipe allows {rule.clock_offset_max_s:g} s, and stops",
+            remedy=remedy,
+        )
+    if is_good:
+        output.result(words)
+    else:
+        output.error_line(f"warning: {words}")
+    return offset_s
 
 
 def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:

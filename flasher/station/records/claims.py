@@ -5,28 +5,39 @@ sockets cannot both take the last place of a lot.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime, timedelta
 from pathlib import PurePath
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from sqlalchemy import func, select
 
 from flasher.errors import FlasherError, UsageError
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station.recipe import Duplicate, Golden
+from flasher.station.recipe import ClockRule, Duplicate, Golden, Unchecked
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
+    CHECKED,
+    CLOCK_OFFSET,
+    DUPLICATES,
+    PLANT_ANSWER,
+    PLANT_CLAIM,
+    Admission,
     Claim,
+    Elsewhere,
+    ElsewhereState,
+    Measurement,
     Order,
     RunId,
     RunKind,
     RunState,
     Signature,
+    StepName,
+    StepState,
     UnitState,
     utc_moment,
     utc_text,
@@ -111,6 +122,7 @@ class Claiming:
         order, loaded, connection = self._order, self._loaded, self._connection
         self._check_free()
         self._check_unit_kind()
+        self._check_plant(order.admission or Admission())
         last = connection.execute(
             select(run.c.state)
             .where(run.c.unit_id == self._unit_id)
@@ -157,11 +169,55 @@ class Claiming:
                 target=target.name,
                 required=int(target.required),
             )
+        if order.admission is not None:
+            self._note_plant(run_id, order.admission, monotonic_s)
         digests = digests_of(connection, [run_id])[run_id]
         data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
         self._trail.append(self._now, chain.CLAIMED, data, run_id)
         day = self._now.astimezone().date()
-        return Claim(RunId(run_id), kind, order.serial, day, order.lot, signatures=self._signatures)
+        return Claim(
+            RunId(run_id),
+            kind,
+            order.serial,
+            day,
+            order.lot,
+            signatures=self._signatures,
+            unchecked="" if order.admission is None else order.admission.doubt,
+        )
+
+    def _note_plant(self, run_id: int, admission: Admission, monotonic_s: float) -> None:
+        """Record what the plant answered, with the begin of the run."""
+        rule, doubt = self._loaded.recipe.plant, admission.doubt
+        measured: list[Measurement] = []
+        if admission.claim:
+            words = f"not {CHECKED}: {doubt}" if doubt else CHECKED
+            measured.append(Measurement(DUPLICATES, text=words))
+            measured.append(Measurement(PLANT_CLAIM, text=admission.claim))
+        if admission.answer is not None:
+            measured.append(Measurement(PLANT_ANSWER, text=admission.answer.text))
+        if admission.clock_offset_s is not None:
+            most_s = rule.clock_offset_max_s if rule.clock is ClockRule.STOP else None
+            least_s = None if most_s is None else -most_s
+            offset_s = admission.clock_offset_s
+            measured.append(Measurement(CLOCK_OFFSET, offset_s, "s", low=least_s, high=most_s))
+        if not measured:
+            return
+        step_id = insert(
+            self._connection,
+            schema.step,
+            run_id=run_id,
+            position=1,
+            name=StepName.PLANT.value,
+            try_number=1,
+            state=(StepState.SKIPPED if doubt else StepState.PASS).value,
+            code="",
+            text=f"duplicates not {CHECKED}: {doubt}" if doubt else "",
+            begun_at=utc_text(self._now - timedelta(seconds=admission.duration_s)),
+            begun_monotonic_s=monotonic_s - admission.duration_s,
+            duration_s=admission.duration_s,
+        )
+        for each in measured:
+            insert(self._connection, schema.measurement, step_id=step_id, **asdict(each))
 
     def _recipe_id(self) -> int:
         """Row id of the recipe. The row holds the whole text, readable years later."""
@@ -213,18 +269,7 @@ class Claiming:
         of_unit = running.where(run.c.unit_id == self._unit_id)
         by_unit: Any = self._connection.execute(of_unit).first()
         if by_unit is not None:
-            raise ClaimRefusedError(
-                Refusal.UNIT_RUNNING,
-                text(
-                    "{serial} is running on socket {socket} of {station}.",
-                    serial=self._order.serial,
-                    socket=by_unit.socket_name,
-                    station=by_unit.name,
-                ),
-                remedy=text(
-                    "Wait until that run ends. If its unit is not there, check this label."
-                ),
-            )
+            self._refuse_running(by_unit.socket_name, by_unit.name)
         on_socket = running.where(run.c.socket_id == self._socket_id)
         by_socket: Any = self._connection.execute(on_socket).first()
         if by_socket is not None:
@@ -237,6 +282,72 @@ class Claiming:
                 ),
                 remedy=text("Wait until that run ends."),
             )
+
+    def _check_plant(self, admission: Admission) -> None:
+        """Check what the plant answered. Raises ClaimRefusedError."""
+        golden = self._loaded.recipe.golden
+        if golden is not None and self._order.serial in golden.serial_numbers:
+            return
+        self._check_clock_offset(admission.clock_offset_s)
+        answer, other = admission.answer, admission.elsewhere
+        if answer is not None and not answer.may_begin:
+            raise ClaimRefusedError(
+                Refusal.PLANT_REFUSED,
+                text("The plant: {answer}.", answer=printable(answer.text)),
+                remedy=text("Ask the shift leader where this unit belongs.")
+                if answer.is_answered
+                else text("Try again when the plant's system answers."),
+            )
+        if other is not None and other.state is ElsewhereState.RUNNING:
+            self._refuse_running(other.socket, other.station)
+        doubt = admission.doubt if admission.claim else text("this station belongs to no plant")
+        if doubt and self._loaded.recipe.plant.unchecked is Unchecked.BLOCK:
+            raise ClaimRefusedError(
+                Refusal.NOT_CHECKED,
+                text(
+                    "It was not checked whether {serial} passed at another station: {why}.",
+                    serial=self._order.serial,
+                    why=doubt,
+                ),
+                remedy=text(
+                    "Repair the connection to the plant's database, or that station; the recipe"
+                    " allows no unit without this check."
+                ),
+            )
+
+    def _check_clock_offset(self, offset_s: float | None) -> None:
+        rule = self._loaded.recipe.plant
+        if rule.clock is not ClockRule.STOP:
+            return
+        if offset_s is None and rule.clock_unknown is Unchecked.BLOCK:
+            raise ClaimRefusedError(
+                Refusal.CLOCK_OFFSET,
+                text("The clock was not compared with that of the plant's database."),
+                remedy=text("Repair the connection to the plant's database."),
+            )
+        if offset_s is not None and abs(offset_s) > rule.clock_offset_max_s:
+            raise ClaimRefusedError(
+                Refusal.CLOCK_OFFSET,
+                text(
+                    "The clock differs by {offset:+.1f} s from that of the plant's database;"
+                    " the recipe allows {most:g} s.",
+                    offset=offset_s,
+                    most=rule.clock_offset_max_s,
+                ),
+                remedy=text("Set the clock of this computer."),
+            )
+
+    def _refuse_running(self, socket_name: str, station_name: str) -> NoReturn:
+        raise ClaimRefusedError(
+            Refusal.UNIT_RUNNING,
+            text(
+                "{serial} is running on socket {socket} of {station}.",
+                serial=self._order.serial,
+                socket=socket_name,
+                station=station_name,
+            ),
+            remedy=text("Wait until that run ends. If its unit is not there, check this label."),
+        )
 
     def _check_unit_kind(self) -> None:
         """Refuse a real unit recorded as virtual, or the reverse: a PASS of one proves nothing
@@ -265,8 +376,11 @@ class Claiming:
             return RunKind.GOLDEN
         self._check_golden()
         kind = RunKind.PRODUCTION
-        if before is UnitState.PASS:
-            kind = self._repeated()
+        other = None if self._order.admission is None else self._order.admission.elsewhere
+        if other is not None and other.state is not ElsewhereState.PASSED:
+            other = None
+        if before is UnitState.PASS or other is not None:
+            kind = self._repeated(None if before is UnitState.PASS else other)
         elif before is UnitState.RECHECK:
             kind = RunKind.RECHECK
         self._check_lot()
@@ -297,24 +411,34 @@ class Claiming:
                 ),
             )
 
-    def _repeated(self) -> RunKind:
-        """Kind of run for a unit that has passed before. Raises ClaimRefusedError."""
+    def _repeated(self, other: Elsewhere | None) -> RunKind:
+        """Kind of run for a unit that has passed before, here or elsewhere. Raises
+        ClaimRefusedError.
+        """
         order, rule = self._order, self._loaded.recipe.duplicate
         if rule is Duplicate.VERIFY_ONLY:
             return RunKind.VERIFY_ONLY
+        has_passed = text("{serial} has passed already.", serial=order.serial)
+        if other is not None:
+            has_passed = text(
+                "{serial} has passed already, on socket {socket} of {station}, at {at} (its run"
+                " {run}).",
+                serial=order.serial,
+                socket=printable(other.socket),
+                station=printable(other.station),
+                at=other.moment,
+                run=other.run,
+            )
         if rule is Duplicate.BLOCK:
             raise ClaimRefusedError(
                 Refusal.DUPLICATE,
-                text("{serial} has passed already.", serial=order.serial),
+                has_passed,
                 remedy=text("Check the label: another unit may carry the same number."),
             )
         if not order.reason.strip():
             raise ClaimRefusedError(
                 Refusal.REASON_NEEDED,
-                text(
-                    "{serial} has passed already; another run needs a reason.",
-                    serial=order.serial,
-                ),
+                text("{passed} Another run needs a reason.", passed=has_passed),
                 remedy=text("Give the reason, then scan it again."),
             )
         return RunKind.REFLASH

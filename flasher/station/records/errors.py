@@ -123,6 +123,12 @@ class Refusal(StrEnum):
     """The trust file no longer allows an image of the recipe."""
     CLOCK = "CLOCK"
     """The computer's clock is earlier than the last record of this station."""
+    CLOCK_OFFSET = "CLOCK_OFFSET"
+    """The computer's clock differs from that of the plant's database, or that is not known."""
+    NOT_CHECKED = "NOT_CHECKED"
+    """The plant's database does not say whether the unit has passed at another station."""
+    PLANT_REFUSED = "PLANT_REFUSED"
+    """The plant answered that the unit may not be here, or did not answer."""
 
 
 class ClaimRefusedError(FlasherError):

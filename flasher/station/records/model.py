@@ -122,6 +122,8 @@ class UnitState(LowerCaseInJson, StrEnum):
 class StepName(StrEnum):
     """Steps of a run, in order."""
 
+    PLANT = "plant"
+    """What the plant answered before the run."""
     CONNECT = "connect"
     IDENTIFY = "identify"
     CHECK = "check"
@@ -155,7 +157,79 @@ class StepState(LowerCaseInJson, StrEnum):
     FAIL = "FAIL"
     ERROR = "ERROR"
     SKIPPED = "SKIPPED"
-    """Not needed, for example in a verify-only run."""
+    """Not done: not needed, as in a verify-only run, or not possible, which its text states."""
+
+
+DUPLICATES: Final = "duplicates"
+"""Measurement of the step `plant`: `CHECKED`, or "not checked: " and why it is not known whether
+the unit has passed at another station."""
+CHECKED: Final = "checked"
+PLANT_CLAIM: Final = "plant claim"
+"""Measurement of the step `plant`: the claim of the unit in the plant's database."""
+PLANT_ANSWER: Final = "plant answer"
+"""Measurement of the step `plant`: the answer to the question whether the unit may be here."""
+CLOCK_OFFSET: Final = "clock offset"
+"""Measurement of the step `plant`: this computer's clock minus that of the plant's database."""
+
+
+class ElsewhereState(StrEnum):
+    """State of a unit at another station of the plant."""
+
+    RUNNING = "running"
+    UNKNOWN = "unknown"
+    """A station claimed it, and has not sent the end of that run in time: it may have passed."""
+    PASSED = "passed"
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """What the plant's database has about a unit at another station."""
+
+    state: ElsewhereState
+    station: str
+    socket: str
+    at: str
+    """Time of the claim, or of the begin of the run that passed, in UTC."""
+    run: int | None = None
+    """Number of that run in its station's records; None before its end was sent."""
+
+    @property
+    def moment(self) -> str:
+        """The time, for people."""
+        return f"{self.at[:19].replace('T', ' ')} UTC"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answer to the question whether a unit may be here, or the rule for none."""
+
+    may_begin: bool
+    text: str
+    is_answered: bool = True
+
+
+@dataclass(frozen=True)
+class Admission:
+    """What a plant answered about a unit before its run. The recipe decides what follows."""
+
+    claim: str = ""
+    """The claim in the plant's database; "" if none was asked for."""
+    unchecked: str = ""
+    """Why the plant's database did not answer; "" if it did."""
+    elsewhere: Elsewhere | None = None
+    answer: Answer | None = None
+    clock_offset_s: float | None = None
+    """This computer's clock minus that of the plant's database; None: not known."""
+    duration_s: float = 0.0
+    """Time that the plant took."""
+
+    @property
+    def doubt(self) -> str:
+        """Why it is not known whether the unit has passed at another station; "" if it is."""
+        other = self.elsewhere
+        if self.unchecked or other is None or other.state is not ElsewhereState.UNKNOWN:
+            return self.unchecked
+        return f"{other.station} claimed it at {other.moment}, and has not sent the end of its run"
 
 
 @dataclass(frozen=True)
@@ -168,6 +242,8 @@ class Order:
     lot: str = ""
     reason: str = ""
     is_virtual: bool = False
+    admission: Admission | None = None
+    """None: the station does not ask a plant."""
 
 
 SIGNATURE: Final = "signature"
@@ -218,6 +294,9 @@ class Claim:
     signatures: Mapping[str, Signature] = field(default_factory=dict)
     """Signatures of the images, by target, checked when the unit was claimed; without a target for
     which neither recipe nor trust file asks for any."""
+    unchecked: str = ""
+    """Why it is not known whether the unit has passed at another station; "" if it was checked, or
+    the station belongs to no plant."""
 
 
 @dataclass(frozen=True)
@@ -355,6 +434,13 @@ class RunRecord:
     verified: Verified | None
     """Lowest level of its targets; None if unknown."""
     log_sha256: str | None
+    duplicates: str | None = None
+    """As in `ReportedRun`."""
+
+    @property
+    def is_unchecked(self) -> bool:
+        """True if it was not checked whether the unit has passed at another station."""
+        return self.duplicates not in (None, CHECKED)
 
 
 @dataclass(frozen=True)
@@ -384,6 +470,9 @@ class ReportedRun:
     """The lowest level among its targets: completed, version or memory."""
     log_sha256: str | None
     reason: str
+    duplicates: str | None
+    """Whether the unit has passed at another station was "checked", or "not checked" with the
+    reason; null: the station belongs to no plant."""
 
 
 @dataclass(frozen=True)
@@ -415,6 +504,30 @@ class UnitLife:
     def last(self) -> RunDetails | None:
         """The last run; None without runs."""
         return self.runs[-1] if self.runs else None
+
+
+@dataclass(frozen=True)
+class PassedRun:
+    """A run that passed."""
+
+    run_id: int
+    station: str
+    socket: str
+    begun_at: str
+    duplicates: str | None
+    """As in `ReportedRun`."""
+
+
+@dataclass(frozen=True)
+class PassedTwice:
+    """A unit that passed at two stations of a plant, without a recipe that asked for it."""
+
+    serial: str
+    part: str
+    is_virtual: bool
+    first: PassedRun
+    """The PASS that the plant's database had first."""
+    second: PassedRun
 
 
 @dataclass(frozen=True)

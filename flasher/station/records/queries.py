@@ -18,6 +18,7 @@ from flasher.station.records.errors import NotFoundError
 from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
+    DUPLICATES,
     SIGNATURE,
     Figures,
     ReportedRun,
@@ -26,6 +27,7 @@ from flasher.station.records.model import (
     RunId,
     RunKind,
     RunState,
+    StepName,
     UnitLife,
     UnitState,
     Verified,
@@ -38,6 +40,18 @@ VERIFIED: Final = case(
     {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
 ).label("verified")
 """Verification level of a run, as a word."""
+_DUPLICATES: Final = (
+    select(schema.measurement.c.text)
+    .join_from(schema.step, schema.measurement)
+    .where(
+        schema.step.c.run_id == schema.run.c.id,
+        schema.step.c.position == 1,
+        schema.step.c.name == StepName.PLANT.value,
+        schema.measurement.c.name == DUPLICATES,
+    )
+    .scalar_subquery()
+    .label("duplicates")
+)
 _DETAILS: Final = TypeAdapter(RunDetails)
 _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
 """Columns with a name that every run has."""
@@ -217,14 +231,14 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
         "recipe_sha256": recipe["sha256"],
         "verified": run["verification_reached"],
     }
-    signatures = {each["name"]: each["text"] for each in content["measurements"]}
+    found = {each["name"]: each["text"] for each in content["measurements"]}
     targets = [
         each
         | {
             "image": images[each["artifact_id"]]["name"],
             "image_sha256": images[each["artifact_id"]]["sha256"],
             "version": images[each["artifact_id"]]["version"],
-            "signature": signatures.get(f"{each['target']} {SIGNATURE}"),
+            "signature": found.get(f"{each['target']} {SIGNATURE}"),
         }
         for each in content["targets"]
         if each["artifact_id"] in images
@@ -235,7 +249,7 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
     ]
     return _DETAILS.validate_python(
         {
-            "run": run | facts,
+            "run": run | facts | {"duplicates": found.get(DUPLICATES)},
             "targets": targets,
             "steps": steps,
             "writes": [each | {"write_id": each["id"]} for each in content["writes"]],
@@ -270,6 +284,7 @@ def run_query(verified: Any) -> Select[Any]:
             verified,
             run.log_sha256,
             run.reason,
+            _DUPLICATES,
         )
         .join_from(schema.run, schema.unit, run.unit_id == schema.unit.c.id)
         .join(schema.recipe, run.recipe_id == schema.recipe.c.id)

@@ -61,6 +61,7 @@ from flasher.station.records.model import (
     Examination,
     Measurement,
     Order,
+    PassedTwice,
     RunEnd,
     RunExamination,
     RunId,
@@ -230,6 +231,10 @@ class Store:
         # One claim at a time: two must not take the last place of a lot.
         with self.signer.writing() as trail:
             return Claiming(trail, order, recipe, signatures, now).begin(self._clock.monotonic_s())
+
+    def passed_twice(self, _limit: int) -> Sequence[PassedTwice]:
+        """The newest units that passed at two stations: none, as one station refuses them."""
+        return ()
 
     # -- while it runs ----------------------------------------------------------------------------
 

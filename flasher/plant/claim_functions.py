@@ -1,0 +1,136 @@
+# ruff: noqa: S608  all of this SQL is written here
+"""SQL functions and rights for claims of units, so that two stations do not pass one unit.
+
+A claim stays until its station sends the end of the run, or releases it because no run began. It
+expires if its station does not renew it; from then on it refuses the unit nowhere, but the station
+may have passed the unit, which `plant_claim` states. So a unit is reported as free only while no
+run of it at another station can end with a PASS that is not here.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flasher.plant.functions import DEFINER, REFUSED
+from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
+
+_OPEN_MAX: Final = 1000
+"""Claims of a station that have not expired; with 64 sockets it has a fraction of that."""
+_LEASE_MAX_S: Final = 600
+
+_CLAIM: Final = f"""
+CREATE OR REPLACE FUNCTION plant_claim(
+    of_token text, of_part text, of_serial text, of_virtual boolean, at_socket text,
+    lease_s double precision,
+    OUT state text, OUT station text, OUT socket text, OUT at timestamptz, OUT run bigint
+) LANGUAGE plpgsql {DEFINER} AS $$
+DECLARE
+    mine plant_station;
+    other plant_claim;
+    now timestamptz;
+BEGIN
+    SELECT * INTO mine FROM plant_station p WHERE p.role = session_user;
+    IF mine.station IS NULL THEN
+        RAISE EXCEPTION 'foreign: the user % has not sent from any records', session_user
+            USING ERRCODE = '{REFUSED}';
+    END IF;
+    PERFORM pg_advisory_xact_lock(hashtextextended(of_part || E'\\x1f' || of_serial, 7053));
+    now := clock_timestamp();
+    -- Claims before runs: a claim goes when the end of its run comes.
+    SELECT * INTO other FROM plant_claim c WHERE c.part = of_part AND c.serial = of_serial
+        AND c.station <> mine.station ORDER BY c.expires_at DESC LIMIT 1;
+    IF other.expires_at > now THEN
+        state := 'running';
+    ELSE
+        SELECT 'passed', n.name, s.name, r.begun_at::timestamptz, c.run_number
+            INTO state, station, socket, at, run
+            FROM unit u JOIN run r ON r.unit_id = u.id
+                JOIN chain_row c ON c.run_id = r.id AND c.content IS NOT NULL
+                JOIN socket s ON s.id = r.socket_id JOIN station n ON n.id = s.station_id
+            WHERE u.part = of_part AND u.serial = of_serial AND r.state = 'PASS'
+                AND r.kind <> '{RunKind.GOLDEN}' AND r.is_virtual = of_virtual
+                AND c.station <> mine.station
+            ORDER BY r.id DESC LIMIT 1;
+        IF state IS NULL AND other.token IS NOT NULL THEN
+            state := 'unknown';
+        END IF;
+    END IF;
+    IF state IN ('running', 'unknown') THEN
+        SELECT p.name, other.socket, other.claimed_at INTO station, socket, at
+            FROM plant_station p WHERE p.station = other.station;
+    END IF;
+    IF state IS DISTINCT FROM 'running' THEN
+        IF (SELECT count(*) FROM plant_claim c WHERE c.station = mine.station
+                AND c.expires_at > now) >= {_OPEN_MAX} THEN
+            RAISE EXCEPTION 'foreign: station % claims too many units', mine.name
+                USING ERRCODE = '{REFUSED}';
+        END IF;
+        INSERT INTO plant_claim (token, station, part, serial, socket, claimed_at, expires_at)
+            VALUES (of_token, mine.station, of_part, of_serial, at_socket, now,
+                now + make_interval(secs => greatest(1, least(lease_s, {_LEASE_MAX_S}))));
+    END IF;
+END $$
+"""
+
+_RENEW: Final = f"""
+CREATE OR REPLACE FUNCTION plant_renew(tokens text[], lease_s double precision)
+RETURNS void LANGUAGE sql {DEFINER} AS $$
+    UPDATE plant_claim SET expires_at = clock_timestamp()
+            + make_interval(secs => greatest(1, least(lease_s, {_LEASE_MAX_S})))
+        WHERE token = ANY(tokens) AND station = plant_my_station()
+$$
+"""
+
+_RELEASE: Final = f"""
+CREATE OR REPLACE FUNCTION plant_release(tokens text[]) RETURNS void LANGUAGE sql {DEFINER} AS $$
+    DELETE FROM plant_claim WHERE token = ANY(tokens) AND station = plant_my_station()
+$$
+"""
+
+_CLAIMS: Final = f"""
+CREATE OR REPLACE FUNCTION plant_claims() RETURNS TABLE (token text, part text, serial text)
+LANGUAGE sql STABLE {DEFINER} AS $$
+    SELECT token, part, serial FROM plant_claim WHERE station = plant_my_station()
+$$
+"""
+"""Claims of the station itself."""
+
+_END: Final = f"""
+CREATE OR REPLACE FUNCTION plant_end_claims() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
+DECLARE
+    ended run;
+BEGIN
+    DELETE FROM plant_claim WHERE station = NEW.station AND token IN (
+        SELECT m.text FROM step s JOIN measurement m ON m.step_id = s.id
+        WHERE s.run_id = NEW.run_id AND s.position = 1 AND s.name = '{StepName.PLANT}'
+            AND m.name = '{PLANT_CLAIM}');
+    SELECT * INTO ended FROM run WHERE id = NEW.run_id;
+    IF ended.state = 'PASS' AND ended.kind IN ('{RunKind.PRODUCTION}', '{RunKind.RECHECK}') THEN
+        INSERT INTO plant_pass (unit_id, is_virtual, run_id, station)
+            VALUES (ended.unit_id, ended.is_virtual, ended.id, NEW.station) ON CONFLICT DO NOTHING;
+        IF NOT FOUND THEN
+            INSERT INTO plant_duplicate (run_id, first_run_id)
+                SELECT ended.id, p.run_id FROM plant_pass p WHERE p.unit_id = ended.unit_id
+                    AND p.is_virtual = ended.is_virtual AND p.station <> NEW.station;
+        END IF;
+    END IF;
+    RETURN NULL;
+END $$
+"""
+"""Ends the claim of a run that was sent, and compares its PASS with those of other stations."""
+
+_TRIGGER: Final = """
+DROP TRIGGER IF EXISTS plant_end_claims ON chain_row;
+CREATE TRIGGER plant_end_claims AFTER INSERT ON chain_row FOR EACH ROW
+    WHEN (NEW.content IS NOT NULL) EXECUTE FUNCTION plant_end_claims();
+"""
+
+FUNCTIONS: Final = (_CLAIM, _RENEW, _RELEASE, _CLAIMS, _END, _TRIGGER)
+
+
+def rights(stations: str) -> str:
+    """Statement that gives the role of all stations its rights; the name is quoted."""
+    return f"""
+GRANT EXECUTE ON FUNCTION plant_claim(text, text, text, boolean, text, double precision),
+    plant_renew(text[], double precision), plant_release(text[]), plant_claims() TO {stations};
+"""

@@ -1,0 +1,256 @@
+"""Claims units in the plant's database for a station, and keeps the claims while runs last.
+
+A server that does not answer is asked once; until it answers again, `claim` fails at once, so that
+a server that is away delays no unit. Whether a unit that another station claims may be run is the
+recipe's matter (`flasher.station.records.claims`).
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import closing
+from datetime import datetime
+from typing import Final
+
+from sqlalchemy import Connection, select, text
+
+from flasher.log import log_event
+from flasher.plant.central import Central
+from flasher.station.records import schema
+from flasher.station.records.database import Database
+from flasher.station.records.errors import RecordError
+from flasher.station.records.model import (
+    PLANT_CLAIM,
+    Elsewhere,
+    ElsewhereState,
+    Order,
+    StationClock,
+    utc_text,
+)
+
+LEASE_S: Final = 60.0
+"""Time after which a claim expires unless it is renewed."""
+KEEP_S: Final = 15.0
+"""Interval at which claims are renewed."""
+RETRY_S: Final = 5.0
+"""Interval at which a server that did not answer is asked again."""
+CLOCK_KNOWN_S: Final = 12 * 3600.0
+"""Time for which a comparison of the clocks counts: this computer's monotonic clock drifts by less
+than a second meanwhile."""
+_CLOSE_S: Final = 3.0
+
+_ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
+_CLAIM: Final = text(
+    "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s)"
+)
+_RENEW: Final = text("SELECT plant_renew(:tokens, :lease_s)")
+_RELEASE: Final = text("SELECT plant_release(:tokens)")
+_NOW: Final = text("SELECT clock_timestamp()")
+_CLAIMS: Final = text("SELECT * FROM plant_claims()")
+
+
+def clock_offset_s(central: Central, clock: StationClock) -> float:
+    """A computer's clock minus that of a plant's database. Raises RecordError."""
+    with central.reading() as connection:
+        return _offset_s(_compared(connection, clock), clock)
+
+
+def _compared(connection: Connection, clock: StationClock) -> tuple[float, float]:
+    """The database's time minus this computer's monotonic clock, and the latter."""
+    began_s = clock.monotonic_s()
+    server: datetime = connection.execute(_NOW).scalar_one()
+    now_s = clock.monotonic_s()
+    return server.timestamp() - (began_s + now_s) / 2, now_s
+
+
+def _offset_s(clocks: tuple[float, float], clock: StationClock) -> float:
+    return clock.utc().timestamp() - (clock.monotonic_s() + clocks[0])
+
+
+class PlantClaims:
+    """Claims of one station (`flasher.station.gate.Claims`). `is_kept` starts the thread that
+    renews them; otherwise the owner calls `tend`.
+    """
+
+    def __init__(
+        self,
+        central: Central,
+        records: Database,
+        station: str,
+        clock: StationClock,
+        *,
+        is_kept: bool = True,
+    ) -> None:
+        self._central, self._records = central, records
+        self._station, self._clock = station, clock
+        self._mutex = threading.Lock()
+        self._asked: set[str] = set()
+        """Claims of this process, until those of an earlier one are released."""
+        self._kept: set[str] = set()
+        self._left: set[str] = set()
+        """Claims with which no run began."""
+        self._is_entered = self._is_swept = False
+        self._fault: RecordError | None = None
+        """Why the server did not answer last; None if it did."""
+        self._clocks: tuple[float, float] | None = None
+        """As of `_compared`; None before."""
+        self._is_over = False
+        self._poke = threading.Event()
+        self._thread: threading.Thread | None = None
+        if is_kept:
+            self._thread = threading.Thread(target=self._keep, name="claims", daemon=True)
+            self._thread.start()
+
+    # -- `Claims` of a gate -----------------------------------------------------------------------
+
+    def claim(self, token: str, order: Order, part: str) -> Elsewhere | None:
+        """Claim a unit if no other station does. Raises RecordError if it is not known whether the
+        unit was claimed.
+        """
+        with self._mutex:
+            fault = self._fault
+            if not self._is_swept:
+                self._asked.add(token)
+        if fault is not None:
+            raise fault
+        values = {
+            "token": token,
+            "part": part,
+            "serial": order.serial,
+            "is_virtual": order.is_virtual,
+            "socket": order.socket,
+            "lease_s": LEASE_S,
+        }
+        try:
+            with self._central.writing() as central:
+                self._enter(central)
+                found = central.execute(_CLAIM, values).mappings().one()
+        except RecordError as error:
+            with self._mutex:
+                self._fault = error
+            self._poke.set()
+            raise
+        if found["state"] != ElsewhereState.RUNNING:
+            with self._mutex:
+                self._kept.add(token)
+        if found["state"] is None:
+            return None
+        at = utc_text(found["at"])
+        return Elsewhere(
+            ElsewhereState(found["state"]), found["station"], found["socket"], at, found["run"]
+        )
+
+    def clock_offset_s(self) -> float | None:
+        with self._mutex:
+            clocks = self._clocks
+        if clocks is None or self._clock.monotonic_s() - clocks[1] > CLOCK_KNOWN_S:
+            return None
+        return _offset_s(clocks, self._clock)
+
+    def ended(self, token: str) -> None:
+        with self._mutex:
+            self._kept.discard(token)
+
+    def dropped(self, token: str) -> None:
+        with self._mutex:
+            self._kept.discard(token)
+            self._left.add(token)
+        self._poke.set()
+
+    def close(self) -> None:
+        self._is_over = True
+        self._poke.set()
+        if self._thread is None:
+            self._central.close()
+        else:
+            self._thread.join(_CLOSE_S)
+
+    # -- keeping ----------------------------------------------------------------------------------
+
+    def tend(self) -> None:
+        """Renew the claims, and release those that are not needed."""
+        with self._mutex:
+            kept, left = sorted(self._kept), sorted(self._left)
+        try:
+            with self._central.writing() as central:
+                self._enter(central)
+                if not self._is_swept:
+                    left += self._unknown(central)
+                if left:
+                    central.execute(_RELEASE, {"tokens": left})
+                central.execute(_RENEW, {"tokens": kept, "lease_s": LEASE_S})
+                clocks = _compared(central, self._clock)
+        except RecordError as error:
+            with self._mutex:
+                self._fault = error
+            return
+        with self._mutex:
+            self._clocks = clocks
+            self._is_swept = True
+            self._asked.clear()
+            self._left.difference_update(left)
+            self._fault = None
+
+    def _enter(self, central: Connection) -> None:
+        """Tell the database once from which records this station sends."""
+        if self._is_entered:
+            return
+        with self._records.reading() as local:
+            records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
+        central.execute(_ENTER, {"records": records, "station": self._station})
+        self._is_entered = True
+
+    def _unknown(self, central: Connection) -> list[str]:
+        """Claims of this station with which no run began: the station died in between."""
+        claims = central.execute(_CLAIMS).all()
+        with self._mutex:
+            earlier = [each for each in claims if each.token not in self._asked]
+        return [
+            each.token
+            for each in earlier
+            if each.token not in self._recorded(each.part, each.serial)
+        ]
+
+    def _recorded(self, part: str, serial: str) -> set[str]:
+        """Claims of the recorded runs of a unit."""
+        run, step, measurement = schema.run, schema.step, schema.measurement
+        query = (
+            select(measurement.c.text)
+            .join_from(schema.unit, run, run.c.unit_id == schema.unit.c.id)
+            .join(step, step.c.run_id == run.c.id)
+            .join(measurement, measurement.c.step_id == step.c.id)
+            .where(
+                schema.unit.c.part == part,
+                schema.unit.c.serial == serial,
+                step.c.position == 1,
+                measurement.c.name == PLANT_CLAIM,
+            )
+        )
+        with self._records.reading() as local:
+            return set(local.execute(query).scalars())
+
+    def _keep(self) -> None:
+        with closing(self._central):
+            while not self._is_over:
+                self._poke.clear()
+                try:
+                    self.tend()
+                except Exception as error:  # noqa: BLE001  claims expire, and runs are marked
+                    log_event(error)
+                with self._mutex:
+                    is_behind = self._fault is not None
+                if is_behind:  # `dropped` must not ask a dead server again and again
+                    self._wait(RETRY_S)
+                else:
+                    self._poke.wait(KEEP_S)
+            with self._mutex:
+                has_left = bool(self._left) and self._fault is None
+            if has_left:
+                self.tend()
+
+    def _wait(self, limit_s: float) -> None:
+        """Wait, or until the station ends."""
+        until_s = self._clock.monotonic_s() + limit_s
+        while not self._is_over and (left_s := until_s - self._clock.monotonic_s()) > 0:
+            self._poke.wait(left_s)
+            self._poke.clear()
