@@ -37,7 +37,7 @@ class TimeName:
     POWERED: Final = "power to first boot version"
     SPACING: Final = "boot version to boot version"
     GAP: Final = "boot version to boot version without an application"
-    LATE: Final = "pause to boot version, beyond the shortest one"
+    LATE: Final = "pause to boot version, beyond the pause of the profile"
     REQUEST: Final = "update command to request transfer"
     ANSWER: Final = "packet to ACK"
     REJECTED: Final = "bad packet to NAK"

@@ -161,6 +161,11 @@ def test_an_image_may_be_refused_much_later_than_init_saw_the_good_one_confirmed
     assert profile_faults(17, Selection(cases=("TX-07",)), make=right_c_device) == []
 
 
+def test_a_pause_that_counts_from_a_packet_ends_sooner_after_a_late_ack() -> None:
+    """`init` sees it after 2.0 to 2.5 s, and its own waits become one (tx_01_lost_frame)."""
+    assert profile_faults(24, Selection(cases=("TX-12",)), make=right_c_device) == []
+
+
 def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without_power() -> None:
     device = right_c_device(3)
     choices = {**device.choices, "PAGE_BYTES": 8448, "PAUSE_US": 2_500_000}

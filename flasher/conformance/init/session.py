@@ -193,9 +193,18 @@ class InitSession(PacketTransfer):
         """Send the next packet unchanged until it is acknowledged."""
         bench = self.bench
         bench.forget()
-        trouble = bench.host.deliver_packet(self.image, self.stored + 1, bench.now)
-        bench.require(not trouble, f"ACK {self.stored + 1}", trouble or "ACK")
-        self.stored += 1
+        number = self.stored + 1
+        trouble = bench.host.deliver_packet(self.image, number, bench.now)
+        if trouble.startswith(Reply.BOOT_VERSION.value):
+            self.begin_again(number)
+            return
+        bench.require(not trouble, f"ACK {number}", trouble or "ACK")
+        self.stored = number
+
+    def begin_again(self, number: int) -> None:
+        """Send the packets up to `number` in a new transfer: a wait became a pause (tx_12)."""
+        self.update()
+        self.packets(number)
 
     def feedback_since(self, moment: float) -> int:
         """Count general feedback since `moment`, including messages that were not collected."""
