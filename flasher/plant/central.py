@@ -34,11 +34,18 @@ class Refusal(StrEnum):
     """The station's records end before the plant's: an older copy."""
     INCOMPLETE = "incomplete"
     """A row is missing in between."""
+    TAKEN_OVER = "taken-over"
+    """Another PC continues the station."""
     FOREIGN = "foreign"
     """The chain belongs to another station, user or records."""
 
     @property
     def remedy(self) -> str:
+        if self is Refusal.TAKEN_OVER:
+            return (
+                "End the station on this PC. What it has recorded since then: flasher station"
+                " bring-in, on the other PC. To take the station back: flasher station take-over."
+            )
         if self is Refusal.FOREIGN:
             return (
                 "If the station has new records: flasher plant init --renew STATION --database"

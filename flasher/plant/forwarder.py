@@ -42,18 +42,25 @@ BATCH_ROWS: Final = 200
 BATCH_BYTES: Final = 4 * 1024 * 1024
 """Traces of a batch; the first run is sent whatever its size."""
 _STATE_MAX_SIZE: Final = 64 * 1024
+_WITH_RUN: Final = (chain.CLAIMED, *chain.ENDINGS)
 _ROW: Final = ("number", "at", "event", "data", "previous_hash", "hash", "signature")
 
-_ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
+ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
 _REPORT: Final = text("SELECT plant_report(:version, :unsent, :oldest, :offset_s, :free, :refusal)")
 _ADD_PART: Final = text(
     "INSERT INTO shared_part (station, sha256, content) VALUES (:station, :sha256, :content)"
     " ON CONFLICT DO NOTHING"
 )
+_ADD_OPEN: Final = text(
+    "INSERT INTO open_run (station, run_number, content) VALUES (:station, :run_number,"
+    " CAST(:content AS json)) ON CONFLICT DO NOTHING"
+)
+_TAKEN_OVER: Final = text("SELECT * FROM plant_taken_over()")
+_REPORT_OTHER: Final = text("SELECT plant_report_other(:refusal)")
 _ADD_TRACE: Final = text(
     "INSERT INTO trace (sha256, data) VALUES (:sha256, :data) ON CONFLICT DO NOTHING"
 )
-_ADD_ROW: Final = text(
+ADD_ROW: Final = text(
     "INSERT INTO chain_row (station, number, at, event, run_number, data, previous_hash, hash,"
     " signature, content) VALUES (:station, :number, :at, :event, :run_number, :data,"
     " :previous_hash, :hash, :signature, CAST(:content AS json)) ON CONFLICT DO NOTHING"
@@ -110,9 +117,17 @@ class _Batch:
     rows: list[dict[str, Any]] = field(default_factory=list)
     parts: dict[str, str] = field(default_factory=dict)
     """Shared parts of runs by their digest."""
+    open_runs: list[dict[str, Any]] = field(default_factory=list)
+    """Runs that are claimed in this batch and do not end in it."""
     traces: list[dict[str, Any]] = field(default_factory=list)
     size_bytes: int = 0
     """Size of the traces."""
+
+    def add_parts(self, content: Mapping[str, Any]) -> None:
+        """Add the shared parts of a run."""
+        for name in SHARED_PARTS:
+            part = chain.canonical(content[name])
+            self.parts[hashlib.sha256(part.encode("ascii")).hexdigest()] = part
 
 
 @dataclass(frozen=True)
@@ -187,7 +202,7 @@ class Forwarder:
         """Ask the database for the last row that it has. Raises RecordError."""
         with self._central.writing() as central:
             named = {"records": self._records_id, "station": self._station}
-            return _Head(*central.execute(_ENTER, named).one())
+            return _Head(*central.execute(ENTER, named).one())
 
     @cached_property
     def _records_id(self) -> str:
@@ -203,8 +218,8 @@ class Forwarder:
             if head.number:
                 self._compare(local, head)
             rows = local.execute(_rows_after(self._station, head.number)).mappings().all()
-            ended = [row["run_id"] for row in rows if row["event"] in chain.ENDINGS]
-            contents = chain.contents_of(local, ended)
+            runs = {row["run_id"] for row in rows if row["event"] in _WITH_RUN}
+            contents = chain.contents_of(local, runs)
         for row in rows:
             content = contents.get(row["run_id"]) if row["event"] in chain.ENDINGS else None
             if content is not None:
@@ -213,25 +228,41 @@ class Forwarder:
                 if batch.traces and batch.size_bytes > BATCH_BYTES:
                     break
                 batch.traces += traces
-                for name in SHARED_PARTS:
-                    part = chain.canonical(content[name])
-                    batch.parts[hashlib.sha256(part.encode("ascii")).hexdigest()] = part
+                batch.add_parts(content)
             own = content and chain.canonical({name: content[name] for name in OWN_PARTS})
-            batch.rows.append(
-                {name: row[name] for name in _ROW}
-                | {"station": head.station, "run_number": row["run_id"], "content": own}
-            )
+            batch.rows.append(row_values(row, head.station) | {"content": own})
+        ended = {row["run_number"] for row in batch.rows if row["content"] is not None}
+        for sent in batch.rows:
+            number = sent["run_number"]
+            if sent["event"] == chain.CLAIMED and number not in ended and number in contents:
+                batch.add_parts(contents[number])
+                parts = {name: contents[number][name] for name in ("run", "targets", "unit")}
+                batch.open_runs.append(
+                    {
+                        "station": head.station,
+                        "run_number": number,
+                        "content": chain.canonical(parts),
+                    }
+                )
         return batch
 
     def _compare(self, local: Connection, head: _Head) -> None:
         """Compare the database's last row with the station's. Raises ChainRefusedError."""
         found = chain.hash_at(local, self._station, head.number)
+        if found == head.hash:
+            return
+        where = self._central.shown
+        with self._central.writing() as central:
+            taken: Any = central.execute(_TAKEN_OVER).one_or_none()
+        if taken and chain.hash_at(local, self._station, taken.number) != taken.hash:
+            data = chain.data_of(taken.data)
+            what = f"{data.get('computer')} runs the station since {taken.at[:19]} UTC"
+            raise ChainRefusedError(Refusal.TAKEN_OVER, what, where=where)
         if found is None:
             what = f"the plant has row {head.number}, the station does not"
-            raise ChainRefusedError(Refusal.REPLAYED, what, where=self._central.shown)
-        if found != head.hash:
-            what = f"the plant has row {head.number} with another hash"
-            raise ChainRefusedError(Refusal.FORKED, what, where=self._central.shown)
+            raise ChainRefusedError(Refusal.REPLAYED, what, where=where)
+        what = f"the plant has row {head.number} with another hash"
+        raise ChainRefusedError(Refusal.FORKED, what, where=where)
 
     def _traces_of(self, content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         """Attachments of a run. One that is missing or damaged is left out: `plant verify` reports
@@ -253,7 +284,8 @@ class Forwarder:
         traces = sorted(batch.traces, key=itemgetter("sha256"))
         with self._central.writing() as central:
             for statement, values in (
-                (_ADD_PART, new), (_ADD_TRACE, traces), (_ADD_ROW, batch.rows),
+                (_ADD_PART, new), (_ADD_TRACE, traces), (_ADD_OPEN, batch.open_runs),
+                (ADD_ROW, batch.rows),
             ):  # fmt: skip
                 if values:
                     central.execute(statement, values)
@@ -301,9 +333,18 @@ class Forwarder:
             values["free"] = shutil.disk_usage(self._files.folder).free
         try:
             with self._central.writing() as central:
-                central.execute(_REPORT, values)
+                if state.refusal.startswith(Refusal.TAKEN_OVER):
+                    central.execute(_REPORT_OTHER, {"refusal": state.refusal})
+                else:
+                    central.execute(_REPORT, values)
         except RecordError as error:
             self.state = replace(state, fault=error.cause or error.what)
+
+
+def row_values(row: Mapping[Any, Any], station: UUID) -> dict[str, Any]:
+    """Values of an audit row for `ADD_ROW`."""
+    named = {name: row[name] for name in _ROW}
+    return named | {"station": station, "run_number": row["run_id"], "content": None}
 
 
 def _rows_after(station: str, number: int) -> Any:

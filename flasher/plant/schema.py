@@ -31,7 +31,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "2"
+PLANT_SCHEMA: Final = "3"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -57,9 +57,12 @@ plant_station: Final = Table(
     Column("clock_offset_s", Float),
     Column("disk_free_bytes", BigInteger),
     Column("refusal", Text, nullable=False, server_default=""),
+    Column("other_refusal", Text, nullable=False, server_default=""),
+    Column("other_reported_at", DateTime(timezone=True)),
 )
 """A station that may send, by its role, and what it reported last. `station` identifies the chain
-of a station in its records; it is set when the station first connects."""
+of a station in its records; it is set when the station first connects. `other_...`: report of a PC
+that still runs as this station, although another one has taken it over."""
 
 chain_row: Final = Table(
     "chain_row",
@@ -87,6 +90,17 @@ chain_row: Final = Table(
 """The stations' audit rows as they were signed. `run_number` is the run's id at the station.
 `content` of the end of a run: the rows of the run as JSON, whose digests the audit row states.
 `station_id` and `run_id` are ids of this database, set by `plant_bring`."""
+
+open_run: Final = Table(
+    "open_run",
+    metadata,
+    Column("station", Uuid, nullable=False),
+    Column("run_number", BigInteger, nullable=False),
+    Column("content", JSON, nullable=False),
+    PrimaryKeyConstraint("station", "run_number"),
+)
+"""Runs that were claimed and have not ended: their row, targets and unit, whose digests the audit
+row of the claim states. A PC that takes the station over ends them."""
 
 shared_part: Final = Table(
     "shared_part",

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, inspect, select, text
 from sqlalchemy.dialects.postgresql import insert
 
 from flasher.errors import ErrorCode, UsageError
-from flasher.plant import claim_functions, functions
+from flasher.plant import claim_functions, functions, takeover_functions
 from flasher.plant.central import Central, plant_location
 from flasher.plant.schema import (
     PLANT_SCHEMA,
@@ -101,10 +101,20 @@ def setup(
         is_new = _bring_up_to_date(connection, central, now)
         for role in (STATIONS, READERS):
             _make(connection, role)
-        _execute(connection, *functions.FUNCTIONS, *claim_functions.FUNCTIONS)
+        _execute(
+            connection,
+            *functions.FUNCTIONS,
+            *claim_functions.FUNCTIONS,
+            *takeover_functions.FUNCTIONS,
+        )
         database = connection.execute(text("SELECT current_database()")).scalar_one()
         quoted = [_quoted(connection, each) for each in (database, STATIONS, READERS)]
-        _execute(connection, functions.rights(*quoted), claim_functions.rights(quoted[1]))
+        _execute(
+            connection,
+            functions.rights(*quoted),
+            claim_functions.rights(quoted[1]),
+            takeover_functions.rights(*quoted[1:]),
+        )
         made, named = [], []
         for station in dict.fromkeys((*stations, *renewed)):
             role = _add_station(connection, station)
@@ -139,7 +149,8 @@ def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -
         )
     station_schema.metadata.create_all(connection, STATION_TABLES)
     metadata.create_all(connection)
-    _execute(connection, *functions.FUNCTIONS, functions.ONCE)
+    _execute(connection, *functions.FUNCTIONS, *takeover_functions.FUNCTIONS)
+    _execute(connection, functions.ONCE, takeover_functions.ONCE)
     # As in a station's records: pages check this version.
     version = station_schema.SCHEMA_VERSION
     connection.execute(

@@ -12,7 +12,8 @@ from flasher.plant.central import Central
 
 _QUERY: Final = text("""
 SELECT p.name AS station, p.role, p.reported_at, p.version, p.unsent, p.oldest_unsent_at,
-    p.clock_offset_s, p.disk_free_bytes, p.refusal, clock_timestamp() AS now,
+    p.clock_offset_s, p.disk_free_bytes, p.refusal, p.other_refusal, p.other_reported_at,
+    clock_timestamp() AS now,
     coalesce(c.number, 0) AS head_number, c.hash AS head_hash, c.at AS head_at
 FROM plant_station p LEFT JOIN LATERAL (
     SELECT number, hash, at FROM chain_row WHERE chain_row.station = p.station
@@ -49,6 +50,10 @@ class StationStatus:
     disk_free_bytes: int | None
     refusal: str
     """Why the database refuses its chain; empty if it does not."""
+    other_refusal: str
+    """Why it refuses a PC that ran as this station before another one took it over."""
+    other_reported_at: datetime | None
+    """When that PC reported last."""
 
 
 def stations_of(central: Central) -> list[StationStatus]:

@@ -230,7 +230,7 @@ class _Plant:
             name="t.log.gz", sha256=sha256, size_bytes=size,
         )  # fmt: skip
         parts = self._parts(run_id, utc_text(at), bad=bad)
-        claim = {name: value for name, value in run.items() if name not in chain._OUTCOME}
+        claim = {name: value for name, value in run.items() if name not in chain.OUTCOME}
         digests = {
             "run": digest(run),
             CLAIM: digest([claim, [{**target, "reached": None}]]),

@@ -12,6 +12,8 @@ import resource
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from flasher.image.load import load
@@ -59,9 +61,16 @@ def make_recipe(folder: Path) -> LoadedRecipe:
 
 
 class Measured:
-    """One station with so many sockets, each with so many units."""
+    """One station with so many sockets, each with so many units. `beside` gets its records."""
 
-    def __init__(self, sockets: int, units: int) -> None:
+    def __init__(
+        self,
+        sockets: int,
+        units: int,
+        name: str = "benchmark",
+        beside: Callable[[Path], AbstractContextManager[None]] = lambda _records: nullcontext(),
+    ) -> None:
+        self._name, self._beside = name, beside
         self.flash_s: list[float] = []
         self.run_s: list[float] = []
         self.beside_s: list[float] = []
@@ -71,8 +80,8 @@ class Measured:
         self.bad = 0
         self.wall_s = self.cpu_s = self.station_cpu_s = 0.0
         self._wanted = sockets * units
-        with tempfile.TemporaryDirectory() as name:
-            self._measure(Path(name), sockets, units)
+        with tempfile.TemporaryDirectory() as folder:
+            self._measure(Path(folder), sockets, units)
 
     def _measure(self, folder: Path, sockets: int, units: int) -> None:
         recipe = make_recipe(folder)
@@ -92,8 +101,11 @@ class Measured:
         ]
         cpu_before, own_before = _children_cpu_s(), time.process_time()
         key_locations = KeyLocations(folder / "keys")
-        records = str(folder / "records.sqlite")
-        with Store.open(records, station="benchmark", key_locations=key_locations) as store:
+        records = folder / "records.sqlite"
+        with (
+            Store.open(str(records), station=self._name, key_locations=key_locations) as store,
+            self._beside(records),
+        ):
             options = StationOptions(scans_labels=True)
             station = Station(
                 store, recipe, setups, operator="jo", on_event=self._hear, options=options

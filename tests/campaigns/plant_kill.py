@@ -59,8 +59,8 @@ CHANCE: Final = 0.1
 PASSWORD: Final = "campaign"  # noqa: S105
 _DRAIN_LIMIT_S: Final = 3600.0
 _STATEMENTS: Final = {
-    forwarder._ENTER: "enter", forwarder._ADD_PART: "part", forwarder._ADD_TRACE: "trace",
-    forwarder._ADD_ROW: "row",
+    forwarder.ENTER: "enter", forwarder._ADD_PART: "part", forwarder._ADD_TRACE: "trace",
+    forwarder.ADD_ROW: "row",
 }  # fmt: skip
 
 
@@ -136,7 +136,7 @@ def _send(what: Sending, folder: Path) -> None:
 
         def execute(self, statement: Any, values: Any) -> Any:
             found = self._connection.execute(statement, values)
-            self.is_batch = self.is_batch or statement is forwarder._ADD_ROW
+            self.is_batch = self.is_batch or statement is forwarder.ADD_ROW
             if statement in _STATEMENTS:
                 may_die(_STATEMENTS[statement])
             return found

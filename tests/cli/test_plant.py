@@ -11,9 +11,11 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,6 +34,7 @@ from tests.station.postgres import Server
 __all__ = ["plant", "sender"]
 pytestmark = pytest.mark.slow
 BMS_SHA256 = IMAGES[BMS].sha256
+BADGES = '[[person]]\nname = "Jo"\ncode = "B1"\nrole = "rework"\n'
 STATION = """\
 name = "line-2"
 plant = "{plant}"
@@ -355,3 +358,116 @@ def test_records_of_a_station_are_not_on_a_server(flasher: Flasher, tmp_path: Pa
         assert run.code == ExitCode.USAGE
         assert "in a file on its own PC" in run.document["error"]["what"]
         assert "flasher plant report" in run.document["error"]["remedy"]
+
+
+# -- a spare PC ------------------------------------------------------------------------------------
+
+PASSPHRASE = "correct horse battery"  # noqa: S105  of an export that the test makes
+
+
+@dataclass
+class Export:
+    """A sealed export of line-2, whose plant has a run and an active run."""
+
+    flasher: Flasher
+    sender: Sender
+    folder: Path
+    file: Path = field(init=False)
+    """The station file."""
+
+    def __post_init__(self) -> None:
+        old = self.sender.bench
+        self.file = self.sender.folder / "station.toml"
+        url = self.sender.plant.url("flasher_line_2")
+        text = f'keys = "keys"\nbadges = "badges.toml"\n{STATION.format(plant=url)}'
+        self.file.write_text(text, encoding="utf-8")
+        (self.sender.folder / "badges.toml").write_text(BADGES, encoding="utf-8")
+        old.make(serial="W2605001")
+        old.claim("W2605004", "B")
+        self.sender.send()
+        old.store.close()
+        self.sealed = self.folder / "line-2.sealed"
+        self.spare = self.folder / "spare" / "station.toml"
+
+    def secret(self, passphrase: str = PASSPHRASE) -> tuple[str, Path]:
+        path = self.folder / "passphrase"
+        path.write_text(passphrase, encoding="utf-8")
+        return "--passphrase-file", path
+
+    def make(self, *words: object, passphrase: str = PASSPHRASE) -> Any:
+        secret = self.secret(passphrase)
+        return self.flasher(
+            "station", "export", self.sealed, "--sockets", self.file, *words, *secret
+        )
+
+    def take_over(self, sockets: Path, *words: object) -> Any:
+        url = self.sender.plant.url("flasher_desk")
+        place = ("--sockets", sockets, "--database", url, "--reason", "broken")
+        return self.flasher("station", "take-over", *place, *words)
+
+
+@pytest.fixture
+def exported(flasher: Flasher, sender: Sender, tmp_path: Path) -> Export:
+    return Export(flasher, sender, tmp_path)
+
+
+def test_an_export_has_the_settings_and_the_key(exported: Export) -> None:
+    run = exported.make(passphrase="short")  # noqa: S106  refused
+    assert (run.code, exported.sealed.exists()) == (ExitCode.USAGE, False)
+    recipe = exported.sender.folder / "recipe.toml"
+    run = exported.make("--recipe", recipe, "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, 0)
+    assert run.document["members"] == [
+        "badges.toml", "bms.bin", "bms.bin.toml", "recipe.toml", "signing.key", "station.toml",
+    ]  # fmt: skip
+    assert b"PRIVATE KEY" not in exported.sealed.read_bytes()
+
+
+def test_an_export_that_cannot_be_opened_changes_nothing(exported: Export) -> None:
+    exported.make()
+    half, other = exported.folder / "half.sealed", exported.folder / "other.sealed"
+    half.write_bytes(exported.sealed.read_bytes()[:-1])
+    other.write_bytes(b"something else")
+    for path, phrase, code in (
+        (exported.sealed, "wrong horse battery", ExitCode.VERIFICATION),
+        (half, PASSPHRASE, ExitCode.VERIFICATION),
+        (other, PASSPHRASE, ExitCode.USAGE),
+        (exported.folder / "none", PASSPHRASE, ExitCode.USAGE),
+    ):
+        run = exported.take_over(exported.spare, "--from", path, *exported.secret(phrase))
+        assert run.code == code
+        assert not exported.spare.parent.exists()
+    assert exported.sender.plant.rows("SELECT count(*) FROM open_run") == [(1,)]
+
+
+def test_a_spare_pc_continues_a_station_with_its_export(exported: Export) -> None:
+    flasher, schema = exported.flasher, json.loads(SCHEMA.read_text("utf-8"))
+    url = exported.sender.plant.url("flasher_desk")
+    exported.make("--recipe", exported.sender.folder / "recipe.toml")
+    run = exported.take_over(
+        exported.spare, "--from", exported.sealed, *exported.secret(), "--json"
+    )
+    hold_output(schema, run.out, 0)
+    assert run.document["active"] == ["W2605004"]
+    assert (exported.spare.parent / "recipe.toml").exists()
+    assert flasher("station", "verify", "--sockets", exported.spare).code == ExitCode.OK
+
+    assert "taken-over" in flasher("plant", "send", "--sockets", exported.file).err
+    shown = flasher("plant", "status", "--database", url)
+    assert "another PC, REFUSED" in shown.out
+    plain = exported.file.with_name("plain.toml")
+    without = exported.file.read_text("utf-8").replace('badges = "badges.toml"', "")
+    plain.write_text(without, encoding="utf-8")
+    start = ("--recipe", exported.sender.folder / "recipe.toml", "--units", "1")
+    run = flasher("station", "run", *start, "--sockets", plain, "--operator", "jo")
+    assert (run.code, "another pc" in run.err.lower()) == (ExitCode.USAGE, True)
+
+    back = exported.take_over(exported.file, "--json")
+    hold_output(schema, back.out, 0)
+    assert back.document["brought_in"] is None
+    words = (back.document["set_aside"], "--sockets", exported.file, "--reason", "x", "--json")
+    run = flasher("station", "bring-in", *words)
+    hold_output(schema, run.out, 0)
+    assert "taken-over" in flasher("plant", "send", "--sockets", exported.spare).err
+    assert flasher("plant", "verify", "--database", url).code == ExitCode.OK
+    assert PASSWORD not in run.out + shown.out + back.out

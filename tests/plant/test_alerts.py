@@ -27,6 +27,7 @@ GOOD = StationStatus(
     station="line-2", role="flasher_line_2", reported_at=NOW - timedelta(seconds=10), now=NOW,
     silent_s=10.0, version="1.0", head_number=4, head_hash="a" * 64, head_at=utc_text(NOW),
     unsent=0, oldest_unsent_at="", clock_offset_s=0.1, disk_free_bytes=10**11, refusal="",
+    other_refusal="", other_reported_at=None,
 )  # fmt: skip
 BOUNDS = Bounds(repeats=3)
 OK, UNKNOWN, ALERT = CheckState.OK, CheckState.UNKNOWN, CheckState.ALERT

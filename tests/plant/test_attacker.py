@@ -52,6 +52,18 @@ ATTEMPTS = {
     "add a row with a false hash": (
         f"{_ROW} VALUES ({_MINE}, 5, '', 'sign-in', '', '{{head}}', {_HASH}, '')", REFUSED,
     ),
+    "read active runs": ("SELECT * FROM open_run", DENIED),
+    "end the active run of another station": ("DELETE FROM open_run", DENIED),
+    "add an active run to another station": (
+        f"INSERT INTO open_run VALUES ({_THEIRS}, 9, '{{{{}}}}')", POLICY,
+    ),
+    "take another station over": (
+        f"{_ROW} VALUES ({_THEIRS}, 5, '', 'taken over', '', {_HASH}, {_HASH}, '')", REFUSED,
+    ),
+    "take the own station over with a false hash": (
+        f"{_ROW} VALUES ({_MINE}, 5, '', 'taken over', '', '{{head}}', {_HASH}, '')", REFUSED,
+    ),
+    "end an active run by the inner function": ("SELECT plant_close()", DENIED),
     "overwrite a row": (
         f"{_ROW} VALUES ({_MINE}, 4, '', 'sign-in', '', {_HASH}, {_HASH}, '')"
         " ON CONFLICT (station, number) DO UPDATE SET data = 'x'", DENIED,
@@ -119,5 +131,5 @@ def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
 
 def _everything(plant: Plant) -> dict[str, list[tuple[Any, ...]]]:
     tables = ("chain_row", "shared_part", "trace", "plant_station", "run", "unit", "station",
-              "plant_claim", "plant_pass", "plant_duplicate")  # fmt: skip
+              "plant_claim", "plant_pass", "plant_duplicate", "open_run")  # fmt: skip
     return {table: plant.rows(f"SELECT * FROM {table} ORDER BY 1, 2") for table in tables}

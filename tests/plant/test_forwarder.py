@@ -123,7 +123,7 @@ def test_a_forwarder_that_dies_loses_and_doubles_nothing(
     sender.bench.make(RunState.FAIL, serial=OTHER)
     reached: list[str] = []
     usual = Central.writing
-    points = {"enter": "_ENTER", "part": "_ADD_PART", "trace": "_ADD_TRACE", "row": "_ADD_ROW"}
+    points = {"enter": "ENTER", "part": "_ADD_PART", "trace": "_ADD_TRACE", "row": "ADD_ROW"}
 
     class Dying:
         def __init__(self, connection: Any) -> None:

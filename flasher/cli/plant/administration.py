@@ -142,6 +142,9 @@ def _lines(of: StationOverview) -> Iterator[str]:
     yield f"{name}: {seen} {duration(each.silent_s)}{ago}, flasher {printable(each.version)}"
     if each.refusal:
         yield printable(f"  REFUSED: {each.refusal}")
+    if each.other_reported_at is not None:
+        at = f"{each.other_reported_at:%Y-%m-%d %H:%M:%S %Z}"
+        yield printable(f"  another PC, REFUSED at {at}: {each.other_refusal}")
     at = f", of {printable(each.head_at)}" if each.head_at else ""
     yield f"  last row:  {each.head_number:,}{at}, hash {(each.head_hash or 'none')[:16]}"
     if (last := of.activity.last_run) is not None:

@@ -447,10 +447,86 @@ def accept(
     return _call("maintenance.accept", output, records, what, operator, reason)
 
 
+_station_file: Final = option(
+    "--sockets", type=values.FilePath("toml", gives=Path), required=True, brief=True,
+    metavar="FILE", help="the station file (TOML)",
+)  # fmt: skip
+_passphrase_option: Final = _path_option(
+    "--passphrase-file",
+    help="a file with the passphrase (default: asked for, or the first line of a pipe)",
+)
+
+
+@station.action("export")
+@argument("file", type=values.FilePath(gives=Path), metavar="FILE", help="the file to write")
+@_station_file
+@option(
+    "--recipe", "recipes", type=values.FilePath("toml", gives=Path), metavar="FILE", multiple=True,
+    help="a recipe to put in, with its images; may be repeated",
+)  # fmt: skip
+@_passphrase_option
+def export(
+    output: Output,
+    file: Path,
+    sockets: Path,
+    recipes: tuple[Path, ...],
+    passphrase_file: Path | None,
+) -> int:
+    """Seal the station's signing key and settings in one file for a spare PC, encrypted with a
+    passphrase. Records are not in it: a spare PC takes them from the plant's database.
+    """
+    return _call("spare.export", output, sockets, recipes, file, passphrase_file)
+
+
+@station.action("take-over")
+@_station_file
+@option(
+    "--database", "url", metavar="URL", required=True, brief=True,
+    help="the plant's database for a reader: postgresql://USER@HOST/NAME",
+)  # fmt: skip
+@_path_option(
+    "--from", "sealed", brief=True,
+    help="the sealed export (default: this PC has the key and the settings)",
+)  # fmt: skip
+@_passphrase_option
+@_operator_option
+@_reason_option(required=True)
+def take_over(
+    output: Output,
+    sockets: Path,
+    url: str,
+    sealed: Path | None,
+    passphrase_file: Path | None,
+    operator: str | None,
+    reason: str,
+) -> int:
+    """Let this PC continue a station from the plant's database. The PC that ran it before is
+    refused from then on; to take the station back, run this there. Settings that are missing here
+    are taken from the export.
+    """
+    need("Taking a station over", "plant")
+    return _call("spare.take_over", output, sockets, url, sealed, passphrase_file, operator, reason)
+
+
+@station.action("bring-in")
+@argument(
+    "file", type=values.FilePath(gives=Path), metavar="RECORDS",
+    help="the records of the PC that ran the station before",
+)  # fmt: skip
+@_operator_option
+@_reason_option(required=True)
+@_records_options
+def bring_in(
+    output: Output, file: Path, operator: str | None, reason: str, records: RecordsOptions
+) -> int:
+    """Bring in what another PC recorded as this station after the station was taken over: runs,
+    traces, and every signed row as it was.
+    """
+    return _call("spare.bring", output, records, file, operator, reason)
+
+
 @station.action("upgrade")
 @_records_options
 def upgrade(output: Output, records: RecordsOptions) -> int:
-    """Migrate records of an older flasher. An SQLite file is backed up first; back up a PostgreSQL
-    database yourself (pg_dump), and migrate it as its owner.
-    """
+    """Migrate records of an older flasher. The file is backed up first."""
     return _call("maintenance.upgrade", output, records)

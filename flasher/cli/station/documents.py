@@ -7,6 +7,7 @@ from typing import Final, get_args
 
 from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
+from flasher.station.records.branch import BroughtIn
 from flasher.station.records.capability import Capability
 from flasher.station.records.model import (
     Backup,
@@ -158,6 +159,40 @@ class SigningKeyDocument:
 
 
 @dataclass(frozen=True)
+class ExportDocument:
+    """A sealed export of a station."""
+
+    station: str
+    file: str
+    members: list[str]
+    left_out: list[str]
+    """Files that are not beside the station file, and not in the export."""
+
+
+@dataclass(frozen=True)
+class BroughtInDocument:
+    """A branch that was brought into a station's records; null: there was nothing to bring in."""
+
+    station: str
+    brought_in: BroughtIn | None
+
+
+@dataclass(frozen=True)
+class TakenOverDocument(BroughtInDocument):
+    """A station that this PC has taken over."""
+
+    rows: int
+    """Audit rows that were made from the plant's database."""
+    runs: int
+    active: tuple[str, ...]
+    """Serial numbers of units that were active at the other PC."""
+    set_aside: str | None
+    """Where the records are that this PC had as the station before."""
+    written: list[str]
+    """Files of the export that were missing here."""
+
+
+@dataclass(frozen=True)
 class AcceptedDocument:
     """Decision of a person that lets the station continue."""
 
@@ -182,7 +217,10 @@ DOCUMENTS: Final = (
     Examination,
     CheckedCertificate,
     SigningKeyDocument,
+    TakenOverDocument,
     AcceptedDocument,
+    BroughtInDocument,
+    ExportDocument,
     PinDocument,
     Upgraded,
 )

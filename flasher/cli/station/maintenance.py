@@ -29,7 +29,7 @@ from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 ELSEWHERE: Final = "heads stored elsewhere"
 
 
-def _open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
+def open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
     """Open the records as the station in the options, or as their only station."""
     place = records_of(records)
     name = place.station
@@ -152,7 +152,7 @@ def key(
     rotate: bool,
     lost: bool,
 ) -> int:
-    with closing(_open_as_station(records, changes=rotate or lost)) as store:
+    with closing(open_as_station(records, changes=rotate or lost)) as store:
         if lost:
             if not reason:
                 raise UsageError("--lost needs a reason.", remedy="Add --reason TEXT.")
@@ -184,7 +184,7 @@ def accept(
     output: Output, records: RecordsOptions, what: str, operator: str | None, reason: str
 ) -> int:
     who = operator_of(operator)
-    with closing(_open_as_station(records, changes=True)) as store:
+    with closing(open_as_station(records, changes=True)) as store:
         if what == "clock":
             store.release_clock(who, reason)
             done = "the clock was accepted; the station may begin units from now on"

@@ -37,7 +37,8 @@ from flasher.station.config import MockUnits, StationConfig, load_config, mock_c
 from flasher.station.events import StationEvent
 from flasher.station.operators import Crew
 from flasher.station.recipe_file import load_checked
-from flasher.station.records.errors import RecordError
+from flasher.station.records.database import locate_records
+from flasher.station.records.errors import RecordError, StationBusyError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import Store
 from flasher.station.socket import FILE, PIPE, TERMINAL
@@ -193,11 +194,18 @@ def _sent_to_plant(
     if not config.plant or _is_temporary(options, records):
         return nullcontext()
     need("Sending records to a plant", "plant")
-    from flasher.plant.central import plant_location  # noqa: PLC0415  an extra
+    from flasher.plant.central import Refusal, plant_location  # noqa: PLC0415  an extra
+    from flasher.plant.forwarder import load_state  # noqa: PLC0415
     from flasher.plant.process import Sending, sending  # noqa: PLC0415
 
     plant_location(config.plant)  # refuses a wrong URL before the first unit
     place = records_of(records)
+    refusal = load_state(locate_records(place.url, place.files).folder, config.name).refusal
+    if refusal.startswith(Refusal.TAKEN_OVER):
+        raise StationBusyError(
+            f"Another PC has taken {printable(config.name)} over: {printable(refusal)}.",
+            remedy="Use that PC. To take the station back: flasher station take-over.",
+        )
     return sending(Sending(config.plant, config.name, place.url, place.files))
 
 

@@ -40,17 +40,28 @@ CLOCK: Final = "clock"
 """An operator confirmed the clock although later times are recorded."""
 RESTORED: Final = "restored"
 """An operator accepted an older copy of the records, whose missing rows are lost."""
+TAKEN_OVER: Final = "taken over"
+"""A person let another PC continue the station. Rows that only the PC before it has are a branch;
+the numbers of runs before `runs_from` are left to it."""
+BRANCH: Final = "branch"
+"""Rows of another PC follow, which it recorded as this station after it had been taken over."""
+BROUGHT_IN: Final = "brought in"
+"""A row of a branch that belongs to no run."""
+RUNS_LEFT_FREE: Final = 100_000
+"""Numbers that a takeover leaves to the runs of the PC before: two months at a unit a minute."""
 RECIPE: Final = "recipe"
 """A recipe was used for the first time."""
 ENDINGS: Final = (FINISHED, INTERRUPTED)
 """Rows that hold the digests of a run that ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
+LOSSES: Final = (RESTORED, TAKEN_OVER)
+"""Rows that may accept a range of rows as lost."""
 _CANONICAL: Final = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr
 )
 EVENTS: Final = (
     BEGUN, CLAIMED, FINISHED, INTERRUPTED, RECIPE, *(event.value for event in AuditEvent), CLOCK,
-    RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED,
+    RESTORED, TAKEN_OVER, BRANCH, BROUGHT_IN, KEY_ROTATED, KEY_LOST, MIGRATED,
 )  # fmt: skip
 """All events of audit rows."""
 
@@ -192,13 +203,21 @@ def head_of(connection: Connection, run_id: int) -> ChainHead | None:
 
 
 def accepted_losses(connection: Connection, station_name: str) -> list[range]:
-    """Ranges of rows that operators accepted as lost when they restored older records."""
-    rows = rows_without_run(connection, station_name, [RESTORED])
+    """Ranges of rows that operators accepted as lost when they restored older records, or that
+    are a branch of another PC.
+    """
+    rows = rows_without_run(connection, station_name, LOSSES)
     return [lost_of(data_of(row.data)) for row in rows]
 
 
+def runs_from(data: Mapping[str, Any]) -> int:
+    """The lowest number for a run after a TAKEN_OVER row."""
+    found = data.get("runs_from")
+    return found if isinstance(found, int) else 1
+
+
 def lost_of(data: Mapping[str, Any]) -> range:
-    """Range of rows that a RESTORED row accepts as lost."""
+    """Range of rows that a row of `LOSSES` accepts as lost."""
     first, last = data.get("lost_from"), data.get("lost_to")
     if isinstance(first, int) and isinstance(last, int):
         return range(first, last + 1)
@@ -249,7 +268,7 @@ OWN: Final = {
 }
 """Parts of a run, as `verify` names them."""
 CLAIM_PARTS: Final = (CLAIM, *NAMED)
-_OUTCOME: Final = frozenset(
+OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
 """Columns of a run that are set when it ends."""
@@ -294,7 +313,7 @@ def digests_in(contents: Mapping[int, Mapping[str, Any]]) -> dict[int, dict[str,
 
 def claim_of(content: Mapping[str, Any]) -> list[Any]:
     """The part of a run that does not change after its claim."""
-    claim = {name: value for name, value in content["run"].items() if name not in _OUTCOME}
+    claim = {name: value for name, value in content["run"].items() if name not in OUTCOME}
     return [claim, [{**each, "reached": None} for each in content["targets"]]]
 
 

@@ -134,6 +134,7 @@ class Claiming:
         run_id = insert(
             connection,
             run,
+            **self._first_number(),
             unit_id=self._unit_id,
             socket_id=self._socket_id,
             recipe_id=self._recipe_id(),
@@ -218,6 +219,15 @@ class Claiming:
         )
         for each in measured:
             insert(self._connection, schema.measurement, step_id=step_id, **asdict(each))
+
+    def _first_number(self) -> dict[str, int]:
+        """Number of the first run after a takeover, which leaves numbers to the PC before."""
+        rows = chain.rows_without_run(self._connection, self._trail.station, [chain.TAKEN_OVER])
+        begin = max((chain.runs_from(chain.data_of(row.data)) for row in rows), default=1)
+        if begin == 1:
+            return {}
+        last = self._connection.execute(select(func.max(run.c.id))).scalar_one() or 0
+        return {"id": begin} if last < begin else {}
 
     def _recipe_id(self) -> int:
         """Row id of the recipe. The row holds the whole text, readable years later."""

@@ -402,17 +402,26 @@ def _create(database: Database, now: datetime) -> None:
     with database.writing() as connection:
         if inspect(connection).has_table(schema_info.name):
             return
-        metadata.create_all(connection)
-        for statement in trigger_statements():
-            connection.exec_driver_sql(statement)
-        connection.execute(
-            schema_info.insert().values(
-                version=SCHEMA_VERSION, created_at=utc_text(now), records_id=uuid4().hex
-            )
-        )
-        connection.execute(alembic_version.insert().values(version_num=str(SCHEMA_VERSION)))
+        create_tables(connection, now, uuid4().hex)
+        create_triggers(connection)
     if database.location.file is not None:
         sync_folder(database.location.file.parent)
+
+
+def create_tables(connection: Connection, now: datetime, records_id: str) -> None:
+    """Create all tables of records, without their rules."""
+    metadata.create_all(connection)
+    connection.execute(
+        schema_info.insert().values(
+            version=SCHEMA_VERSION, created_at=utc_text(now), records_id=records_id
+        )
+    )
+    connection.execute(alembic_version.insert().values(version_num=str(SCHEMA_VERSION)))
+
+
+def create_triggers(connection: Connection) -> None:
+    for statement in trigger_statements():
+        connection.exec_driver_sql(statement)
 
 
 def make_backup(database: Database, files: FileStore, path: Path) -> Backup:

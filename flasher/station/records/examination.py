@@ -380,7 +380,7 @@ class Examiner:
                 continue  # its content is not trusted
             if _table(data.get("schema")):
                 trail.stated = data.get("version"), _table(data.get("schema"))
-            if row["event"] == chain.RESTORED:
+            if row["event"] in chain.LOSSES:
                 trail.restored[expected] = chain.lost_of(data)
             self._add_remarks(shown, row, data)
             for what in _contradictions(trail.station, records_id, row["event"], data):
@@ -451,6 +451,14 @@ class Examiner:
                 self._remarks.append(
                     f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
                     f" up as lost on {decision}"
+                )
+            case chain.TAKEN_OVER:
+                computer = printable(str(data.get("computer")))
+                self._remarks.append(f"{shown}: {computer} took the station over on {decision}")
+            case chain.BRANCH:
+                self._remarks.append(
+                    f"{shown}: rows {data.get('first')} to {data.get('last')} of another PC were"
+                    f" brought in on {decision}"
                 )
             case chain.CLOCK:
                 self._remarks.append(f"{shown}: the clock was released on {decision}")

@@ -57,8 +57,13 @@ class SigningKey:
     @classmethod
     def make(cls, path: Path) -> SigningKey:
         """Create a key file that only this user can read; on disk on return. Raises RecordError."""
-        key = Ed25519PrivateKey.generate()
-        text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        made = cls(Ed25519PrivateKey.generate())
+        made.save(path)
+        return made
+
+    def save(self, path: Path) -> None:
+        """Write the key to a new file, as `make`."""
+        text = self._key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         with mapped(printable(str(path)), writes=True):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _MODE)
@@ -67,7 +72,6 @@ class SigningKey:
                 file.flush()
                 os.fsync(file.fileno())
             sync_folder(path.parent)
-        return cls(key)
 
     @classmethod
     def load(cls, path: Path) -> SigningKey | None:
@@ -85,16 +89,23 @@ class SigningKey:
                         where=shown,
                         remedy=f"chmod 600 {shown}",
                     )
-            data = read(path, KEY_MAX_SIZE, error=RecordError)
-            key = load_pem_private_key(data, password=None)
-        except (ValueError, TypeError, UnsupportedAlgorithm):
-            key = None
-        if not isinstance(key, Ed25519PrivateKey):
+            return cls.parse(read(path, KEY_MAX_SIZE, error=RecordError))
+        except ValueError as error:
             raise KeyMissingError(
                 "The signing key of the station cannot be used: the file holds no Ed25519 key.",
                 where=shown,
                 remedy="Put the right file back; if it is lost: flasher station key --lost.",
-            )
+            ) from error
+
+    @classmethod
+    def parse(cls, data: bytes) -> SigningKey:
+        """Parse the content of a key file. Raises ValueError."""
+        try:
+            key = load_pem_private_key(data, password=None)
+        except (TypeError, UnsupportedAlgorithm) as error:
+            raise ValueError(str(error)) from error
+        if not isinstance(key, Ed25519PrivateKey):
+            raise ValueError("it is not an Ed25519 key")  # noqa: TRY004  it was read from a file
         return cls(key)
 
     def sign(self, text: str, purpose: str = AUDIT_ROW) -> str:

@@ -26,6 +26,7 @@ from flasher.station.records.database import (
     StationLock,
     check_schema,
     copy_checked,
+    create_triggers,
     revision_of,
 )
 from flasher.station.records.errors import (
@@ -42,7 +43,6 @@ from flasher.station.records.triggers import (
     drop_triggers,
     fingerprint_of,
     stated_differences,
-    trigger_statements,
 )
 
 CHANGES: Final = "flasher.station.records:migrations"
@@ -197,8 +197,7 @@ def _change(connection: Connection) -> None:
     config.set_main_option("script_location", CHANGES)
     config.attributes["connection"] = connection
     command.upgrade(config, NEWEST)
-    for statement in trigger_statements():
-        connection.exec_driver_sql(statement)
+    create_triggers(connection)
     connection.execute(update(schema.schema_info).values(version=schema.SCHEMA_VERSION))
     if _missing_rows(connection) != missing:
         raise RecordsDamagedError(f"{NOT_SAVED}: rows would refer to missing rows.")

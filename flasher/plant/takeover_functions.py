@@ -1,0 +1,56 @@
+# ruff: noqa: S608  all of this SQL is written here
+"""SQL functions for the takeover of a station by another PC, and for its active runs."""
+
+from __future__ import annotations
+
+from typing import Final
+
+_DEFINER: Final = "SECURITY DEFINER SET search_path = public, pg_temp"
+
+_TAKEN_OVER: Final = f"""
+CREATE OR REPLACE FUNCTION plant_taken_over(
+    OUT number bigint, OUT hash text, OUT at text, OUT data text
+) RETURNS SETOF record LANGUAGE sql STABLE {_DEFINER} AS $$
+    SELECT c.number, c.hash, c.at, c.data FROM chain_row c
+        WHERE c.station = plant_my_station() AND c.event = 'taken over'
+        ORDER BY c.number DESC LIMIT 1
+$$
+"""
+"""The last takeover of the station that asks."""
+
+_REPORT: Final = f"""
+CREATE OR REPLACE FUNCTION plant_report_other(refused text) RETURNS void
+LANGUAGE sql {_DEFINER} AS $$
+    UPDATE plant_station SET other_refusal = left(refused, 1000),
+        other_reported_at = clock_timestamp() WHERE role = session_user
+$$
+"""
+"""Report of a PC that was taken over: it leaves the report of the station as it is."""
+
+_CLOSE: Final = f"""
+CREATE OR REPLACE FUNCTION plant_close() RETURNS trigger LANGUAGE plpgsql {_DEFINER} AS $$
+BEGIN
+    DELETE FROM open_run WHERE station = NEW.station AND run_number = NEW.run_number;
+    RETURN NULL;
+END $$
+"""
+
+FUNCTIONS: Final = (_TAKEN_OVER, _REPORT, _CLOSE)
+ONCE: Final = """
+CREATE TRIGGER plant_close AFTER INSERT ON chain_row FOR EACH ROW
+    WHEN (NEW.event IN ('finished', 'interrupted')) EXECUTE FUNCTION plant_close();
+ALTER TABLE open_run ENABLE ROW LEVEL SECURITY;
+CREATE POLICY open_run_of_own_station ON open_run FOR INSERT
+    WITH CHECK (station = (SELECT plant_my_station()));
+"""
+"""Statements for a new database."""
+
+
+def rights(stations: str, readers: str) -> str:
+    """Statements that give two roles their rights, after those of `functions`; names are quoted."""
+    return f"""
+GRANT EXECUTE ON FUNCTION plant_taken_over(), plant_report_other(text) TO {stations};
+GRANT INSERT ON open_run TO {stations};
+DROP POLICY IF EXISTS open_run_is_read ON open_run;
+CREATE POLICY open_run_is_read ON open_run FOR SELECT TO {readers} USING (true);
+"""

@@ -1,0 +1,317 @@
+"""A spare PC takes a station over, and the station is taken back: nothing is lost or doubled."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from flasher.plant.central import ChainRefusedError, Refusal
+from flasher.plant.setup import role_of
+from flasher.plant.takeover import TakenOver, Takeover
+from flasher.station.records.branch import BroughtIn, bring_in
+from flasher.station.records.database import locate_records, open_database
+from flasher.station.records.errors import (
+    KeyMissingError,
+    NotFoundError,
+    RecordsDamagedError,
+    StationBusyError,
+    UnprovenError,
+)
+from flasher.station.records.files import FileStore
+from flasher.station.records.keys import KeyLocations
+from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
+from flasher.station.records.signatures import SigningKey
+from tests.plant.factory import READER, Plant, Sender
+from tests.plant.test_verify import examined
+from tests.station.factory import FakeClock
+
+pytestmark = pytest.mark.slow
+WHEN = datetime(2026, 5, 17, 12, tzinfo=UTC)
+
+
+def takeover_of(plant: Plant, folder: Path) -> Takeover:
+    return Takeover(
+        "line-2", plant.url(READER), plant.url(role_of("line-2")),
+        locate_records(str(folder / "records.sqlite")), KeyLocations(folder / "keys"),
+        "sv", "the PC died",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def key(sender: Sender) -> bytes:
+    return sender.bench.store.signer.key_file.read_bytes()
+
+
+def spare_of(plant: Plant, sender: Sender, name: str = "spare") -> Sender:
+    """Another PC, with the records that a takeover has put there."""
+    folder = plant.folder / name
+    shutil.copytree(sender.bench.folder / "keys", folder / "unused", dirs_exist_ok=True)
+    made = object.__new__(Sender)
+    made.plant, made.station, made.folder, made.role = plant, "line-2", folder, ""
+    made._forwarders = []
+    made.bench = bench = object.__new__(type(sender.bench))
+    bench.folder, bench.path, bench.recipe = folder, folder / "records.sqlite", sender.bench.recipe
+    bench.clock, bench.lock_timeout_s, bench.heads, bench._traces = FakeClock(WHEN), 0.5, (), 500
+    bench.trace = bench.traced("W2605002")
+    bench.store = bench.opened()
+    bench.store.recover()
+    made.start()
+    return made
+
+
+def taken(plant: Plant, key: bytes | None, name: str = "spare") -> TakenOver:
+    return takeover_of(plant, plant.folder / name).run(key, FakeClock(WHEN).utc)
+
+
+def brought(spare: Sender, old: Path) -> BroughtIn:
+    files = old.with_name("records.sqlite.files")
+    with closing(
+        open_database(
+            locate_records(str(old), files), WHEN, lock_timeout_s=0.5, create=False, read_only=True
+        )
+    ) as branch:
+        return bring_in(
+            spare.bench.store, branch, FileStore(files), by="sv", reason="back", now=WHEN
+        )
+
+
+def states(sender: Sender) -> dict[str, UnitState]:
+    store = sender.bench.store
+    return {row.serial: store.read.unit(row.serial).state for row in store.read.table()}
+
+
+@pytest.fixture
+def spares() -> Iterator[list[Sender]]:
+    made: list[Sender] = []
+    yield made
+    for each in made:
+        each.close()
+
+
+def test_a_spare_pc_goes_on_in_mid_shift_and_the_station_is_taken_back(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    old = sender.bench
+    old.make(serial="W2605001")
+    old.make(RunState.FAIL, serial="W2605003", lot="L1")
+    active = old.claim("W2605004", "B")
+    old.store.note(AuditEvent.OPERATOR, {"name": "jo"})
+    sender.send()
+    # Not sent: the end of the active run, a run, and one that has not ended.
+    old.work(active.run_id)
+    old.store.finish(active.run_id, old.ending(trace=old.traced("W2605004")))
+    unsent = old.make(serial="W2605005")
+    old.claim("W2605006", "A")
+
+    found = taken(plant, key)
+    assert (found.runs, found.active) == (2, ("W2605004",))
+    with pytest.raises(ChainRefusedError) as caught:
+        sender.send()
+    assert caught.value.refusal is Refusal.TAKEN_OVER
+    line_2 = plant.status()
+    assert (line_2.refusal, line_2.other_refusal) == ("", caught.value.text)
+
+    spare = spare_of(plant, sender)
+    spares.append(spare)
+    assert states(spare) == {
+        "W2605001": UnitState.PASS, "W2605003": UnitState.FAIL, "W2605004": UnitState.RECHECK,
+    }  # fmt: skip
+    own = spare.bench.make(serial="W2605007")
+    assert own > unsent + 99_000  # numbers are left to the other PC
+    spare.bench.make(serial="W2605003")
+    spare.send()
+    assert not spare.bench.store.examine().problems
+
+    _take_back(plant, sender, spare, unsent)
+
+
+def _take_back(plant: Plant, sender: Sender, spare: Sender, unsent: int) -> None:
+    """On the old PC, which has a branch; the spare PC has one too, then."""
+    old = sender.bench
+    old.store.close()
+    sender.end()
+    spare.bench.make(serial="W2605008")
+    back = takeover_of(plant, old.folder).run(None, FakeClock(WHEN).utc)
+    assert back.set_aside is not None
+    with pytest.raises(ChainRefusedError, match="taken-over"):
+        spare.send()  # W2605008 was not sent: it is a branch now
+    old.store = old.opened()
+    old.store.recover()
+    sender.start()
+    branch = brought(sender, back.set_aside)
+    assert len(branch.runs) == 3
+    assert unsent in branch.runs
+    assert branch.conflicts == ()
+    with pytest.raises(NotFoundError):
+        brought(sender, back.set_aside)
+    spare.bench.store.close()
+    second = brought(sender, spare.bench.path)
+    assert len(second.runs) == 1
+    sender.send()
+
+    assert states(sender) == {
+        "W2605001": UnitState.PASS, "W2605003": UnitState.PASS, "W2605004": UnitState.PASS,
+        "W2605005": UnitState.PASS, "W2605006": UnitState.RECHECK, "W2605007": UnitState.PASS,
+        "W2605008": UnitState.PASS,
+    }  # fmt: skip
+    found_here = old.store.examine()
+    assert not found_here.problems
+    assert "took the station over" in " ".join(found_here.remarks)
+    in_plant = examined(plant)
+    assert not in_plant.problems
+    assert in_plant.runs == len(old.store.read.table()) == 9
+    assert plant.rows("SELECT count(*) FROM open_run") == [(0,)]
+    assert not old.store.examine(incremental=True).problems
+
+
+def test_a_unit_that_passes_at_both_pcs_is_named(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    taken(plant, key)
+    sender.bench.make(serial="W2605009")
+    spares.append(spare := spare_of(plant, sender))
+    spare.bench.make(serial="W2605009")
+    assert brought(spare, sender.bench.path).conflicts == ("W2605009",)
+    sender.bench.make(serial="W2605010")  # the old PC still runs
+    assert len(brought(spare, sender.bench.path).runs) == 1
+    spare.send()
+    assert not examined(plant).problems
+
+
+def test_a_changed_branch_is_not_brought_in(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    taken(plant, key)
+    sender.bench.make(RunState.FAIL, serial="W2605009")
+    with sender.bench.outsider() as other:
+        other.execute("DROP TRIGGER step_final")
+        other.execute("DROP TRIGGER step_update")
+        other.execute("UPDATE step SET text = 'other' WHERE run_id = 2")
+        other.commit()
+    spares.append(spare := spare_of(plant, sender))
+    with pytest.raises(UnprovenError, match="not as it was signed"):
+        brought(spare, sender.bench.path)
+    assert len(spare.bench.store.read.table()) == 1
+
+
+def test_of_two_spare_pcs_at_once_one_takes_the_station_over(
+    plant: Plant, sender: Sender, key: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    usual = Takeover._data
+    faster: list[TakenOver] = []
+
+    def data(self: Takeover, *args: object) -> object:
+        if not faster:
+            faster.append(TakenOver("", 0, 0, (), None))
+            faster[0] = taken(plant, key, "faster")
+        return usual(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Takeover, "_data", data)
+    with pytest.raises(StationBusyError, match="Another PC"):
+        taken(plant, key, "slower")
+    assert not (plant.folder / "slower" / "records.sqlite").exists()
+    assert faster[0].runs == 1
+    assert plant.rows("SELECT count(*) FROM chain_row WHERE event = 'taken over'") == [(1,)]
+
+
+def test_the_other_pc_may_send_while_it_is_taken_over(
+    plant: Plant, sender: Sender, key: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    usual = Takeover._data
+    made: list[RunId] = []
+
+    def data(self: Takeover, *args: object) -> object:
+        if len(made) < 2:
+            made.append(sender.bench.make(serial=f"W260500{len(made) + 2}"))
+            sender.send()
+        return usual(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Takeover, "_data", data)
+    assert taken(plant, key).runs == 3
+
+
+def test_a_takeover_that_was_killed_is_run_again(
+    plant: Plant, sender: Sender, key: bytes, monkeypatch: pytest.MonkeyPatch, spares: list[Sender]
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    monkeypatch.setattr("flasher.plant.takeover._set_aside", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):  # the plant has accepted it
+        taken(plant, key)
+    monkeypatch.undo()
+    assert taken(plant, None).runs == 1  # the key is here
+    spares.append(spare := spare_of(plant, sender))
+    spare.bench.make(serial="W2605002")
+    spare.send()
+    assert not spare.bench.store.examine().problems
+    assert not examined(plant).problems
+
+
+def test_a_key_that_is_missing_or_older_is_named(plant: Plant, sender: Sender, key: bytes) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.bench.store.rotate_key("jo")
+    sender.send()
+    for given in (None, key):
+        with pytest.raises(KeyMissingError) as caught:
+            taken(plant, given)
+        assert "flasher station export" in caught.value.remedy
+    newer = sender.bench.store.signer.key_file.read_bytes()
+    assert SigningKey.parse(newer).public == sender.bench.store.signer.public
+    assert taken(plant, newer).runs == 1
+
+
+def test_a_restored_older_copy_of_either_pc_is_refused(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    taken(plant, key)
+    spares.append(spare := spare_of(plant, sender))
+    spare.send()
+    copy = plant.folder / "copy.sqlite"
+    spare.bench.store.backup(copy)
+    spare.bench.make(serial="W2605002")
+    spare.send()
+    spare.end()
+    spare.bench.store.close()
+    shutil.copy(copy, spare.bench.path)
+    for path in (spare.bench.folder / "keys").glob("*.heads*"):
+        path.unlink()
+    spare.start()
+    with pytest.raises(ChainRefusedError) as caught:
+        spare.send()
+    assert caught.value.refusal is Refusal.REPLAYED
+    with pytest.raises(ChainRefusedError) as caught:
+        sender.send()
+    assert caught.value.refusal is Refusal.TAKEN_OVER
+
+
+def test_rows_that_were_changed_in_the_plant_are_not_taken(
+    plant: Plant, sender: Sender, key: bytes
+) -> None:
+    sender.bench.make(serial="W2605001")
+    sender.bench.claim("W2605002", "B")
+    sender.send()
+    with plant.server.connect(plant.database) as owner:
+        owner.execute("UPDATE open_run SET content = jsonb_set(content::jsonb, '{unit,serial}',"
+                      " '\"X\"')::json")  # fmt: skip
+    with pytest.raises(RecordsDamagedError, match="had not ended"):
+        taken(plant, key)
+    with plant.server.connect(plant.database) as owner:
+        owner.execute("UPDATE chain_row SET data = replace(data, 'W2605001', 'W2605009')")
+    with pytest.raises(RecordsDamagedError, match="as the station signed"):
+        taken(plant, key)
+    assert not (plant.folder / "spare" / "records.sqlite").exists()
