@@ -99,6 +99,18 @@ def flasher(*words: object) -> dict[str, Any]:
     return document
 
 
+def judge(wanted: set[tuple[str, str]], arrived: Counter[Any], named: set[str]) -> bool:
+    """Print the result; True if there is a fault."""
+    missing = [each for each in wanted if each not in arrived]
+    twice = [each for each, count in arrived.items() if count > 1]
+    units = Counter(serial for serial, _ in arrived)
+    unnamed = [serial for serial, count in units.items() if count > 1 and serial not in named]
+    print(f"PASS of both PCs: {len(wanted)}; in the plant: {sum(arrived.values())}")
+    print(f"missing: {len(missing)}; doubled: {len(twice)}; units that passed on both PCs:"
+          f" {sum(count > 1 for count in units.values())}, not named: {len(unnamed)}")  # fmt: skip
+    return bool(missing or twice or unnamed)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--rounds", type=int, default=3)
@@ -149,14 +161,7 @@ def main() -> None:
         with psycopg.connect(owner) as admin:
             arrived = Counter(admin.execute(_PASSED).fetchall())
         wanted = {*now.passed(), *other.passed()}
-    missing = [each for each in wanted if each not in arrived]
-    twice = [each for each, count in arrived.items() if count > 1]
-    units = Counter(serial for serial, _ in arrived)
-    unnamed = [serial for serial, count in units.items() if count > 1 and serial not in named]
-    print(f"PASS of both PCs: {len(wanted)}; in the plant: {sum(arrived.values())}")
-    print(f"missing: {len(missing)}; doubled: {len(twice)}; units that passed on both PCs:"
-          f" {sum(count > 1 for count in units.values())}, not named: {len(unnamed)}")  # fmt: skip
-    raise SystemExit(bool(missing or twice or unnamed))
+    raise SystemExit(judge(wanted, arrived, named))
 
 
 if __name__ == "__main__":
