@@ -16,9 +16,11 @@ from typing import Final
 
 from flasher.errors import FlasherError
 from flasher.plant.central import Central
+from flasher.plant.fetcher import FETCH_S, Fetcher
 from flasher.plant.forwarder import Forwarder
 from flasher.processes import signals_blocked
-from flasher.station.records.database import locate_records, open_database
+from flasher.station.given_recipes import RecipeFolder
+from flasher.station.records.database import Database, Location, locate_records, open_database
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import SystemClock
@@ -44,20 +46,32 @@ class Sending:
     station: str
     records: str
     files: Path | None
+    recipes_for: tuple[str, ...] = ()
+    """Sockets whose recipes come from the plant."""
+
+    def open_fetcher(self) -> Fetcher:
+        """Open the folder of the plant's recipes. Raises UsageError, RecordError."""
+        location = locate_records(self.records, self.files)
+        folder = RecipeFolder.of(location.folder, self.station)
+        return Fetcher(
+            Central(self.url), self._records(location), folder, self.station, self.recipes_for
+        )
 
     def open(self) -> Forwarder:
         """Open the station's records for reading. Raises UsageError, RecordError."""
-        clock = SystemClock()
         location = locate_records(self.records, self.files)
-        central = Central(self.url)
-        records = open_database(
+        central, files = Central(self.url), FileStore(location.folder)
+        return Forwarder(self._records(location), files, central, self.station, SystemClock())
+
+    @staticmethod
+    def _records(location: Location) -> Database:
+        return open_database(
             location,
-            clock.utc(),
+            SystemClock().utc(),
             lock_timeout_s=DEFAULT_LOCK_TIMEOUT_S,
             create=False,
             read_only=True,
         )
-        return Forwarder(records, FileStore(location.folder), central, self.station, clock)
 
 
 def keep_sending(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:
@@ -131,6 +145,10 @@ def _work(channel: Connection, what: Sending) -> None:
         """True as soon as the station has ended; a killed one closes the channel too."""
         return channel.poll(limit_s)
 
+    has_ended = threading.Event()
+    fetching = threading.Thread(target=_fetch, args=(what, has_ended), daemon=True)
+    if what.recipes_for:
+        fetching.start()
     is_over = False
     while not is_over:
         try:
@@ -140,3 +158,19 @@ def _work(channel: Connection, what: Sending) -> None:
         except FlasherError as error:
             _LOG.warning("nothing is sent to the plant: %s", error)
             is_over = wait(RETRY_MAX_S)
+    has_ended.set()
+
+
+def _fetch(what: Sending, over: threading.Event) -> None:
+    """Fetch recipes until `over`. The end of the process may cut it off: a recipe is added as a
+    whole.
+    """
+    while not over.is_set():
+        try:
+            with closing(what.open_fetcher()) as fetcher:
+                while not over.is_set():
+                    fetcher.fetch()
+                    over.wait(FETCH_S)
+        except FlasherError as error:
+            _LOG.warning("no recipe is fetched from the plant: %s", error)
+            over.wait(FETCH_S)

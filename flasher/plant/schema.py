@@ -17,6 +17,7 @@ from sqlalchemy import (
     Column,
     DateTime,
     Float,
+    ForeignKey,
     Identity,
     Index,
     LargeBinary,
@@ -26,12 +27,13 @@ from sqlalchemy import (
     Text,
     Uuid,
     func,
+    text,
 )
 from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "3"
+PLANT_SCHEMA: Final = "4"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -157,6 +159,45 @@ plant_duplicate: Final = Table(
     Column("first_run_id", BigInteger, nullable=False),
 )
 """A PASS of a unit of which another station's PASS had arrived."""
+released_file: Final = Table(
+    "released_file",
+    metadata,
+    Column("sha256", Text, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    CheckConstraint("sha256 = encode(sha256(data), 'hex')", name="file_is_whole"),
+)
+"""Files of recipes that the plant gives out (recipes, images, manifests, profiles), once each."""
+
+released_recipe: Final = Table(
+    "released_recipe",
+    metadata,
+    Column("digest", Text, primary_key=True),
+    Column("manifest", Text, nullable=False),
+    Column("name", Text, nullable=False),
+    Column("revision", Text, nullable=False),
+    Column("part", Text, nullable=False),
+    CheckConstraint(
+        "digest = encode(sha256(convert_to(manifest, 'UTF8')), 'hex')", name="recipe_is_whole"
+    ),
+)
+"""A recipe with its files (`flasher.station.given_recipes`). `name`, `revision` and `part` are for
+people; stations read them from the recipe itself."""
+
+recipe_event: Final = Table(
+    "recipe_event",
+    metadata,
+    Column("id", BigInteger, Identity(always=True), primary_key=True),
+    Column("at", DateTime(timezone=True), nullable=False, server_default=func.clock_timestamp()),
+    Column("by", Text, nullable=False, server_default=text("session_user")),
+    Column("what", Text, nullable=False),
+    Column("digest", Text, ForeignKey("released_recipe.digest"), nullable=False, index=True),
+    Column("station", Text, ForeignKey("plant_station.name")),
+    Column("socket", Text),
+    Column("reason", Text, nullable=False, server_default=""),
+    CheckConstraint("what IN ('published', 'withdrawn')", name="event_is_known"),
+)
+"""Who gave a recipe to which sockets of which station (null: all), or withdrew it. The newest row
+counts."""
 
 OWN_PARTS: Final = (
     "run", "unit", "targets", "steps", "measurements", "writes", "attachments",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
@@ -20,6 +21,43 @@ FROM plant_station p LEFT JOIN LATERAL (
     ORDER BY number DESC LIMIT 1
 ) c ON true ORDER BY p.name
 """)
+
+
+_RECIPES: Final = text("""
+WITH used AS (
+    SELECT DISTINCT ON (c.station, data::jsonb->>'socket') p.name AS station, c.at, data::jsonb AS d
+    FROM chain_row c JOIN plant_station p USING (station) WHERE c.event = 'recipe in use'
+    ORDER BY c.station, data::jsonb->>'socket', c.number DESC
+), newest AS (
+    SELECT DISTINCT ON (digest) digest, what FROM recipe_event ORDER BY digest, id DESC
+)
+SELECT station, d->>'socket' AS socket, d->>'name' AS name, d->>'revision' AS revision,
+    d->>'sha256' AS sha256, d->>'digest' AS digest, at AS since,
+    coalesce(n.what = 'withdrawn', false) AS is_withdrawn,
+    (SELECT CASE WHEN e.digest = d->>'digest' THEN '' ELSE e.digest END FROM recipe_event e
+        WHERE e.what = 'published' AND coalesce(e.station, used.station) = used.station
+        AND coalesce(e.socket, d->>'socket') = d->>'socket' ORDER BY e.id DESC LIMIT 1) AS published
+FROM used LEFT JOIN newest n ON n.digest = d->>'digest' ORDER BY 1, 2
+""")
+
+
+@dataclass(frozen=True)
+class SocketRecipe:
+    """The recipe that a socket uses, as its station recorded it."""
+
+    socket: str
+    name: str
+    revision: str
+    sha256: str
+    """SHA-256 of the recipe file."""
+    digest: str
+    """Digest of the recipe with its files; empty: a local recipe."""
+    since: str
+    """By the station's clock."""
+    is_withdrawn: bool
+    published: str | None
+    """Digest of the newest recipe that was published for the socket, if it is not in use yet; empty
+    if it is; null without one."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +92,8 @@ class StationStatus:
     """Why it refuses a PC that ran as this station before another one took it over."""
     other_reported_at: datetime | None
     """When that PC reported last."""
+    recipes: tuple[SocketRecipe, ...] = ()
+    """Recipes in use by socket, of a station that gets them from the plant."""
 
 
 def stations_of(central: Central) -> list[StationStatus]:
@@ -64,9 +104,14 @@ def stations_of(central: Central) -> list[StationStatus]:
 
 def statuses(connection: Connection) -> list[StationStatus]:
     """All stations, by name."""
+    recipes = defaultdict(list)
+    for each in connection.execute(_RECIPES).mappings():
+        facts = dict(each)
+        recipes[facts.pop("station")].append(SocketRecipe(**facts))
     found = []
     for row in connection.execute(_QUERY).mappings():
         reported_at = row["reported_at"]
         silent_s = None if reported_at is None else (row["now"] - reported_at).total_seconds()
-        found.append(StationStatus(**row, silent_s=silent_s))
+        used = tuple(recipes[row["station"]])
+        found.append(StationStatus(**row, silent_s=silent_s, recipes=used))
     return found

@@ -7,7 +7,7 @@ of the sockets' processes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +120,6 @@ def worker_setups(
     in turn over the sockets, up to `units`. Raises ImageError as `check_samples`.
     """
     check_samples(sockets, recipe)
-    files = {str(path): sha256 for path, sha256 in recipe.files.items()}
     total = len(sockets)
     setups = []
     for at, each in enumerate(sockets):
@@ -136,8 +135,15 @@ def worker_setups(
                 count=count,
             )
         name, power = each.config.name, each.config.power
-        setups.append(WorkerSetup(name, recipe.path, files, each.bus, virtual, power))
+        setup = WorkerSetup(name, recipe.path, {}, each.bus, virtual, power)
+        setups.append(with_recipe(setup, recipe))
     return setups
+
+
+def with_recipe(setup: WorkerSetup, recipe: LoadedRecipe) -> WorkerSetup:
+    """Settings of the same socket with another recipe."""
+    files = {str(path): sha256 for path, sha256 in recipe.files.items()}
+    return replace(setup, recipe=recipe.path, files=files, may_waive=not recipe.digest)
 
 
 # -- detection ------------------------------------------------------------------------------------

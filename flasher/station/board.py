@@ -19,6 +19,8 @@ from flasher.station.events import (
     PinAwaited,
     PinEnded,
     Progressed,
+    RecipeChanged,
+    RecipesOffered,
     RecordNotSaved,
     RunEnded,
     RunStarted,
@@ -125,7 +127,11 @@ class Board:
     title: str = ""
     station: str = ""
     recipe: str = ""
-    """Name and revision."""
+    """Name and revision; by socket, if they have different ones."""
+    recipes: dict[str, str] = field(default_factory=dict)
+    """Name and revision by socket."""
+    offered: RecipesOffered | None = None
+    """Recipes from the plant; None without any news of them."""
     part: str = ""
     figures: Figures | None = None
     stopped: LineStopped | None = None
@@ -171,8 +177,8 @@ class Board:
 
     def apply(self, event: StationEvent) -> None:
         match event:
-            case StationStarted():
-                self._begun(event)
+            case StationStarted() | RecipeChanged() | RecipesOffered():
+                self._set_up(event)
             case FiguresChanged(figures):
                 self.figures = figures
             case LineStopped():
@@ -200,9 +206,18 @@ class Board:
             case _:
                 self._socket(event)
 
+    def _set_up(self, event: StationStarted | RecipeChanged | RecipesOffered) -> None:
+        if isinstance(event, StationStarted):
+            self._begun(event)
+        elif isinstance(event, RecipeChanged):
+            self._recipe_changed(event)
+        else:
+            self.offered = event
+
     def _begun(self, event: StationStarted) -> None:
         recipe, revision, part = event.recipe, event.revision, event.part
         self.recipe = printable(f"{recipe}, {revision}")
+        self.recipes = dict.fromkeys(event.sockets, self.recipe)
         self.station, self.part = printable(event.station), printable(part)
         self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
         self.virtual_sockets = virtual = event.virtual_sockets
@@ -211,6 +226,16 @@ class Board:
         if not self.has_badges:
             self.reply(NO_BADGES)
         if virtual:
+            self.title = f"{self.virtual_words} {self.title}"
+
+    def _recipe_changed(self, event: RecipeChanged) -> None:
+        self.recipes[event.socket] = printable(f"{event.recipe}, {event.revision}")
+        names = dict.fromkeys(self.recipes.values())
+        self.recipe, self.part = next(iter(names)), printable(event.part)
+        if len(names) > 1:
+            self.recipe = "; ".join(f"{printable(s)}: {name}" for s, name in self.recipes.items())
+        self.title = printable(f"{self.station}: {self.recipe}, {self.part}")
+        if self.virtual_sockets:
             self.title = f"{self.virtual_words} {self.title}"
 
     def _apply_device_event(

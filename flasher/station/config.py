@@ -211,6 +211,11 @@ class StationConfig(TomlTable):
     plant: str = ""
     """Database that collects the records of all stations, such as
     "postgresql://flasher_line_2@plant-db/flasher"; empty: none."""
+    plant_recipes: bool = False
+    """Recipes come from the plant, and a supervisor approves them at the station."""
+    golden_unit: Literal["optional", "required"] = "optional"
+    """required: after an update of flasher or a change of the recipe a golden unit has to pass
+    before any other unit begins."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """Time limit of a write while another program locks the database."""
     badges: str = ""
@@ -237,6 +242,12 @@ class StationConfig(TomlTable):
         if not all(value):
             raise ValueError("heads contains an empty place")
         return value
+
+    @model_validator(mode="after")
+    def _check_plant(self) -> StationConfig:
+        if self.plant_recipes and not (self.plant and self.badges):
+            raise ValueError("plant_recipes needs plant, and badges of the people who approve")
+        return self
 
     @model_validator(mode="after")
     def _check_sockets(self) -> StationConfig:

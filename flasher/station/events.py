@@ -77,6 +77,45 @@ class StationStarted(Timed):
 
 
 @dataclass(frozen=True)
+class RecipeChanged(Timed):
+    """A socket uses another recipe from its next unit on."""
+
+    socket: str
+    recipe: str
+    revision: str
+    part: str
+    digest: str
+    """Digest of the recipe with its files, as the plant gave it."""
+
+
+@dataclass(frozen=True)
+class OfferedRecipe:
+    """A recipe from the plant that waits for a supervisor, or that cannot be used."""
+
+    recipe: str
+    """Name and revision; "" if it cannot be loaded."""
+    digest: str
+    sockets: tuple[str, ...]
+    published_at: str
+    published_by: str
+    changes: tuple[str, ...] = ()
+    """Differences from the recipe in use, as sentences."""
+    scan: str = ""
+    """The scan that approves it."""
+    problem: str = ""
+    """Why it cannot be used; "" if it can."""
+
+
+@dataclass(frozen=True)
+class RecipesOffered(Timed):
+    """The recipes that the plant offers, and those in use that it has withdrawn, changed."""
+
+    offered: tuple[OfferedRecipe, ...]
+    withdrawn: tuple[str, ...] = ()
+    """Sockets that begin no unit, since their recipe was withdrawn."""
+
+
+@dataclass(frozen=True)
 class SocketChanged(Timed):
     """The state or text of a socket changed."""
 
@@ -313,6 +352,8 @@ class StationStopped(Timed):
 
 StationEvent = (
     StationStarted
+    | RecipeChanged
+    | RecipesOffered
     | SocketChanged
     | UnitArrived
     | UnitRemoved

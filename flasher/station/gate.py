@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Protocol
 from uuid import uuid4
@@ -25,6 +25,7 @@ from flasher.station.records.model import Admission, Elsewhere, Order
 
 if TYPE_CHECKING:
     from flasher.station.question import Question
+    from flasher.station.recipe_file import LoadedRecipe
 
 HUNG_MAX: Final = 64
 """Threads that may wait for a plant that does not answer; further units are not asked about."""
@@ -62,6 +63,9 @@ class _Asked:
     give_up_at_s: float
     admission: Admission
     """What is known so far."""
+    recipe: Recipe
+    """Recipe of the socket when it was asked."""
+    loaded: LoadedRecipe | None
     is_over: bool = False
 
 
@@ -86,6 +90,8 @@ class Gate:
         self._recipe, self._claims, self._question = recipe, claims, question
         self._now, self._start = monotonic_s, start
         self.wake: Callable[[], None] = lambda: None
+        self.recipes: Mapping[str, LoadedRecipe] = {}
+        """Recipes by socket, where they may differ from the first one."""
         self._open: list[_Asked] = []
         self._over: deque[_Asked] = deque()
         self._threads = 0
@@ -93,8 +99,10 @@ class Gate:
 
     def ask(self, order: Order) -> None:
         """Ask about a unit; `take` returns the answer."""
-        rule, question, now = self._recipe.plant, self._question, self._now()
-        golden = self._recipe.golden
+        loaded = self.recipes.get(order.socket)
+        recipe = self._recipe if loaded is None else loaded.recipe
+        rule, question, now = recipe.plant, self._question, self._now()
+        golden = recipe.golden
         limit_s = 0.0 if self._claims is None else rule.time_limit_s
         admission = Admission()
         if self._claims is not None:
@@ -103,7 +111,7 @@ class Gate:
         if question is not None:
             limit_s += question.time_limit_s
             admission = replace(admission, answer=question.silence())
-        asked = _Asked(order, now, now + limit_s + _GRACE_S, admission)
+        asked = _Asked(order, now, now + limit_s + _GRACE_S, admission, recipe, loaded)
         self._open.append(asked)
         if golden is not None and order.serial in golden.serial_numbers:
             asked.admission = Admission()  # it is no product
@@ -169,14 +177,14 @@ class Gate:
     def _ask(self, asked: _Asked) -> None:
         order = asked.order
         if self._question is not None:
-            answer = self._question.ask(order)
+            answer = self._question.ask(order, asked.loaded)
             self._learn(asked, replace(asked.admission, answer=answer))
             if not answer.may_begin:
                 return  # no claim is needed
         if self._claims is None or asked.is_over:
             return
         try:
-            other = self._claims.claim(asked.admission.claim, order, self._recipe.part)
+            other = self._claims.claim(asked.admission.claim, order, asked.recipe.part)
         except FlasherError as error:
             words = error.what.rstrip(".")
             is_in_time = self._learn(asked, replace(asked.admission, unchecked=words))

@@ -86,6 +86,7 @@ NOTE_S: Final = 15.0
 """Time for which a socket shows that a card or label was dropped."""
 _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
+_RECIPE: Final = Word.RECIPE.value.lower()
 _PIN: Final = "pin"
 _AGAIN: Final = text("Scan it again.")
 _NOTHING: Final = text("Nothing to do.")
@@ -167,6 +168,16 @@ class Reprint:
 
 
 @dataclass(frozen=True)
+class ApproveRecipe:
+    """Record `data` for the offered recipe whose digest begins with `digits`, then use it; then
+    call `Line.recipe_approved`.
+    """
+
+    digits: str
+    data: Mapping[str, str]
+
+
+@dataclass(frozen=True)
 class Audit:
     """Append an action of a person to the audit trail."""
 
@@ -196,6 +207,7 @@ Effect = (
     | AbortRun
     | CheckPin
     | Reprint
+    | ApproveRecipe
     | Audit
     | StationEvent
 )
@@ -421,6 +433,18 @@ class Line:
             socket.note = what.reason
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
+    def is_between_units(self, name: str) -> bool:
+        """True if no run and no scan needs the process of this socket."""
+        socket = self.sockets[name]
+        return not (socket.is_busy or socket.is_chosen)
+
+    def restart(self, name: str, now: float) -> None:
+        """The process of a socket between two units is replaced by another one."""
+        socket = self.sockets[name]
+        self._down(socket, AdapterDown(""), now)
+        socket.out_of_service = ""  # it starts
+        self._go_on(now)
+
     # -- scans ------------------------------------------------------------------------------------
 
     def scan(self, raw: str, now: float, source: Source = UNNAMED) -> None:
@@ -465,7 +489,7 @@ class Line:
         except Refused as refused:
             self._refuse(shown, refused, source=source)
         else:
-            if meaning not in (_RESUME, _REPRINT, _PIN):  # other events report the result
+            if meaning not in (_RESUME, _REPRINT, _RECIPE, _PIN):  # other events report the result
                 name = "" if socket is None else socket.name
                 self._emit(ScanAccepted(shown, meaning, name, source.name))
 
@@ -804,6 +828,23 @@ class Line:
         else:
             self._refuse(text, refused)
 
+    def _approve_recipe(self, argument: str, _now: float, _waiting: Waiting) -> None:
+        if not self._crew.has_badges:
+            raise Refused(
+                "NO_BADGES",
+                text("Nobody can be identified: this station has no badge table."),
+                text("Name the badge table in the station file."),
+            )
+        self._effects.append(ApproveRecipe(argument, self._with_author({})))
+
+    def recipe_approved(self, digits: str, refused: Refused | None) -> None:
+        """Process the result of `ApproveRecipe`."""
+        text = printable(f"{Word.RECIPE.value} {digits}")[:80]
+        if refused is None:
+            self._emit(ScanAccepted(text, _RECIPE))
+        else:
+            self._refuse(text, refused)
+
     def _resume(self, _argument: str, _now: float, _waiting: Waiting) -> None:
         if self.stopped is None:
             raise Refused("NOT_STOPPED", text("The line is not stopped."), _NOTHING)
@@ -1064,6 +1105,7 @@ class Line:
         Word.LOT: _set_lot,
         Word.OPERATOR: _set_operator,
         Word.REASON: _give_reason,
+        Word.RECIPE: _approve_recipe,
         Word.REPRINT: _reprint,
         Word.RESUME: _resume,
     }

@@ -105,6 +105,8 @@ class WorkerSetup:
     """Arguments of python-can's bus; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
+    may_waive: bool = True
+    """The recipe may waive signatures; those from the plant may not."""
 
 
 # -- from the station -----------------------------------------------------------------------------

@@ -50,6 +50,7 @@ _REWORK: Final = frozenset({Role.REWORK, Role.SUPERVISOR})
 _ROLES: Final[Mapping[Word, frozenset[Role]]] = {
     Word.REASON: _REWORK,
     Word.ABORT: _REWORK,
+    Word.RECIPE: frozenset({Role.SUPERVISOR}),
     Word.RESUME: frozenset({Role.SUPERVISOR}),
 }
 """Roles that may give a command that overrides the station. Anyone may give the others."""

@@ -60,11 +60,13 @@ class Question:
         self._address = urlsplit(config.url)
         self._tls = None if self._address.scheme == "http" else _tls(config.certificates)
 
-    def ask(self, order: Order) -> Answer:
-        """Ask about the unit of an order; returns the answer, or the rule for none."""
+    def ask(self, order: Order, recipe: LoadedRecipe | None = None) -> Answer:
+        """Ask about the unit of an order; returns the answer, or the rule for none. `recipe`: that
+        of its socket, if it is not the first one.
+        """
         ends_at_s = time.perf_counter() + self.time_limit_s
         try:
-            reply = self._reply(self._facts(order), ends_at_s)
+            reply = self._reply(self._facts(order, recipe or self._recipe), ends_at_s)
         except (_NoAnswerError, OSError, HTTPException, ValueError) as error:
             late = isinstance(error, TimeoutError) or time.perf_counter() >= ends_at_s
             return self.silence("" if late else _words(error))
@@ -79,8 +81,8 @@ class Question:
             self._config.silence is Unchecked.ALLOW, f"no answer: {why}", is_answered=False
         )
 
-    def _facts(self, order: Order) -> dict[str, Any]:
-        rule = self._recipe.recipe
+    def _facts(self, order: Order, recipe: LoadedRecipe) -> dict[str, Any]:
+        rule = recipe.recipe
         return {
             "serial": order.serial,
             "part": rule.part,
@@ -90,10 +92,10 @@ class Question:
             "operator": order.operator,
             "recipe": rule.name,
             "recipe_revision": rule.revision,
-            "recipe_sha256": self._recipe.sha256,
+            "recipe_sha256": recipe.sha256,
             "targets": [
                 {"target": each.name, "version": each.version, "image_sha256": each.image.sha256}
-                for each in self._recipe.targets
+                for each in recipe.targets
             ],
             "is_virtual": order.is_virtual,
         }

@@ -139,6 +139,8 @@ class LoadedRecipe:
     targets: tuple[LoadedTarget, ...]
     files: Mapping[Path, str] = field(repr=False)
     """SHA-256 of each loaded file: recipe, images, manifests and profile."""
+    digest: str = ""
+    """Digest of the bundle, if the plant gave it (`given_recipes`); "" for a local recipe."""
 
     @cached_property
     def required(self) -> Verified:
@@ -148,7 +150,7 @@ class LoadedRecipe:
     def is_unchanged(self) -> bool:
         """True if the recipe's files on disk still have the loaded content."""
         try:
-            return all(_sha256(path) == sha256 for path, sha256 in self.files.items())
+            return all(sha256_of(path) == sha256 for path, sha256 in self.files.items())
         except FlasherError:
             return False
 
@@ -177,13 +179,26 @@ class LoadedRecipe:
         )
 
 
-def load_recipe(path: Path) -> LoadedRecipe:
-    """Load a recipe with its images without trying its values.
+def load_recipe(path: Path, *, may_waive: bool = True) -> LoadedRecipe:
+    """Load a recipe with its images without trying its values. Without `may_waive`,
+    `signature = "waived"` in it is read as "checked".
 
     Raises UsageError with all problems of the file and the files that it refers to.
     """
     raw = read(path, TOML_MAX_SIZE, what="recipe")
     recipe = RECIPE.parse(raw, path)
+    if not may_waive:
+        checked = {"signature": SignatureRule.CHECKED}
+        recipe = recipe.model_copy(
+            update={
+                "target": tuple(
+                    each.model_copy(update=checked)
+                    if each.signature is SignatureRule.WAIVED
+                    else each
+                    for each in recipe.target
+                )
+            }
+        )
     files = {path: hashlib.sha256(raw).hexdigest()}
     targets: list[LoadedTarget] = []
     faults: list[Fault] = []
@@ -203,12 +218,13 @@ def load_recipe(path: Path) -> LoadedRecipe:
     return LoadedRecipe(recipe, path, files[path], raw.decode("utf-8-sig"), tuple(targets), files)
 
 
-def load_checked(path: Path, day: date) -> LoadedRecipe:
+def load_checked(path: Path, day: date, *, may_waive: bool = True) -> LoadedRecipe:
     """Load a recipe with its images, and check everything that needs no device.
 
-    `day`: the day of production of the sample scan. Raises UsageError with all problems.
+    `day`: the day of production of the sample scan; `may_waive`: see `load_recipe`. Raises
+    UsageError with all problems.
     """
-    loaded = load_recipe(path)
+    loaded = load_recipe(path, may_waive=may_waive)
     faults = [
         *(
             fault
@@ -224,7 +240,8 @@ def load_checked(path: Path, day: date) -> LoadedRecipe:
     return loaded
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file. Raises UsageError."""
     with opened(path, FILE_MAX_SIZE) as (file, _):
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -266,7 +283,7 @@ def _load_target(
             )
     files = [image_path, manifest, *([profile_path] if profile_path else [])]
     # Hashed before and after loading: the hashes are those of the loaded bytes.
-    hashes = {file: _sha256(file) for file in files}
+    hashes = {file: sha256_of(file) for file in files}
     if signed is None:
         image, release = load(image_path, base=firmware.base), read_release(manifest)
     else:
@@ -283,7 +300,7 @@ def _load_target(
         required = Verified.VERSION if can_ask else Verified.COMPLETED
     target = LoadedTarget(firmware, image_path, image, release, profile, required)
     target = replace(target, provenance=target.check_signatures())
-    if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
+    if any(sha256_of(file) != sha256 for file, sha256 in hashes.items()):
         raise UsageError("a file changed while it was read.", remedy="Try again.")
     return target, hashes
 

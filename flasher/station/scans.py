@@ -8,6 +8,7 @@ LOT 4711      the lot of the following units
 OPERATOR Jo   the operator from now on
 REASON text   why units that passed are flashed again; applies to the next label
 REPRINT W1    print the label of a passed unit again
+RECIPE 1a2b.. a supervisor approves a recipe from the plant, by the digits of its digest
 RESUME        the cause of a stopped line was removed: save open outcomes, and continue
 
 `place` assigns a label that is scanned alone. No label is assigned to a unit only because it is the
@@ -52,6 +53,7 @@ class Word(StrEnum):
     LOT = "LOT"
     OPERATOR = "OPERATOR"
     REASON = "REASON"
+    RECIPE = "RECIPE"
     REPRINT = "REPRINT"
     RESUME = "RESUME"
 

@@ -17,20 +17,25 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
+from flasher import __version__
 from flasher.errors import UsageError
 from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes, line, pins
+from flasher.station.adapters import with_recipe
 from flasher.station.codes import CODES
 from flasher.station.events import (
     FiguresChanged,
     LabelFailed,
     LabelPrinted,
+    OfferedRecipe,
     OperatorPrompted,
     Progressed,
+    RecipeChanged,
+    RecipesOffered,
     RecordNotSaved,
     RunEnded,
     RunStarted,
@@ -58,7 +63,9 @@ from flasher.station.messages import (
     WriteReply,
 )
 from flasher.station.operators import Crew
+from flasher.station.recipe_changes import changes
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.recipe_offers import SCAN_DIGITS, Offer, Offers, used
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
     AuditEvent,
@@ -77,9 +84,10 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, passed_words, save, with_history
-from flasher.station.scans import Refused
+from flasher.station.scans import Refused, Word
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
+from flasher.station.virtual_units import next_number
 
 TURN_S: Final = 0.1
 """Maximum time that a turn of the loop waits."""
@@ -98,15 +106,22 @@ class StationOptions:
     """Time limit for runs to end when the station closes."""
     scans_labels: bool = False
     """Scan the labels of virtual units automatically."""
+    needs_golden: bool = False
+    """After an update of flasher or a change of the recipe a golden unit has to pass first."""
+    gets_recipes: bool = False
+    """The plant gives recipes: the audit trail states which socket uses which."""
     mixes_virtual: bool = False
     """Real and virtual units may share the records, but not a serial number."""
 
 
 class Station:
-    """A station with one recipe. Incidents on the line are reported by events, not exceptions.
+    """A station. Incidents on the line are reported by events, not exceptions.
 
-    `submit`, `publish`, `note`, `stop` and `abort_all` may be called from any thread, the others
-    from one.
+    Each socket has a recipe of its own, or the same one. A recipe that the plant gives and a
+    supervisor approves replaces that of a socket between two units.
+
+    `submit`, `publish`, `note`, `offer`, `stop` and `abort_all` may be called from any thread, the
+    others from one.
     """
 
     def __init__(  # noqa: PLR0913  all parts of a station
@@ -115,6 +130,7 @@ class Station:
         recipe: LoadedRecipe,
         setups: Iterable[WorkerSetup],
         *,
+        recipes: Mapping[str, LoadedRecipe] | None = None,
         operator: str,
         lot: str = "",
         crew: Crew | None = None,
@@ -128,15 +144,23 @@ class Station:
         gate: Gate | None = None,
     ) -> None:
         self.store = store
-        self.recipe = recipe
         self.options = options or StationOptions()
         self.clock: StationClock = clock or SystemClock()
         self._on_event = on_event
         self._on_turn = on_turn
         setups = tuple(setups)
+        self._setups = {each.socket: each for each in setups}
+        self.recipes = {name: (recipes or {}).get(name, recipe) for name in self._setups}
+        """Recipe of each socket."""
+        self._offers = Offers()
+        self._offered: deque[Offers] = deque()
+        self._released: set[tuple[str, ...]] = set()
+        """Versions of flasher with recipes that a golden unit has passed with."""
+        self._approved: dict[str, Offer] = {}
+        """Approved recipes by the socket that does not use them yet."""
         self.line = Line(
             [Socket(each.socket, is_virtual=each.virtual is not None) for each in setups],
-            recipe.recipe.serial_number.read,
+            self._read_serial,
             operator=operator,
             lot=lot,
             arrival_limit_s=self.options.arrival_limit_s,
@@ -146,6 +170,7 @@ class Station:
         )
         self._gate = gate or Gate(recipe.recipe, None, None, self.clock.monotonic_s)
         self._gate.wake = self._wake
+        self._gate.recipes = self.recipes
         self._has_badges = crew is not None
         self._labels = labels
         self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
@@ -184,6 +209,8 @@ class Station:
         if self._labels is not None:
             self._labels.start(self._wake)
         rule = self.recipe.recipe
+        self._note_recipes()
+        self._find_released()
         self.emit(
             StationStarted(
                 self.store.station,
@@ -196,6 +223,9 @@ class Station:
                 self._has_badges,
             )
         )
+        for name, each in self.recipes.items():
+            if each is not self.recipe:
+                self._emit_recipe(name, each)
         if are_mixed and self._has_badges:
             self.line.stop(
                 "VIRTUAL_MIXED",
@@ -217,6 +247,11 @@ class Station:
     def note(self, what: AuditEvent, data: Mapping[str, str]) -> None:
         """Append an action of a person outside the line to the audit trail, in the next turn."""
         self._notes.append((what, data))
+        self._wake()
+
+    def offer(self, offers: Offers) -> None:
+        """Offer the recipes that the plant gives, in the next turn."""
+        self._offered.append(offers)
         self._wake()
 
     def drop_waiting(self) -> None:
@@ -262,6 +297,10 @@ class Station:
         while self._published:
             self.emit(self._published.popleft())
         self._write_notes()
+        while self._offered:
+            self._offers = self._offered.popleft()
+            self._show_offers()
+        self._change_recipes()
         self._take_scans()
         self._take_answers()
         if self._is_aborting:
@@ -313,6 +352,11 @@ class Station:
         return any(socket.is_running for socket in self.line.sockets.values())
 
     @property
+    def recipe(self) -> LoadedRecipe:
+        """Recipe of the first socket."""
+        return next(iter(self.recipes.values()))
+
+    @property
     def figures(self) -> Figures:
         """Totals of this recipe since the station started. Raises RecordError."""
         chosen = RunFilter(
@@ -361,12 +405,19 @@ class Station:
                     case line.CheckPin(pin, pin_hash):
                         checked = self.checker.submit(pins.is_right, pin, pin_hash)
                         checked.add_done_callback(self._pin_checked)
-                    case line.Reprint(serial, data):
-                        self.line.reprinted(serial, self._reprint(serial, data))
+                    case line.Reprint() | line.ApproveRecipe():
+                        self._do_asked(effect)
                     case line.Audit(what, data):
                         self._audit(what, data)
                     case _:
                         self.emit(effect)
+
+    def _do_asked(self, asked: line.Reprint | line.ApproveRecipe) -> None:
+        if isinstance(asked, line.Reprint):
+            self.line.reprinted(asked.serial, self._reprint(asked.serial, asked.data))
+        else:
+            self.line.recipe_approved(asked.digits, self._approve(asked.digits, asked.data))
+            self._change_recipes()
 
     def _process_message(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
@@ -432,13 +483,182 @@ class Station:
             self._not_saved("", "", None, error)
             self.line.stop(codes.RECORD_NOT_SAVED.name, error.what, error.remedy)
 
+    # -- recipes from the plant -------------------------------------------------------------------
+
+    def _read_serial(self, serial: str) -> object:
+        """Check that a text is a serial number of a recipe in use. Raises ValueError."""
+        for recipe in self.recipes.values():
+            with suppress(ValueError):
+                return recipe.recipe.serial_number.read(serial)
+        return self.recipe.recipe.serial_number.read(serial)
+
+    def _show_offers(self) -> None:
+        """Publish what waits for a supervisor, and what was withdrawn."""
+        offered = []
+        for offer in self._offers.offers:
+            given, loaded = offer.given, offer.loaded
+            sockets = [name for name in given.sockets if self._waits_for(name, given.digest)]
+            if not sockets or given.digest in self._offers.withdrawn:
+                continue
+            found = OfferedRecipe(
+                "", given.digest, tuple(sockets), given.at, given.by, problem=offer.problem
+            )
+            if loaded is not None and not offer.problem:
+                rule = loaded.recipe
+                found = replace(
+                    found,
+                    recipe=f"{rule.name}, {rule.revision}",
+                    changes=changes(self.recipes[sockets[0]], loaded),
+                    scan=f"{Word.RECIPE.value} {given.digest[:SCAN_DIGITS]}",
+                )
+            offered.append(found)
+        withdrawn = [
+            name
+            for name, recipe in self.recipes.items()
+            if recipe.digest in self._offers.withdrawn and name not in self._approved
+        ]
+        self.emit(RecipesOffered(tuple(offered), tuple(withdrawn)))
+
+    def _waits_for(self, socket: str, digest: str) -> bool:
+        """True if a socket neither uses this recipe nor will do so."""
+        if socket not in self.recipes:
+            return False
+        due = self._approved.get(socket)
+        return digest != (self.recipes[socket].digest if due is None else due.given.digest)
+
+    def _approve(self, digits: str, data: Mapping[str, str]) -> Refused | None:
+        """Approve the offered recipe of these digits; returns the refusal, or None."""
+        found = {
+            offer.given.digest: offer
+            for offer in self._offers.offers
+            if len(digits) >= SCAN_DIGITS and offer.given.digest.startswith(digits.lower())
+        }
+        sockets = [
+            name
+            for offer in self._offers.offers
+            if offer.given.digest in found
+            for name in offer.given.sockets
+            if self._waits_for(name, offer.given.digest)
+        ]
+        if len(found) != 1 or not sockets:
+            reason = text("The plant offers no recipe with this digest.")
+            return Refused("NO_SUCH_RECIPE", reason, text("Scan what the operator page shows."))
+        (offer,) = found.values()
+        loaded = offer.loaded
+        if offer.given.digest in self._offers.withdrawn:
+            reason = text("The plant has withdrawn this recipe.")
+            return Refused(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
+        if loaded is None or offer.problem:
+            return Refused("RECIPE_UNUSABLE", offer.problem, _OTHER_RECIPE)
+        facts = {**_recipe_facts(loaded), "sockets": sockets}
+        published = {"published_at": offer.given.at, "published_by": offer.given.by}
+        try:
+            self.store.note(AuditEvent.RECIPE_APPROVED, {**data, **facts, **published})
+        except RecordError as error:
+            return Refused(codes.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
+        self._approved |= dict.fromkeys(sockets, offer)
+        self._show_offers()
+        return None
+
+    def _change_recipes(self) -> None:
+        """Give the sockets that are between two units their approved recipe."""
+        for name, offer in tuple(self._approved.items()):
+            recipe = offer.loaded
+            if offer.given.digest in self._offers.withdrawn:
+                del self._approved[name]
+                continue
+            if recipe is None or name in self._runs or not self.line.is_between_units(name):
+                continue
+            try:
+                self.store.note(AuditEvent.RECIPE_USED, {**_recipe_facts(recipe), "socket": name})
+                setup = self._with_number(with_recipe(self._setups[name], recipe), recipe)
+            except RecordError as error:
+                self._not_saved("", "", None, error)
+                self.line.stop(codes.RECORD_NOT_SAVED.name, error.what, error.remedy)
+                return
+            del self._approved[name]
+            # The process that knows the old recipe gets no further run.
+            self.recipes[name], self._setups[name] = recipe, setup
+            self.supervisor.replace(setup)
+            self.line.restart(name, self._now)
+            self._emit_recipe(name, recipe)
+            self._show_offers()
+
+    def _with_number(self, setup: WorkerSetup, recipe: LoadedRecipe) -> WorkerSetup:
+        """Settings whose virtual units have new numbers. Raises RecordError."""
+        virtual = setup.virtual
+        if virtual is None:
+            return setup
+        rule, part = recipe.recipe.serial_number, recipe.recipe.part
+        number = next_number(rule, lambda serials: self.store.read.known(part, serials))
+        number += (virtual.first_number - number) % virtual.number_step
+        return replace(setup, virtual=replace(virtual, first_number=number))
+
+    def _note_recipes(self) -> None:
+        """Record the recipes of a station that gets them from the plant. Raises RecordError."""
+        if not self.options.gets_recipes:
+            return
+        last = used(self.store.read, self.store.station)
+        for name, recipe in self.recipes.items():
+            facts = {**_recipe_facts(recipe), "socket": name}
+            if last.get(name) != facts:
+                self.store.note(AuditEvent.RECIPE_USED, facts)
+
+    def _emit_recipe(self, socket: str, recipe: LoadedRecipe) -> None:
+        rule = recipe.recipe
+        self.emit(RecipeChanged(socket, rule.name, rule.revision, rule.part, recipe.digest))
+
+    # -- golden units after an update -------------------------------------------------------------
+
+    def _find_released(self) -> None:
+        """Read what a golden unit has passed with. Raises RecordError."""
+        if self.options.needs_golden:
+            rows = self.store.read.noted(self.store.station, AuditEvent.RELEASED)
+            self._released = {_release_key(data) for data in rows}
+
+    def _needs_golden(self, order: Order) -> line.NotClaimed | None:
+        """The refusal of a unit before a golden unit has passed; None if it may begin."""
+        recipe = self.recipes[order.socket]
+        golden = recipe.recipe.golden
+        serials = () if golden is None else golden.serial_numbers
+        is_released = _release_key(_release(recipe, is_virtual=order.is_virtual)) in self._released
+        if not self.options.needs_golden or is_released or order.serial in serials:
+            return None
+        reason = text(
+            "No golden unit has passed with flasher {version} and this recipe yet.",
+            version=__version__,
+        )
+        remedy = text("Scan and connect one of: {serials}.", serials=", ".join(serials))
+        return line.NotClaimed(Refusal.GOLDEN_DUE.value, reason, remedy)
+
+    def _note_golden(self, socket: str, claim: Claim) -> None:
+        """Record the PASS of a golden unit, which releases this flasher with its recipe."""
+        facts = _release(self.recipes[socket], is_virtual=self.line.sockets[socket].is_virtual)
+        key = _release_key(facts)
+        if claim.kind is not RunKind.GOLDEN or not self.options.needs_golden:
+            return
+        if key not in self._released:
+            data = {**facts, "serial": claim.serial, "socket": socket}
+            try:
+                self.store.note(AuditEvent.RELEASED, data, claim.run_id)
+            except RecordError as error:
+                self._not_saved(socket, claim.serial, claim.run_id, error)
+                return
+            self._released.add(key)
+
     # -- beginning --------------------------------------------------------------------------------
 
     def _claim(self, order: Order) -> line.SocketInput:
         socket = order.socket
+        recipe = self.recipes[socket]
+        if (refused := self._needs_golden(order)) is not None:
+            return refused
+        if recipe.digest in self._offers.withdrawn:
+            reason = text("The plant has withdrawn the recipe of this socket.")
+            return line.NotClaimed(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
         try:
             lives = self.store.read.units(order.serial)
-            claim = self.store.claim(order, self.recipe)
+            claim = self.store.claim(order, recipe)
         except ClaimRefusedError as error:
             self._gate.dropped(order.admission)
             stops_line = error.refusal in (Refusal.RECIPE_CHANGED, Refusal.RECIPE_NOT_TRUSTED)
@@ -446,7 +666,7 @@ class Station:
         except RecordError as error:
             self._gate.ended(order.admission)  # whether a run began is not known
             return self._not_saved(socket, order.serial, None, error)
-        claim = with_history(claim, lives, self.recipe, is_reworked=bool(order.reason))
+        claim = with_history(claim, lives, recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
         at = self.line.sockets[socket]
         claim = replace(claim, trace=trace, presence=at.presence_number, has_card=at.has_card)
@@ -454,9 +674,9 @@ class Station:
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
-        """Earlier runs of a unit of this recipe's part. Raises RecordError."""
-        lives, part = self.store.read.units(serial), self.recipe.recipe.part
-        return next((life for life in lives if life.part == part), None)
+        """Earlier runs of a unit of a part that is made here. Raises RecordError."""
+        parts = {each.recipe.part for each in self.recipes.values()}
+        return next((e for e in self.store.read.units(serial) if e.part in parts), None)
 
     def _begin(self, started: RunStarted) -> None:
         """Send the claimed run to the process of its socket."""
@@ -571,6 +791,7 @@ class Station:
         with suppress(RecordError):
             self.emit(FiguresChanged(self.figures))
         if is_pass:
+            self._note_golden(socket, claim)
             self._print(socket, claim)
         return True
 
@@ -607,7 +828,8 @@ class Station:
 
     def _label(self, socket: str, run: RunRecord, *, is_reprint: bool = False) -> LabelJob:
         try:
-            groups = self.recipe.recipe.serial_number.read(run.serial)
+            recipe = self.recipes.get(socket, self.recipe)
+            groups = recipe.recipe.serial_number.read(run.serial)
         except ValueError:  # of a recipe with another pattern
             groups = {}
         return LabelJob(socket, run.serial, values_of(run, groups), is_reprint)
@@ -632,9 +854,35 @@ class Station:
 
 
 _RECHECK: Final = text("Put it aside: it was not checked whether it has passed at another station.")
+_OTHER_RECIPE: Final = text("A supervisor has to approve another recipe from the plant.")
 _NOT_PASSED: Final = Refused(
     "NOT_PASSED", text("The unit has not passed."), text("Only a passed unit gets a label.")
 )
+
+
+def _recipe_facts(recipe: LoadedRecipe) -> dict[str, str]:
+    """What the audit trail states about a recipe."""
+    rule = recipe.recipe
+    return {
+        "name": rule.name,
+        "revision": rule.revision,
+        "part": rule.part,
+        "sha256": recipe.sha256,
+        "digest": recipe.digest,
+    }
+
+
+_RELEASE: Final = ("flasher", "recipe_sha256", "units")
+
+
+def _release(recipe: LoadedRecipe, *, is_virtual: bool) -> dict[str, str]:
+    """What a golden unit releases. A virtual one proves nothing about real ones."""
+    values = (__version__, recipe.sha256, "virtual" if is_virtual else "real")
+    return dict(zip(_RELEASE, values, strict=True))
+
+
+def _release_key(data: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(str(data.get(name, "")) for name in _RELEASE)
 
 
 def _not_labelled(run: RunRecord) -> Refused | None:

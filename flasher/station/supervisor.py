@@ -111,6 +111,8 @@ class _Slot:
         self.pause_s = RESTART_MIN_S
         self.reason = ""
         """Reason that it reported for not working."""
+        self.replace_by: float | None = None
+        """Time at which a process that `replace` ended is killed; None without one."""
 
 
 class WorkerSupervisor:
@@ -149,6 +151,8 @@ class WorkerSupervisor:
         """
         news: list[tuple[str, FromWorker | WorkerLost]] = []
         for name, slot in self._slots.items():
+            if slot.replace_by is not None and not self._has_ended(slot, slot.replace_by):
+                continue
             if slot.port is None:
                 if slot.start_at is not None and self._now() >= slot.start_at:
                     slot.port = self._launch(slot.setup)
@@ -167,6 +171,16 @@ class WorkerSupervisor:
                 reason = f"its process sent nothing for {limit_s:g} s, and was killed"
                 news.append((name, self._lose(slot, reason, hung=True)))
         return news
+
+    def replace(self, setup: WorkerSetup) -> None:
+        """End the process of a socket, and start it with other settings. It must have no run."""
+        slot = self._slots[setup.socket]
+        slot.setup = setup
+        if slot.port is None:
+            slot.start_at = self._now()  # it waited before a restart, or could not work
+        else:
+            slot.port.send(Quit())
+            slot.replace_by = self._now() + _QUIT_S
 
     def close(self) -> None:
         """Ask all processes to end; kill those that do not end in time."""
@@ -200,6 +214,19 @@ class WorkerSupervisor:
                 slot.received_at = self._now()
                 slot.is_new = False
         return messages, False
+
+    def _has_ended(self, slot: _Slot, kill_at: float) -> bool:
+        """True after the end of a process that was asked to end, and is killed at a time. Its last
+        messages are dropped: they are about a unit that the next process identifies again.
+        """
+        _, is_gone = self._receive(slot)
+        if not is_gone and self._now() < kill_at:
+            return False
+        if slot.port is not None:
+            slot.port.kill()
+        slot.port, slot.replace_by, slot.reason = None, None, ""
+        slot.start_at, slot.pause_s = self._now(), RESTART_MIN_S
+        return True
 
     def _lose(self, slot: _Slot, reason: str, *, hung: bool) -> WorkerLost:
         if slot.port is not None and not hung:

@@ -388,7 +388,7 @@ def open_socket(
 
 def load_same(setup: WorkerSetup) -> LoadedRecipe:
     """Load the recipe. Raises UsageError if it differs from the station's."""
-    recipe = load_recipe(setup.recipe)
+    recipe = load_recipe(setup.recipe, may_waive=setup.may_waive)
     if {str(path): sha256 for path, sha256 in recipe.files.items()} != dict(setup.files):
         raise UsageError("The recipe, or a file that it names, was changed.")
     return recipe

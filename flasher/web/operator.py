@@ -20,8 +20,16 @@ from starlette.routing import BaseRoute, Route
 
 from flasher.files import parse_json
 from flasher.i18n import text
-from flasher.station.board import Board, Replies, Row
-from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
+from flasher.protocol.text import printable
+from flasher.station.board import Board, Replies, Row, shown
+from flasher.station.events import (
+    LineStopped,
+    OfferedRecipe,
+    RecipesOffered,
+    RunEnded,
+    SocketState,
+    StationEvent,
+)
 from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.shift_counts import EndedRun, ShiftCounts, ShiftFigures
 from flasher.station.socket import PAGE, Source
@@ -83,6 +91,7 @@ class ScreenHeader:
     replies: Replies
     is_secret: bool
     """Typed characters must be hidden."""
+    offered: RecipesOffered | None = None
 
     def to_json(self, translate: Translator, source: Source) -> dict[str, Any]:
         """The header in a language, for the page of the session `source`."""
@@ -122,7 +131,35 @@ class ScreenHeader:
                 }
                 for check in self.health
             ],
+            "offered": [
+                _offer(each, translate) for each in (self.offered.offered if self.offered else ())
+            ],
+            "withdrawn": translate(
+                text("withdrawn by the plant: no unit begins in {sockets}"),
+                sockets=", ".join(map(printable, self.offered.withdrawn)),
+            )
+            if self.offered and self.offered.withdrawn
+            else "",
         }
+
+
+def _offer(offer: OfferedRecipe, translate: Translator) -> dict[str, Any]:
+    """A recipe that waits for its approval."""
+    published = text(
+        "published {at} by {name}",
+        at=printable(offer.published_at[:16].replace("T", " ")),
+        name=printable(offer.published_by),
+    )
+    return {
+        "recipe": printable(offer.recipe),
+        "digest": offer.digest,
+        "sockets": ", ".join(map(printable, offer.sockets)),
+        "published": translate(published),
+        "changes": [translate(each) for each in offer.changes]
+        or [translate(text("no difference in what it does"))],
+        "scan": offer.scan,
+        "problem": translate(shown(offer.problem)),
+    }
 
 
 def _counted(count: tuple[int, int], translate: Translator) -> str:
@@ -202,8 +239,10 @@ class Screen:
             board.stopped,
             board.replies,
             bool(board.pin_of),
+            board.offered,
         )
-        self.feed.put(_HEAD, head, word=(head.stopped, head.replies, head.is_secret))
+        word = (head.stopped, head.replies, head.is_secret, head.offered)
+        self.feed.put(_HEAD, head, word=word)
 
 
 class OperatorPage:

@@ -28,7 +28,7 @@ from flasher.station.operators import BadgeTable
 from flasher.station.pins import Pin, is_right
 from flasher.station.recipe import Recipe
 from flasher.station.records.errors import DiskFullError
-from flasher.station.records.model import RunState, StepState
+from flasher.station.records.model import AuditEvent, RunState, StepState
 from flasher.station.records.store import Store
 from flasher.station.scans import Word
 from tests.cli.conftest import SAMPLES, Flasher, Run
@@ -178,6 +178,28 @@ def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
     first, second = (unit["serial"] for unit in document["units"])
     assert ended == [(first, "UNIT_CHANGED"), (second, "OK"), (first, "OK")]
     assert run.code == ExitCode.OK
+
+
+@pytest.mark.slow
+def test_a_golden_unit_is_checked_and_releases_the_line(
+    flasher: Flasher, recipe: Path, tmp_path: Path
+) -> None:
+    text = recipe.read_text("utf-8")
+    golden = '\n[golden]\nserial_numbers = ["W2605000"]\nevery_h = 100\n'
+    recipe.write_text(text + golden, "utf-8")
+    file = tmp_path / "station.toml"
+    head = 'name = "line-2"\nkeys = "keys"\ngolden_unit = "required"\n'
+    file.write_text(head + '[[socket]]\nname = "A"\nmock = { bad = 0.0 }\n', "utf-8")
+    words = ("station", "check", recipe, "--sockets", file, "--golden")
+    wrong = flasher(*words, "W2605003")
+    assert wrong.code == ExitCode.USAGE
+    assert "it names W2605000" in wrong.err
+    run = flasher(*words, "W2605000", "--json")
+    assert run.code == ExitCode.OK, run.err
+    assert [unit["outcome"] for unit in lines_of(run)[1]["units"]] == ["pass"]
+    with Store.open(str(tmp_path / "records.sqlite"), station="reader", create=False) as store:
+        (row,) = store.read.noted("line-2", AuditEvent.RELEASED)
+    assert (row["serial"], row["units"]) == ("W2605000", "virtual")
 
 
 @pytest.mark.slow

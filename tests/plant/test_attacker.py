@@ -71,6 +71,19 @@ ATTEMPTS = {
     "store another trace under a hash": (
         f"INSERT INTO trace VALUES ({_HASH}, 'x')", "23514",
     ),
+    "publish a recipe": ("INSERT INTO released_recipe VALUES ('x', 'x', '', '', '')", DENIED),
+    "store an image": (f"INSERT INTO released_file VALUES ({_HASH}, 'x')", DENIED),
+    "give a recipe to all stations": (
+        f"INSERT INTO recipe_event (what, digest) VALUES ('published', {_HASH})", DENIED,
+    ),
+    "withdraw a recipe": (
+        f"INSERT INTO recipe_event (what, digest) VALUES ('withdrawn', {_HASH})", DENIED,
+    ),
+    "alter an image": ("UPDATE released_file SET data = 'x'", DENIED),
+    "read images past the functions": ("SELECT * FROM released_file", DENIED),
+    "read who published": ("SELECT * FROM recipe_event", DENIED),
+    "ask as another station": ("SELECT plant_gives_me('x')", DENIED),
+    "become a publisher": ("SET ROLE flasher_publishers", DENIED),
     "take the checks away": ("ALTER TABLE chain_row DISABLE TRIGGER ALL", DENIED),
     "take row level security away": ("ALTER TABLE chain_row DISABLE ROW LEVEL SECURITY", DENIED),
     "replace a function": (

@@ -173,6 +173,8 @@ class World:
                         | line.DropAdmission()
                     ):
                         pass
+                    case line.ApproveRecipe():
+                        pass
                     case _:
                         self.look(effect)
 

@@ -12,7 +12,12 @@ from sqlalchemy import make_url
 
 from flasher.cli.output import Output, byte_count, counted, duration
 from flasher.cli.plant.commands import BoundsOptions
-from flasher.cli.plant.documents import PlantInitDocument, PlantSendDocument, PlantStatusDocument
+from flasher.cli.plant.documents import (
+    PlantFetchDocument,
+    PlantInitDocument,
+    PlantSendDocument,
+    PlantStatusDocument,
+)
 from flasher.cli.station.records import TWICE_MAX, passed_twice_lines
 from flasher.errors import ExitCode, UsageError
 from flasher.plant.activity import Yield
@@ -157,6 +162,12 @@ def _lines(of: StationOverview) -> Iterator[str]:
         yield f"  unsent:    {counted(each.unsent, 'row')}, the first of {oldest}"
     if each.clock_offset_s is not None:
         yield f"  clock:     {each.clock_offset_s:+.1f} s"
+    for used in each.recipes:
+        recipe = f"{used.name}, revision {used.revision}, {used.digest[:16] or 'a local file'}"
+        withdrawn = ", WITHDRAWN: begins no unit" if used.is_withdrawn else ""
+        yield printable(f"  socket {used.socket}:  {recipe}{withdrawn}")
+        if used.published:
+            yield printable(f"    not approved yet: {used.published[:16]}")
     if each.disk_free_bytes is not None:
         yield f"  disk:      {byte_count(each.disk_free_bytes)} free"
     for check in of.checks:
@@ -182,7 +193,22 @@ def sending_of(file: Path) -> Sending:
             remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
         )
     files = Path(config.files) if config.files else None
-    return Sending(config.plant, config.name, config.records, files)
+    sockets = tuple(each.name for each in config.socket)
+    return Sending(config.plant, config.name, config.records, files, sockets)
+
+
+def fetch(output: Output, file: Path) -> int:
+    with closing(sending_of(file).open_fetcher()) as fetcher:
+        found = fetcher.fetch()
+    for given in found.recipes:
+        state = given.fault or ("fetched now" if given.digest in found.new else "was here")
+        output.result(printable(f"{given.digest}, sockets {', '.join(given.sockets)}: {state}"))
+    for digest in found.withdrawn:
+        output.result(f"{digest}: WITHDRAWN")
+    if not found.recipes:
+        output.result("the plant gives no recipe to this station")
+    code = ExitCode.PARTIAL if any(each.fault for each in found.recipes) else ExitCode.OK
+    return output.document(PlantFetchDocument(found), exit_code=code)
 
 
 def send(output: Output, file: Path) -> int:

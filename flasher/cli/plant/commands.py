@@ -12,7 +12,7 @@ from typing import Annotated, Final
 
 from flasher.cli import values
 from flasher.cli.extras import need
-from flasher.cli.framework import group, option, option_set
+from flasher.cli.framework import argument, group, option, option_set
 from flasher.cli.output import Output
 from flasher.cli.station.commands import (
     DEFAULT_DESK,
@@ -23,7 +23,7 @@ from flasher.cli.station.commands import (
     address_of,
     pages_options,
 )
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, UsageError
 
 _EXAMPLES: Final = """\
 examples:
@@ -34,6 +34,8 @@ examples:
   flasher plant report --database postgresql://reader@plant-db/flasher --since 2026-05-17
   flasher plant pages --database postgresql://reader@plant-db/flasher
   flasher plant verify --database postgresql://reader@plant-db/flasher
+  flasher plant publish recipe.toml --station line-2 --database postgresql://anna@plant-db/flasher
+  flasher plant recipes --database postgresql://reader@plant-db/flasher
   flasher plant send --sockets sockets.toml
 """
 
@@ -205,3 +207,62 @@ def send(output: Output, sockets: Path) -> int:
     by itself.
     """
     return _call("administration.send", output, sockets)
+
+
+@plant.action("publish")
+@argument("recipe", type=values.FilePath("toml", gives=Path), metavar="RECIPE", help="the recipe")
+@option(
+    "--station", "stations", metavar="NAME", multiple=True, brief=True,
+    help="a station that gets it; may be repeated",
+)  # fmt: skip
+@option("--all", "is_all", is_flag=True, brief=True, help="all stations get it")
+@option(
+    "--socket", "sockets", metavar="NAME", multiple=True,
+    help="a socket that gets it (default: all of the station); may be repeated",
+)  # fmt: skip
+@_database_option
+def publish(
+    output: Output,
+    recipe: Path,
+    database: str,
+    stations: tuple[str, ...],
+    sockets: tuple[str, ...],
+    *,
+    is_all: bool,
+) -> int:
+    """Give a recipe with its images to stations with `plant_recipes` in their file. A station
+    fetches it, and uses it after one of its supervisors has approved it there.
+    """
+    if is_all == bool(stations):
+        raise UsageError("Name stations with --station, or give --all.", remedy="Choose one.")
+    return _call("recipes.publish", output, recipe, database, stations, sockets)
+
+
+@plant.action("withdraw")
+@argument("digest", metavar="DIGEST", help="its digest, or the first digits")
+@option("--reason", metavar="TEXT", required=True, brief=True, help="the reason, for the records")
+@_database_option
+def withdraw(output: Output, digest: str, database: str, reason: str) -> int:
+    """Withdraw a published recipe: stations begin no unit with it as soon as they know. To publish
+    it again takes that back.
+    """
+    return _call("recipes.withdraw", output, digest, database, reason)
+
+
+@plant.action("recipes")
+@_database_option
+def recipes(output: Output, database: str) -> int:
+    """List what was published and withdrawn, by whom and when."""
+    return _call("recipes.recipes", output, database)
+
+
+@plant.action("fetch")
+@option(
+    "--sockets", type=values.FilePath("toml", gives=Path), required=True, brief=True,
+    metavar="FILE", help="the station file (TOML), with `plant`",
+)  # fmt: skip
+def fetch(output: Output, sockets: Path) -> int:
+    """Fetch the recipes that the plant gives to a station, and end. A running station does it by
+    itself. Exit code 12 if one could not be fetched.
+    """
+    return _call("administration.fetch", output, sockets)

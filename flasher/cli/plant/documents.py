@@ -8,7 +8,9 @@ from typing import Final
 from flasher.cli.station.documents import StationReportDocument
 from flasher.plant.activity import Activity
 from flasher.plant.alerts import StationCheck
+from flasher.plant.fetcher import Fetched
 from flasher.plant.forwarder import ForwarderState
+from flasher.plant.recipes import RecipeEvent
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
 from flasher.station.records.model import PassedTwice
@@ -48,6 +50,35 @@ class PlantSendDocument:
 
 
 @dataclass(frozen=True)
+class PlantFetchDocument:
+    """Recipes that the plant gives to a station, after `flasher plant fetch`."""
+
+    fetched: Fetched
+
+
+@dataclass(frozen=True)
+class PlantPublishDocument:
+    """A recipe that was published."""
+
+    recipe: str
+    revision: str
+    digest: str
+    files: dict[str, str]
+    """SHA-256 of each file."""
+    stations: list[str]
+    """Empty: all."""
+    sockets: list[str]
+    """Empty: all."""
+
+
+@dataclass(frozen=True)
+class PlantRecipesDocument:
+    """What was published and withdrawn, oldest first."""
+
+    events: list[RecipeEvent]
+
+
+@dataclass(frozen=True)
 class PlantUnitsDocument:
     """Units whose last transfer to a target was of an image."""
 
@@ -63,5 +94,8 @@ DOCUMENTS: Final = (
     PlantInitDocument,
     PlantStatusDocument,
     PlantSendDocument,
+    PlantFetchDocument,
+    PlantPublishDocument,
+    PlantRecipesDocument,
 )
 LINES: Final[tuple[type, ...]] = ()

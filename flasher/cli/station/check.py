@@ -8,13 +8,15 @@ from pathlib import Path
 
 from flasher.cli.documents import document_of
 from flasher.cli.output import Output, byte_count
+from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     CheckedTargetDocument,
     FindingsDocument,
     RecipeFindingDocument,
     StationCheckDocument,
 )
-from flasher.cli.station.setup import check_clock, labels_of
+from flasher.cli.station.run import run
+from flasher.cli.station.setup import check_clock, check_golden, labels_of
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import check_samples, detect, resolve
@@ -22,6 +24,33 @@ from flasher.station.config import load_config
 from flasher.station.operators import load_badges
 from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
+from flasher.station.scans import Word
+
+
+def golden(
+    output: Output, options: RunOptions, records: RecordsOptions, serial: str, socket: str | None
+) -> int:
+    """Run a golden unit. Its PASS releases this flasher with the recipe at the station."""
+    if records.sockets is None or options.recipe is None:
+        raise UsageError("--golden needs the station file.", remedy="Give --sockets FILE.")
+    recipe = load_checked(options.recipe, datetime.now().astimezone().date())
+    rule = recipe.recipe.golden
+    known = () if rule is None else rule.serial_numbers
+    if serial not in known:
+        listed = ", ".join(map(printable, known)) or "none"
+        raise UsageError(
+            f"{printable(serial)} is no golden unit of the recipe: it names {listed}.",
+            remedy="Name one of them, or add it to [golden] in the recipe.",
+        )
+    names = [each.name for each in load_config(records.sockets).socket]
+    if socket is None and len(names) > 1:
+        raise UsageError(
+            "The station has several sockets.",
+            remedy=f"Give --socket with one of {', '.join(map(printable, names))}.",
+        )
+    card = f"{Word.SOCKET.value} {socket or names[0]}"
+    pages = PagesOptions(None, None, None, web_insecure=False, language=None)
+    return run(output, options, pages, records, golden=[card, serial])
 
 
 def check(output: Output, path: Path, station_file: Path | None) -> int:
@@ -56,6 +85,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
             Question(config.question, recipe, config.name)  # reads its certificates
         if config.plant:
             clock_offset_s = check_clock(config, recipe, output)
+        check_golden(config, recipe)
         resolved = resolve(config.socket, detect(config.socket))
         check_samples(resolved, recipe)
         for socket in resolved:

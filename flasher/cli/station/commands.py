@@ -23,6 +23,7 @@ DEFAULT_RECORDS: Final = "records.sqlite"
 _EXAMPLES: Final = """\
 examples:
   flasher station check recipe.toml
+  flasher station check recipe.toml --sockets sockets.toml --golden W2605000 --socket A
   flasher station run --recipe recipe.toml --sockets sockets.toml --operator Jo
   flasher station run --recipe recipe.toml --mock-sockets 4 --units 8
   flasher station run --recipe recipe.toml --mock-sockets 4 --web
@@ -201,20 +202,18 @@ class PagesOptions:
 pages_options: Final = option_set("pages", PagesOptions)
 
 
-@station.action("check")
-@argument("recipe", type=values.FilePath("toml", gives=Path), metavar="RECIPE", help="the recipe")
-@_path_option("--sockets", brief=True, help="check this station file and its adapters, too")
-def check(output: Output, recipe: Path, sockets: Path | None) -> int:
-    """Check a recipe and its images, before a shift."""
-    return _call("check.check", output, recipe, sockets)
-
-
 @dataclass(frozen=True)
 class RunOptions:
     """Options of `flasher station run`."""
 
-    recipe: Annotated[Path, _path_option(
-        "--recipe", required=True, help="the recipe (TOML): steps, images and limits of a unit",
+    recipe: Annotated[Path | None, _path_option(
+        "--recipe", brief=True,
+        help="the recipe (TOML): steps, images and limits of a unit; with `plant_recipes` in the "
+        "station file it is used until a recipe of the plant is approved",
+    )]  # fmt: skip
+    ignore_approved: Annotated[bool, option(
+        "--ignore-approved", is_flag=True,
+        help="begin with --recipe although a recipe of the plant was approved; it is recorded",
     )]  # fmt: skip
     operator: Annotated[str | None, option(
         "--operator", metavar="NAME", brief=True, help="name of the operator (default: the login)",
@@ -273,6 +272,33 @@ class RunOptions:
         "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
         help="speed relative to a real bus; 0: no delays",
     )]  # fmt: skip
+
+
+@station.action("check")
+@argument("recipe", type=values.FilePath("toml", gives=Path), metavar="RECIPE", help="the recipe")
+@_path_option("--sockets", brief=True, help="check this station file and its adapters, too")
+@option(
+    "--golden", metavar="SERIAL", brief=True,
+    help="also run this golden unit: its PASS releases this flasher with the recipe at the station "
+    "(see `golden_unit` in the station file)",
+)  # fmt: skip
+@option("--socket", metavar="NAME", help="the socket of the golden unit")
+def check(
+    output: Output, recipe: Path, sockets: Path | None, golden: str | None, socket: str | None
+) -> int:
+    """Check a recipe and its images, before a shift. With --golden a known good unit is flashed,
+    after an update of flasher or of the recipe. Exit code 12 if it did not pass.
+    """
+    if golden is None:
+        return _call("check.check", output, recipe, sockets)
+    options = RunOptions(
+        recipe=recipe, ignore_approved=False, operator=None, lot="", badges=None, scans=None,
+        lines=True, web=None, mix_virtual=False, mock_sockets=None, units=None, scan_by_hand=False,
+        mock_bad=0.0, mock_slow=0.0, mock_dead=0.0, mock_exchanged=0.0, mock_mislabelled=0.0,
+        mock_seed=1, mock_speed=1.0,
+    )  # fmt: skip
+    records = RecordsOptions(None, None, None, (), sockets)
+    return _call("check.golden", output, options, records, golden, socket)
 
 
 @station.action("run", epilog=_RUN_NOTES)

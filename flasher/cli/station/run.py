@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -19,7 +19,15 @@ from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOption
 from flasher.cli.station.documents import StationRunDocument, figures_document
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
-from flasher.cli.station.setup import crew_of, gate_of, labels_of, scanners_of
+from flasher.cli.station.setup import (
+    check_golden,
+    crew_of,
+    gate_of,
+    labels_of,
+    offered,
+    recipes_of,
+    scanners_of,
+)
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import (
@@ -32,7 +40,7 @@ from flasher.errors import (
 )
 from flasher.protocol.text import printable
 from flasher.station import codes
-from flasher.station.adapters import Resolved, detect, resolve, worker_setups
+from flasher.station.adapters import Resolved, detect, resolve, with_recipe, worker_setups
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.events import StationEvent
 from flasher.station.operators import Crew
@@ -61,15 +69,36 @@ _LEAVE_S: Final = 2.0
 """Time for which the verdict on a virtual unit is shown."""
 
 
-def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
-    """Run the command and return its exit code. Without a terminal the output is JSON."""
+def run(
+    output: Output,
+    options: RunOptions,
+    pages: PagesOptions,
+    records: RecordsOptions,
+    *,
+    golden: Sequence[str] = (),
+) -> int:
+    """Run the command and return its exit code. Without a terminal the output is JSON. `golden`:
+    scans of one golden unit, which releases this flasher with the recipe.
+    """
     is_terminal = sys.stdout.isatty()
     if not (is_terminal or options.lines):
         output.json_wanted = True
-    scans = None if options.scans is None else read_scans(options.scans)
-    recipe = load_checked(options.recipe, datetime.now().astimezone().date())
+    scans = list(golden) or (None if options.scans is None else read_scans(options.scans))
+    day = datetime.now().astimezone().date()
+    local = None if options.recipe is None else load_checked(options.recipe, day)
     config, sockets = _find_sockets(options, records.sockets)
-    crew = crew_of(options, config, recipe.recipe.serial_number)
+    if golden:  # who runs the command is the operator
+        config = config.model_copy(
+            update={"badges": "", "plant_recipes": False, "golden_unit": "required"}
+        )
+    if local is None and not config.plant_recipes:
+        raise UsageError(
+            "A station needs a recipe.",
+            remedy="Give --recipe FILE, or set plant_recipes in the station file.",
+        )
+    if local is not None:
+        check_golden(config, local)
+        crew_of(options, config, local.recipe.serial_number)  # fails before records are created
     is_virtual = all(socket.bus is None for socket in sockets)
     view: View = Table(output)
     if output.json_wanted:
@@ -79,28 +108,36 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
     with (
         _opened_records(options, records, config, output) as store,
         _sent_to_plant(options, records, config),
+        ExitStack() as stack,
     ):
+        recipes = recipes_of(options, config, sockets, store, local, day)
+        recipe = recipes[sockets[0].config.name]
+        crew = crew_of(options, config, recipe.recipe.serial_number)
         session = _Session(
             options, pages, output, store, view, crew, config, is_virtual,
-            is_temporary=_is_temporary(options, records),
+            is_temporary=_is_temporary(options, records), has_scans=scans is not None,
         )  # fmt: skip
         first = 1
         if is_virtual:  # serial numbers that are not in the records yet
-            known = partial(store.read.known, recipe.recipe.part)
-            first = next_number(recipe.recipe.serial_number, known)
+            first = max(
+                next_number(each.recipe.serial_number, partial(store.read.known, each.recipe.part))
+                for each in recipes.values()
+            )
         output.has_opened = True
         gate = None if _is_temporary(options, records) else gate_of(config, recipe, store)
+        setups = worker_setups(
+            sockets,
+            recipe,
+            first_number=first,
+            units=options.units,
+            speed=options.mock_speed,
+            leave_after_s=_LEAVE_S,
+        )
         session.station = Station(
             store,
             recipe,
-            worker_setups(
-                sockets,
-                recipe,
-                first_number=first,
-                units=options.units,
-                speed=options.mock_speed,
-                leave_after_s=_LEAVE_S,
-            ),
+            [with_recipe(each, recipes[each.socket]) for each in setups],
+            recipes=recipes,
             operator=operator_of(options.operator) if crew is None else "",
             lot=options.lot,
             crew=crew,
@@ -111,6 +148,8 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
                 scans_labels=session.scans_itself,
                 end_limit_s=END_LIMIT_S,
                 mixes_virtual=options.mix_virtual,
+                needs_golden=config.golden_unit == "required",
+                gets_recipes=config.plant_recipes,
             ),
             launch=LAUNCH,
             gate=gate,
@@ -122,6 +161,8 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
                 partial(session.station.submit, source=FILE),
                 badges=frozenset() if crew is None else crew.codes,
             )
+        if config.plant_recipes:
+            stack.enter_context(offered(config, sockets, store.files.folder, session.station.offer))
         session.work()
         return session.report()
 
@@ -206,7 +247,8 @@ def _sent_to_plant(
             f"Another PC has taken {printable(config.name)} over: {printable(refusal)}.",
             remedy="Use that PC. To take the station back: flasher station take-over.",
         )
-    return sending(Sending(config.plant, config.name, place.url, place.files))
+    recipes_for = tuple(each.name for each in config.socket) if config.plant_recipes else ()
+    return sending(Sending(config.plant, config.name, place.url, place.files, recipes_for))
 
 
 @dataclass
@@ -223,6 +265,8 @@ class _Session:
     is_virtual: bool
     is_temporary: bool
     """True if the records are deleted at the end."""
+    has_scans: bool
+    """True if a list of scans is given."""
     station: Station = field(init=False)
     file: ScanFile | None = None
     _pipe: LineReader | None = None
@@ -242,7 +286,7 @@ class _Session:
         """True if the station scans the labels of its virtual units automatically."""
         options = self.options
         by_hand = options.scan_by_hand or self.crew is not None or bool(self.config.scanner)
-        return self.is_virtual and options.scans is None and not by_hand
+        return self.is_virtual and not self.has_scans and not by_hand
 
     # -- at work ----------------------------------------------------------------------------------
 

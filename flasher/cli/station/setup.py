@@ -1,26 +1,34 @@
-"""Sets up badges, label printer and scanners of a station; `flasher station pin`."""
+"""Sets up recipes, badges, label printer and scanners of a station; `flasher station pin`."""
 
 from __future__ import annotations
 
 import getpass
 import sys
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from datetime import date
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from flasher.cli.extras import need
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
-from flasher.errors import ErrorCode, UsageError, how_to_install
+from flasher.errors import ErrorCode, FlasherError, UsageError, how_to_install
+from flasher.protocol.text import printable
+from flasher.station.adapters import Resolved, check_samples
 from flasher.station.config import StationConfig
 from flasher.station.gate import Gate
+from flasher.station.given_recipes import RecipeFolder
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
 from flasher.station.operators import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
 from flasher.station.recipe import ClockRule, SerialNumberRule, Unchecked
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.recipe_offers import Offers, RecipeOffers, approved, problem_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.scanners import Scanner
@@ -112,6 +120,103 @@ def check_clock(config: StationConfig, recipe: LoadedRecipe, output: Output) -> 
     else:
         output.error_line(f"warning: {words}")
     return offset_s
+
+
+# -- recipes from the plant ------------------------------------------------------------------------
+
+
+def recipes_of(
+    options: RunOptions,
+    config: StationConfig,
+    sockets: Sequence[Resolved],
+    store: Store,
+    local: LoadedRecipe | None,
+    day: date,
+) -> dict[str, LoadedRecipe]:
+    """Recipe of each socket: the one from the plant that was approved last, else the local one.
+    Raises UsageError, RecordError.
+    """
+    newest = approved(store.read, config.name) if config.plant_recipes else {}
+    if options.ignore_approved:
+        newest = {}
+    folder = RecipeFolder.of(store.files.folder, config.name)
+    loaded: dict[str, LoadedRecipe] = {}
+    found: dict[str, LoadedRecipe] = {}
+    for socket in sockets:
+        name = socket.config.name
+        digest = str(newest[name]["digest"]) if name in newest else ""
+        if digest and digest not in loaded:
+            loaded[digest] = _load_approved(folder, digest, newest[name], config, sockets, day)
+        chosen = loaded.get(digest, local)
+        if chosen is None:
+            raise UsageError(
+                f"No recipe was approved for socket {printable(name)} yet.",
+                remedy="Give --recipe FILE to begin with. It is used until a supervisor has"
+                " approved the plant's first one.",
+            )
+        found[name] = chosen
+    return found
+
+
+def check_golden(config: StationConfig, loaded: LoadedRecipe) -> None:
+    """Check that a recipe names golden units if the station needs one. Raises UsageError."""
+    if config.golden_unit == "required" and loaded.recipe.golden is None:
+        raise UsageError(
+            "The recipe names no golden unit, and this station requires one after each update.",
+            remedy='Add [golden] to the recipe, or remove golden_unit = "required" from the station'
+            " file.",
+        )
+
+
+def _load_approved(
+    folder: RecipeFolder,
+    digest: str,
+    approval: Mapping[str, Any],
+    config: StationConfig,
+    sockets: Sequence[Resolved],
+    day: date,
+) -> LoadedRecipe:
+    try:
+        loaded = folder.load(digest, day)
+        _check_fits(loaded, config=config, sockets=sockets)
+    except FlasherError as error:
+        name = printable(f"{approval.get('name')}, revision {approval.get('revision')}")
+        raise UsageError(
+            f"The approved recipe {name} cannot be used: {problem_of(error)}",
+            where=f"digest {digest}",
+            remedy="Fetch it again (flasher plant fetch --sockets FILE); or begin with a local one"
+            " (--recipe FILE --ignore-approved), and approve another one of the plant there.",
+            code=error.code,
+        ) from error
+    return loaded
+
+
+def _check_fits(
+    loaded: LoadedRecipe, *, config: StationConfig, sockets: Sequence[Resolved]
+) -> None:
+    """Check that a recipe fits the station's adapters, badges and labels. Raises FlasherError."""
+    check_samples(sockets, loaded)
+    check_golden(config, loaded)
+    if config.badges:
+        load_badges(Path(config.badges), loaded.recipe.serial_number)
+    labels_of(config, loaded)
+
+
+@contextmanager
+def offered(
+    config: StationConfig,
+    sockets: Sequence[Resolved],
+    files: Path,
+    offer: Callable[[Offers], None],
+) -> Iterator[None]:
+    """Offer the plant's recipes to a station while the block runs. Raises RecordError."""
+    names = [each.config.name for each in sockets]
+    check = partial(_check_fits, config=config, sockets=sockets)
+    folder = RecipeFolder.of(files, config.name)
+    offers = RecipeOffers(folder, names, check, offer)
+    offers.look()  # what was withdrawn counts from the first unit on
+    with offers.watching():
+        yield
 
 
 def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:

@@ -374,7 +374,7 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
             what,
             where=where,
             cause="they were made by a newer flasher",
-            remedy="Use that newer flasher.",
+            remedy=f"Use that newer flasher.{_way_back(database.location)}",
         )
     cause = "they were made by an older flasher"
     if number < _BEFORE_ALEMBIC:
@@ -385,6 +385,25 @@ def check_schema(database: Database, now: datetime, *, create: bool) -> None:
         cause=cause,
         remedy="Start the station, which backs them up and brings them up to date, or: flasher"
         " station upgrade.",
+    )
+
+
+def before_upgrade(file: Path, revision: str) -> Path:
+    """The copy of an SQLite file that an upgrade from this revision makes."""
+    return file.with_name(f"{file.name}.schema-{revision}")
+
+
+def _way_back(location: Location) -> str:
+    """Names the copy that the newer flasher made before it upgraded records of this schema."""
+    if location.file is None:
+        return ""
+    copy = before_upgrade(location.file, str(SCHEMA_VERSION))
+    if not copy.is_file():
+        return ""
+    return (
+        f" To go back for good, put {printable(copy.name)} in its place, the copy from before the"
+        " upgrade: later runs are not in it, which flasher station accept restored records. Keep"
+        " the newer file."
     )
 
 

@@ -121,6 +121,8 @@ class Refusal(StrEnum):
     RECIPE_CHANGED = "RECIPE_CHANGED"
     RECIPE_NOT_TRUSTED = "RECIPE_NOT_TRUSTED"
     """The trust file no longer allows an image of the recipe."""
+    RECIPE_WITHDRAWN = "RECIPE_WITHDRAWN"
+    """The plant has withdrawn the recipe."""
     CLOCK = "CLOCK"
     """The computer's clock is earlier than the last record of this station."""
     CLOCK_OFFSET = "CLOCK_OFFSET"

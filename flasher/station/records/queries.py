@@ -20,6 +20,7 @@ from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     DUPLICATES,
     SIGNATURE,
+    AuditEvent,
     Figures,
     ReportedRun,
     RunDetails,
@@ -167,6 +168,18 @@ class Records:
         with self._database.reading() as connection:
             query = select(schema.station.c.name).order_by(schema.station.c.id)
             return tuple(connection.execute(query).scalars())
+
+    def noted(self, station: str, event: AuditEvent) -> list[dict[str, Any]]:
+        """Data of a station's audit rows of one event, oldest first."""
+        audit = schema.audit.c
+        query = (
+            select(audit.data)
+            .join(schema.station, schema.station.c.id == audit.station_id)
+            .where(schema.station.c.name == station, audit.event == event.value)
+            .order_by(audit.number)
+        )
+        with self._database.reading() as connection:
+            return [chain.data_of(data) for data in connection.execute(query).scalars()]
 
     def head_of(self, run_id: RunId) -> ChainHead | None:
         """The signed audit row of a finished run; None without one."""

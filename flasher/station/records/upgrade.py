@@ -24,6 +24,7 @@ from flasher.station.records.database import (
     Database,
     Location,
     StationLock,
+    before_upgrade,
     check_schema,
     copy_checked,
     create_triggers,
@@ -142,7 +143,7 @@ def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
     if file is None:
         yield None
         return
-    backup = file.with_name(f"{file.name}.schema-{before}")
+    backup = before_upgrade(file, before)
     while backup.exists():
         backup = backup.with_name(backup.name + "-again")
     with mapped(printable(str(backup)), writes=True), whole_file(backup) as part:

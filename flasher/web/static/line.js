@@ -95,10 +95,53 @@ function showHead(head) {
     item.className = check.is_good ? "good" : "bad";
     return item;
   }));
+  if (head.withdrawn) {
+    const item = document.createElement("li");
+    item.textContent = head.withdrawn;
+    item.className = "bad";
+    byId("health").prepend(item);
+  }
+  showOffers(head);
   byId("stopped").hidden = !head.stopped;
   for (const name of ["reason", "remedy", "code"]) {
     put(byId("stopped-" + name), head.stopped ? head.stopped[name] : "");
   }
+}
+
+// Built again only when it changes, so that a list keeps its place while it is read.
+let offered = "";
+
+function showOffers(head) {
+  const now = JSON.stringify(head.offered);
+  byId("show-offers").hidden = head.offered.length === 0;
+  if (now === offered) {
+    return;
+  }
+  offered = now;
+  byId("offers").hidden = byId("offers").hidden || head.offered.length === 0;
+  byId("offer-list").replaceChildren(...head.offered.map((offer) => {
+    const box = byId("offer").content.firstElementChild.cloneNode(true);
+    const part = (name) => box.querySelector(name);
+    put(part("h3"), offer.recipe);
+    for (const name of ["sockets", "digest", "published", "problem"]) {
+      put(part("." + name), offer[name]);
+    }
+    part(".problem").hidden = !offer.problem;
+    for (const name of ["h4", "ul", ".approve"]) {
+      part(name).hidden = !offer.scan;
+    }
+    part("ul").replaceChildren(...offer.changes.map((change) => {
+      const item = document.createElement("li");
+      item.textContent = change;
+      return item;
+    }));
+    put(part(".approve b"), offer.scan);
+    part(".approve button").addEventListener("click", () => {
+      waiting.push(offer.scan);
+      send();
+    });
+    return box;
+  }));
 }
 
 function apply(message) {
@@ -169,6 +212,9 @@ addEventListener("keydown", (event) => {
     field.focus();
   }
 });
+
+byId("show-offers").addEventListener("click", () => { byId("offers").hidden = false; });
+byId("hide-offers").addEventListener("click", () => { byId("offers").hidden = true; });
 
 byId("sounds").addEventListener("click", async () => {
   audio = audio ?? new AudioContext();
