@@ -246,7 +246,7 @@ def connect_mock(
     the device model.
     """
     from flasher.bus.bit_rate import BitRate  # noqa: PLC0415  loads python-can
-    from flasher.bus.link import PacedClock, VirtualClock  # noqa: PLC0415
+    from flasher.bus.link import SteadyClock, VirtualClock  # noqa: PLC0415
     from flasher.bus.simulated import SimulatedBus  # noqa: PLC0415
     from flasher.mock.model import MockDevice  # noqa: PLC0415
     from flasher.mock.profile import DeviceProfile  # noqa: PLC0415
@@ -255,7 +255,7 @@ def connect_mock(
     chosen, node = as_dialect(dialect), as_target(target)
     bitrate_bps = chosen.bitrate_bps
     own = (profile or DeviceProfile()).speaking(chosen)
-    clock: Clock = PacedClock(speed) if speed else VirtualClock()
+    clock: Clock = SteadyClock(speed) if speed else VirtualClock()
     bus = SimulatedBus(bitrate_bps, clock)
     if system:
         bus.attach(System(chosen, node, profile=own, has_application=has_application), on_event)

@@ -264,6 +264,27 @@ def judge_bike(
     return results
 
 
+def check_same_battery(
+    connection: Connection, profile: Profile, serial: str, **watch: Unpack[CallOptions]
+) -> None:
+    """Raise WrongDeviceError if the battery is another one than before the first upgrade; `serial`
+    is its serial number then, "" if unknown, `profile` that of the battery.
+    """
+    request = profile.upgrade_options().version_request_for(BMS)
+    if not serial or request is None:
+        return
+    with suppress(NoAnswerError):  # the upgrade judges a silent device
+        now = serial_number(connection.device(profile=profile, **watch).ask(request))
+        if now and now != serial:
+            raise WrongDeviceError(
+                f"The BMS has the serial number {now}, and had {serial} before the first upgrade.",
+                cause="another bike is connected, or another battery",
+                remedy="Connect the first bike with its battery and run the same command, then "
+                "run it for the other one.",
+                code=ErrorCode.NOT_FOR_DEVICE,
+            )
+
+
 def serial_number(answer: Content | None) -> str:
     """Return the serial number in an answer to a version query, escaped; empty if it has none."""
     return printable(str(getattr(answer, "serial_number", ""))).strip()

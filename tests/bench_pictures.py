@@ -18,12 +18,14 @@ from playwright.sync_api import Browser, Page, expect
 
 from flasher import events
 from flasher.translation import NAMES
+from flasher.web.bench_state import BenchState, SeriesStep
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.firmware import VECTORS
 from tests.web.barriers import barriers
 from tests.web.bench_place import IMAGE, BenchPlace
 from tests.web.browser import chromium
+from tests.web.test_bench_bike import SET, write_set
 
 SIZES: Final = {"laptop": (1280, 800), "tablet": (820, 1180), "phone": (390, 844)}
 SCHEMES: Final[tuple[Literal["light", "dark"], ...]] = ("light", "dark")
@@ -118,6 +120,78 @@ def before_an_upgrade(page: Page, album: Album) -> None:
     _again(page)
 
 
+def one_after_the_other(page: Page, place: BenchPlace, album: Album) -> None:
+    """Lead the page through a series: each of its steps is held until its picture is taken."""
+    _use(page, BikeFault.EXCHANGED)
+    page.click("#target-bms")
+    page.click(f"#image button:text-is('{IMAGE}')")
+    page.click("#do-settings")
+    album.take("settings")
+    page.click("#go")
+    expect(page.locator("#do-next-bikes")).to_be_enabled()
+    album.take("more")
+    steps = (SeriesStep.REMOVAL, SeriesStep.UNIT, SeriesStep.SHOWN)
+    held = StepsHeld(place, *steps)
+    page.click("#do-next-bikes")
+    for step in steps:
+        expect(page.locator(f"#series [data-step={step.value}]")).to_be_visible()
+        album.take(f"series-{step.value}")
+        if step is SeriesStep.SHOWN:
+            page.click("#stop")
+        held.go_on.set()
+    expect(page.locator("#do-other")).to_be_enabled()
+    page.click("#session-all")
+    album.take("session")
+    _again(page)
+
+
+def whole_bike(page: Page, place: BenchPlace, album: Album) -> None:
+    """Lead the page through a bike whose second device is stopped, and that is gone on with."""
+    write_set(place.shelf.folder)
+    _use(page, BikeFault.NONE)
+    page.click("#target-bike")
+    page.click(f"#image button:text-is('{SET}')")
+    album.take("bike-set")
+    held = Held(
+        place,
+        lambda event: (
+            isinstance(event, events.PacketAcknowledged) and event.number == 3 and event.total == 5
+        ),
+    )
+    page.click("#go")
+    expect(page.locator("#pace .devices progress").nth(1)).to_have_attribute("value", "3")
+    album.take("bike-running")
+    page.click("#stop")
+    held.go_on.set()
+    expect(page.locator("#do-upgrade-bike")).to_be_enabled()
+    album.take("bike-failed")
+    page.click("#do-upgrade-bike")
+    expect(page.locator("#do-upgrade-bike")).to_have_count(0)
+    expect(page.locator("#next-bike")).to_be_enabled()
+    album.take("bike-done")
+    page.click("#sheet")
+    album.take("bike-sheet")
+    page.click("a[href='/']")
+    _again(page)
+
+
+class StepsHeld:
+    """Holds a series at these steps, one after the other."""
+
+    def __init__(self, place: BenchPlace, *steps: SeriesStep) -> None:
+        self._left = list(steps)
+        self.go_on = threading.Event()
+        self._put = place.bench.feed.put
+        place.bench.feed.put = self._hold  # type: ignore[method-assign]
+
+    def _hold(self, subject: str, state: BenchState, *, word: object) -> None:
+        self._put(subject, state, word=word)
+        if state.series is not None and self._left[:1] == [state.series.step]:
+            del self._left[0]
+            self.go_on.wait(60)
+            self.go_on.clear()
+
+
 def from_an_upgrade_on(page: Page, place: BenchPlace, album: Album) -> None:
     """Lead the page through an upgrade that fails, its rescue, and what is left."""
     _use(page, BikeFault.POWER)
@@ -168,6 +242,8 @@ def album_of(browser: Browser, folder: Path, language: str) -> Album:
             expect(page.locator("#adapter-1")).to_be_enabled()
             album = Album(page, folder, language)
             before_an_upgrade(page, album)
+            whole_bike(page, place, album)
+            one_after_the_other(page, place, album)
             from_an_upgrade_on(page, place, album)
             context.close()
     return album
@@ -181,6 +257,7 @@ def main() -> int:
     options.folder.mkdir(parents=True, exist_ok=True)
     wrong: list[str] = []
     count = 0
+    expect.set_options(timeout=60_000)  # many at once keep a computer busy
     with chromium() as browser:
         for language in options.language or NAMES:
             album = album_of(browser, options.folder, language)

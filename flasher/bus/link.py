@@ -18,8 +18,6 @@ SEND_LIMIT_S: Final = 2.0
 
 AT_ONCE: Final = float("-inf")
 """Deadline in the past: receive only frames that have already arrived."""
-_BUSY_WAIT_S: Final = 0.0001
-"""Real seconds before a moment that a paced clock spends in a busy loop."""
 
 
 _CATCH_UP_S: Final = 0.1
@@ -116,33 +114,9 @@ class MonotonicClock:
             time.sleep(remaining_s)
 
 
-class PacedClock:
-    """Real time multiplied by `speed`, for demonstrations.
-
-    A sleep ends about 0.1 ms late, so the last part is waited for in a busy loop.
-    """
-
-    def __init__(self, speed: float = 1.0) -> None:
-        self.speed = speed
-        self._origin = time.perf_counter()
-
-    def now(self) -> float:
-        """Simulated seconds since the clock was created."""
-        return (time.perf_counter() - self._origin) * self.speed
-
-    def wait_until(self, moment: float) -> None:
-        """Sleep until the simulated `moment`."""
-        until = self._origin + moment / self.speed
-        remaining_s = until - time.perf_counter()
-        if remaining_s > _BUSY_WAIT_S:
-            time.sleep(remaining_s - _BUSY_WAIT_S)
-        while time.perf_counter() < until:
-            pass
-
-
 class SteadyClock:
     """Real time multiplied by `speed`, which stops while this computer stalls: it advances only
-    during waits.
+    during waits. So durations and time limits of a simulated device do not depend on this computer.
     """
 
     def __init__(self, speed: float = 1.0) -> None:

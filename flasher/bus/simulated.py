@@ -6,7 +6,7 @@ as on a virtual network.
 
 Devices are engines (`attach`); the host uses a `SimulatedLink`. The bus has no thread: sending and
 receiving advance its time, on the given clock. With a `VirtualClock` an upgrade takes no time, with
-a `PacedClock` as long as on a real bus.
+a `SteadyClock` as long as on a real bus.
 """
 
 from __future__ import annotations

@@ -53,12 +53,39 @@ def check_new(path: Path, option: str, *, force: bool) -> None:
     """Check that a file can be written, and is new unless `force` is set. Raises UsageError."""
     check_writable(path, option)
     if path.exists() and not force:
-        raise UsageError(
-            f"{printable(str(path))} exists already.",
-            where=option,
-            remedy="Name another file, or add --force.",
-            code=ErrorCode.FILE_NOT_WRITTEN,
-        )
+        raise _exists_error(path, option)
+
+
+def _exists_error(path: Path, option: str) -> UsageError:
+    return UsageError(
+        f"{printable(str(path))} exists already.",
+        where=option,
+        remedy="Name another file, or add --force.",
+        code=ErrorCode.FILE_NOT_WRITTEN,
+    )
+
+
+@contextlib.contextmanager
+def claimed(path: Path, option: str, *, force: bool) -> Iterator[None]:
+    """Keep the name of a new file while the block makes its content, so that no second command
+    takes it meanwhile; an error that leaves it empty removes it. Raises UsageError for a file that
+    exists, unless `force` is set.
+    """
+    if force:
+        yield
+        return
+    try:
+        path.open("xb").close()
+    except FileExistsError as error:
+        raise _exists_error(path, option) from error
+    except OSError as error:
+        raise _not_written(path, option, error.strerror or type(error).__name__) from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            if path.stat().st_size == 0:
+                path.unlink()
 
 
 def _can_be_replaced(path: Path) -> bool:

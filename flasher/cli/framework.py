@@ -48,16 +48,16 @@ class Session:
         self.command_line = [without_password(word) for word in words]
         """Arguments as typed, without passwords."""
         self._logs = logs
-        self._verbosity = 0
+        self._verbose = self._quiet = 0
         self._log_file: str | None = None
 
     def take(self, name: str, value: Any) -> None:
         """Set an output option, given before or after the command."""
         match name:
             case "verbose":
-                self._verbosity += len(value)
+                self._verbose += len(value)
             case "quiet":
-                self._verbosity -= len(value)
+                self._quiet += len(value)
             case "json":
                 self.output.json_wanted = True
             case "events":
@@ -70,12 +70,14 @@ class Session:
         log file that cannot be written.
         """
         output = self.output
-        output.verbosity = self._verbosity
+        verbosity = output.verbosity = self._verbose - self._quiet
+        if self._verbose and self._quiet:
+            raise UsageError("-v and -q contradict each other.", remedy="Leave one of them out.")
         if output.events_wanted and not output.json_wanted:
             raise UsageError(
                 "--events needs --json.", remedy="Events are lines of JSON: add --json."
             )
-        self._logs.open(self._verbosity, self._log_file, typed_values(but="log_file"))
+        self._logs.open(verbosity, self._log_file, typed_values(but="log_file"))
         shown = printable(shlex.join(["flasher", *self.command_line]))
         _LOG.info("flasher %s: %s", __version__, shown, extra=PRINTED)
 

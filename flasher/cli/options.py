@@ -7,7 +7,7 @@ import hashlib
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Final
@@ -20,7 +20,7 @@ from flasher.bus.detect import DetectedAdapter
 from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
-from flasher.errors import ErrorCode, FlasherError, ImageError, UsageError
+from flasher.errors import ErrorCode, ImageError, UsageError
 from flasher.files import opened
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
 from flasher.host.waivers import IMPLAUSIBLE, OUTSIDE_VECTOR, WAIVERS
@@ -69,7 +69,7 @@ class Selection:
         help="format of IMAGE, instead of detecting it",
     )]  # fmt: skip
     base: Annotated[int | None, option(
-        "--base", type=values.number, metavar="ADDRESS", panel="image", brief=True,
+        "--base", type=values.address, metavar="ADDRESS", panel="image", brief=True,
         help="address of a raw binary's first byte",
     )]  # fmt: skip
     range_: Annotated[tuple[int, int] | None, option(
@@ -129,8 +129,7 @@ class ImageOptions(SentSelection):
 
     def load(self, *, force: bool = False) -> Image:
         """Load the image. Raises ImageError and UsageError."""
-        with self.advice():
-            return load(self.source, **self.options(force=force))
+        return load(self.source, **self.options(force=force))
 
     @property
     def source(self) -> str:
@@ -146,22 +145,6 @@ class ImageOptions(SentSelection):
         if self.is_piped:
             given["stream"] = self._piped
         return {**given, "allow_outside_vector": self.allow_outside_vector or force}
-
-    @contextlib.contextmanager
-    def advice(self) -> Iterator[None]:
-        """Suggest a base with 0x in an error of the image, if the image starts inside itself
-        there.
-        """
-        try:
-            yield
-        except ImageError as error:
-            digits = str(self.base)
-            if error.code is ErrorCode.IMAGE_OUTSIDE and self.base is not None:
-                with contextlib.suppress(FlasherError):
-                    load(self.source, **{**self.options(), "base": int(digits, 16)})
-                    error.cause = "a base without 0x is a decimal number"
-                    error.remedy = f"Did you mean --base 0x{digits}?"
-            raise
 
 
 image_options: Final = option_set("image", ImageOptions)

@@ -109,6 +109,8 @@ class Recording:
         self.taps: tuple[Tap, ...] = (EchoFilter(lambda: self.recorders),)
         """Taps for the driver."""
         self.failure: BaseException | None = None
+        self.only_asks = False
+        """The command sends queries only, or single writes that it reports."""
         self.bundle: Path | None = None
         """Path of the bundle, if any."""
         self.two_devices: str | None = None
@@ -195,6 +197,7 @@ def recorded_connection(
         bus.connect(target) as connection,
     ):
         record.opened(connection)
+        record.only_asks = True
         yield connection, record
 
 
@@ -248,6 +251,8 @@ def _leave_bundle(
     options: RecordingOptions, output: Output, record: Recording, error: BaseException | None
 ) -> None:
     is_explained = isinstance(error, FlasherError) and error.exit_code in _WITHOUT_BUNDLE
+    # It would take the place of the last failure, which `explain --last` is asked for.
+    is_explained |= record.only_asks and isinstance(error, InterruptedByUserError)
     if (is_explained and not record.is_alone) or not record.flight.frames:
         return
     from flasher.trace.bundle import keep_last, write_bundle  # noqa: PLC0415  loads python-can

@@ -23,6 +23,7 @@ TRACE_SUFFIXES: Final = (
 SLOWEST: Final = 0.1
 """Smallest speed of the mock, except 0."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
+_ADDRESS: Final = re.compile(r"0|0[xX][0-9A-Fa-f_]+")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
 _PORT_MAX: Final = 65_535
@@ -45,12 +46,20 @@ def number(text: str) -> int:
     )
 
 
+def address(text: str) -> int:
+    """Parse an address in hexadecimal, with 0x: without it, another address would be meant."""
+    if _ADDRESS.fullmatch(text):
+        return int(text, 16)
+    hint = f"; did you mean 0x{text}?" if re.fullmatch(r"[0-9a-fA-F]{1,8}", text) else ""
+    raise click.BadParameter(f"{text!a} is not an address in hexadecimal with 0x{hint}")
+
+
 def address_range(text: str) -> tuple[int, int]:
     """Parse START:END, the end exclusive."""
     start, colon, end = text.partition(":")
     if not colon:
         raise click.BadParameter(f"{text!r} is not a range; write START:END")
-    return number(start), number(end)
+    return address(start), address(end)
 
 
 def _from_zero(text: str, what: str) -> float:

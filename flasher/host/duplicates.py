@@ -12,7 +12,8 @@ sent, `received` and `frame_received` all that arrives. Evidence of a second dev
 - packets have ACK and NAK, though every copy has its ACK, more often than damaged frames explain.
 
 Not evidence, because a single device or a bad line may cause it: a late answer to a repetition
-(R10), general feedback besides the bootloader's own answers (R15), another request transfer before
+(R10), a refusal of the part of a packet that was sent before this computer paused (R12), general
+feedback besides the bootloader's own answers (R15), another request transfer before
 the first ACK (R16), an answer doubled by the link.
 """
 
@@ -197,6 +198,8 @@ class DuplicateDetector:
         self._last_row: tuple[object, float] = (None, -inf)
         self._has_ended = self._is_complete = False
         self._odd_answers = 0.0
+        self._refusals_expected = 0
+        """Parts of messages that a device may refuse, because this computer paused in them."""
 
     # -- what is sent -----------------------------------------------------------------------------
 
@@ -236,6 +239,12 @@ class DuplicateDetector:
         self._left_at = now
         self._has_ended = command is Command.END_OF_TRANSFER
         self._feedbacks.left()
+
+    def message_dropped(self) -> None:
+        """Record that this computer paused in a message, which is sent again: a device may refuse
+        the part that it received.
+        """
+        self._refusals_expected += 1
 
     def _packet_of(self, number: int) -> _Packet:
         """Return the record of a packet, the last one from now on; drop one of a packet that was
@@ -410,15 +419,21 @@ class DuplicateDetector:
                     self._transfer_lost_by = text("request transfer came again")
             case messages.Ack(number):
                 self._acknowledged(number, now)
-            case messages.Nak() if not self._has_ended:
-                self._packet.has_nak = True
-                self._check_two_answers(self._packet)
+            case messages.Nak():
+                self._refused()
             case messages.Complete():
                 if self._transfer_lost_by:
                     self._set_evidence(
                         text("{what}, yet the transfer was completed", what=self._transfer_lost_by)
                     )
                 self._is_complete = self._has_ended
+
+    def _refused(self) -> None:
+        if self._refusals_expected:
+            self._refusals_expected -= 1
+        elif not self._has_ended:
+            self._packet.has_nak = True
+            self._check_two_answers(self._packet)
 
     def _announce(self, can_id: int, boot: BootVersion, now: float) -> None:
         announced = self._announced.setdefault(can_id, _Announcements())
@@ -467,6 +482,7 @@ class DuplicateDetector:
 
     def _acknowledged(self, number: int, now: float) -> None:
         self._has_ack = True
+        self._refusals_expected = 0
         if self._confirmed.note_ack():
             self._set_evidence(
                 text("some packets were confirmed by general feedback, others were not")

@@ -29,7 +29,8 @@ class AddressSpan:
 
     def __str__(self) -> str:
         last = self.end - 1
-        return f"0x{self.start:08X}..0x{last:08X} ({self.size_bytes} bytes)"
+        unit = "byte" if self.size_bytes == 1 else "bytes"
+        return f"0x{self.start:08X}..0x{last:08X} ({self.size_bytes} {unit})"
 
 
 @dataclass(frozen=True)

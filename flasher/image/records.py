@@ -21,7 +21,7 @@ from zlib import crc32
 
 from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
-from flasher.image.segments import PIECES_MAX, SparseBytes, scattered_error
+from flasher.image.segments import PIECES_MAX, SparseBytes, empty_error, scattered_error
 
 LINES_MAX: Final = 1_100_000
 """Maximum number of lines, against files of blank lines. The largest image has 1,048,560 records of
@@ -73,6 +73,8 @@ class _Scanner:
             if not text.isascii():
                 raise self.refuse("the line holds bytes that are not ASCII")
             yield text.decode("ascii")
+        if self.line == 0:
+            raise empty_error(self.source)
         if not (self.ended or self.counted):
             raise self.refuse(
                 "the end record is missing: this is where the file ends",

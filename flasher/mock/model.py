@@ -102,6 +102,11 @@ def is_damaged_packet(damage: Damage) -> bool:
     return damage.data.startswith(_PACKET_HEAD)
 
 
+_LEAST_SPACING: Final = 0.8
+"""Shortest interval of two announcements as a share of the documented one: after a stall of this
+computer, a late one followed by one in time would look like two bootloaders (R27)."""
+
+
 class MockDevice(Machine):
     """Upgradable device as an engine (`flasher.protocol.engine`).
 
@@ -393,7 +398,9 @@ class MockDevice(Machine):
         self._announced += 1
         goes_on = self.profile.without_application == "announces"
         if self._announced < self.burst or (not self._has_whole_application and goes_on):
-            self._rearm(self.timings.boot_version_spacing_s, now)
+            spacing_s = self.timings.boot_version_spacing_s
+            self._rearm(spacing_s, now)
+            self._due_at = max(self._due_at, now + _LEAST_SPACING * spacing_s)
         elif self._has_whole_application:
             self._rearm(self.profile.window_s, now)
         else:

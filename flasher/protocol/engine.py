@@ -92,6 +92,8 @@ class Transmitter:
         """`tag` of that message."""
         self.on_message_sent: Callable[[float], None] | None = None
         """Called with the time when the adapter accepts the last frame of a message."""
+        self.on_message_dropped: Callable[[], None] | None = None
+        """Called when a message is sent again because this computer paused in it."""
 
     @property
     def idle(self) -> bool:
@@ -163,6 +165,8 @@ class Transmitter:
         if self._sent_frames and now - self._frame_sent_at > self._dropped_after_s:
             self._sent_frames = 0
             self.due_at = now + self._dropped_after_s * DROP_MARGIN
+            if self.on_message_dropped is not None:
+                self.on_message_dropped()
             return None
         self._asked_at = now
         return self._queue[0].frames[self._sent_frames]

@@ -54,7 +54,7 @@ class TargetImage(TargetTable):
     """Address of the first byte of a raw binary."""
 
 
-class SetImage(TargetImage):
+class BikeTarget(TargetImage):
     """A device of a bike, and its image."""
 
     firmware_version: FirmwareText | None = None
@@ -73,7 +73,7 @@ class BikeSet(TomlTable):
 
     notes: str = ""
     """Notes for people."""
-    target: tuple[SetImage, ...] = Field(min_length=1)
+    target: tuple[BikeTarget, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_targets(self) -> BikeSet:

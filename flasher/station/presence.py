@@ -24,7 +24,6 @@ from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from flasher.settings.profile import Profile, sent_ids
 from flasher.station.messages import PresenceChanged
-from flasher.station.recipe_file import LoadedTarget
 
 BLIND_S: Final = 0.15
 """Seconds of real time between two polls of the bus from which it counts as unobserved. Polls are
@@ -229,7 +228,7 @@ class TargetWatcher:
 class Presence:
     """Presence of a unit on an idle bus, without I/O: frames and times are arguments."""
 
-    def __init__(self, targets: Sequence[LoadedTarget]) -> None:
+    def __init__(self, targets: Sequence[Watched]) -> None:
         self._targets = targets
         self._probed_at: float | None = None
         self._number = 0

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -17,9 +17,17 @@ from queue import Empty, Queue
 from typing import Final, Protocol, TypeVar
 
 from flasher import events
-from flasher.api import Connection, DeviceInfo, Job, Result, compare, prepare, refusal
-from flasher.driver import drive
-from flasher.errors import FlasherError, ImageError, UsageError
+from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
+from flasher.bike import SetImage, open_bike_set, serial_number
+from flasher.driver import Tap, drive
+from flasher.errors import (
+    ErrorCode,
+    FlasherError,
+    ImageError,
+    InterruptedByUserError,
+    UsageError,
+    WrongDeviceError,
+)
 from flasher.history import Flash
 from flasher.host.event_text import progress_line, warning_text
 from flasher.host.identity import (
@@ -32,12 +40,13 @@ from flasher.host.identity import (
 )
 from flasher.host.outcome import AGAIN
 from flasher.host.query import memory_bytes
-from flasher.host.verify import Level, Verdict, possible_levels
 from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
+from flasher.kept_settings import settings_of
 from flasher.procedures import nothing_received_error
 from flasher.protocol.contents import Memory, RunningInformation
+from flasher.protocol.fields import Content
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.release.places import SUFFIX as RELEASE_SUFFIX
@@ -52,11 +61,11 @@ from flasher.web.bench_state import (
     Adapter,
     BenchState,
     BusWatch,
-    Compared,
     Done,
     Offer,
     Saved,
     SeenMessage,
+    SessionEntry,
 )
 from flasher.web.feed import Feed
 
@@ -69,7 +78,7 @@ WATCH_TURN_S: Final = 0.5
 """Refresh interval of the bus view, slow enough to read."""
 SUBJECT: Final = "bench"
 _AGAIN: Final = text("Start again with the adapter.")
-_RESCUE: Final = text("Then rescue this device.")
+RESCUE: Final = text("Then rescue this device.")
 T = TypeVar("T")
 Order = Callable[["BenchController"], object]
 """A function that the bench's own thread calls."""
@@ -101,6 +110,7 @@ class BenchBackend(Protocol):
     def bitrate_bps(self, adapter: Adapter) -> int: ...
     def is_physical(self, adapter: Adapter) -> bool: ...
     def images(self) -> Sequence[Path]: ...
+    def sets(self) -> Sequence[Path]: ...
     def dropped(self) -> Sequence[str]: ...
     def unfinished(self) -> Flash | None: ...
     def use_folder(self, path: str) -> None: ...
@@ -124,11 +134,13 @@ class BenchBackend(Protocol):
         self,
         adapter: Adapter,
         job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
         *,
+        keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> UpgradeEnding:
-        """Run an upgrade to its end and store its records."""
+        """Run an upgrade to its end and store its records; `connect` opens the adapter."""
 
 
 class BenchController:
@@ -145,21 +157,28 @@ class BenchController:
     ) -> None:
         self.feed = Feed(now, silence_limit_s=SILENCE_LIMIT_S)
         self.state = BenchState()
-        self._backend = backend
-        self._now = now
-        self._date = date
+        self.backend = backend
+        self.now = now
+        self.date = date
         self._lock = threading.Lock()
         self._is_taken = False
         """An order is queued or being executed."""
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
+        self._agreement = threading.Event()
         self._has_new_files = threading.Event()
         self._images_here: dict[str, str] = {}
         """Files of this computer by the firmware version inside."""
         self._last_image: Path | None = None
         """Image that was dropped or selected last, since an upgrade began."""
         self._is_closing = self._ends_at_once = False
-        self._set()
+        self._expected_serial = ""
+        """Serial number of the unit that may be upgraded; "" for any."""
+        self._other_serial = ""
+        """Serial number that another unit has reported instead."""
+        self._connection: Connection | None = None
+        """Open while an order needs the bus from one step to the next."""
+        self.show()
 
     # -- any thread --------------------------------------------------------------------------------
 
@@ -176,13 +195,17 @@ class BenchController:
     def file_came(self, path: Path) -> None:
         """Check a dropped file as soon as the bench is idle, and select it if it fits."""
         is_beside = path.suffix.lower() == RELEASE_SUFFIX and path.with_suffix("").is_file()
-        if path.suffix.lower() != ".toml" and not is_beside:  # these belong to an image
-            self._last_image = path
+        if self.state.is_bike or (path.suffix.lower() != ".toml" and not is_beside):
+            self._last_image = path  # the others belong to an image
         self._has_new_files.set()
 
     def stop(self) -> None:
         """End the current activity after the present message."""
         self._stop.set()
+
+    def agree(self) -> None:
+        """Agree to what the bench asks."""
+        self._agreement.set()
 
     def close(self, *, ends_upgrade: bool = True) -> None:
         """Start nothing more, and end the current activity; an upgrade only with `ends_upgrade`."""
@@ -192,8 +215,10 @@ class BenchController:
 
     # -- its own thread ----------------------------------------------------------------------------
 
-    def run(self) -> None:
-        """Execute orders until closed."""
+    def run(self, between: Callable[[BenchController], None]) -> None:
+        """Execute orders until closed; `between` is called after each one, and returns as soon as
+        `is_wanted`.
+        """
         while not self._is_closing:
             self.feed.beat()
             try:
@@ -203,14 +228,20 @@ class BenchController:
                     continue
                 order = self._orders.get()
             self.execute(order)
+            between(self)
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if there is something to do: an order, a new file, or to close."""
+        return not self._orders.empty() or self._is_closing or self.has_new_files
 
     def execute(self, order: Order) -> None:
         """Execute an order; an error becomes the `trouble` of the state."""
-        self._set(trouble=None)
+        self.show(trouble=None)
         try:
             order(self)
         except FlasherError as error:
-            self._set(trouble=error)
+            self.show(trouble=error)
         except Exception as error:  # noqa: BLE001  it is shown, and the bench goes on
             _LOG.exception("internal error")
             trouble = FlasherError(
@@ -218,27 +249,46 @@ class BenchController:
                 cause="a bug in flasher",
                 remedy="Please report it with the output of the terminal and the steps before it.",
             )
-            self._set(trouble=trouble)
+            self.show(trouble=trouble)
         finally:
             with self._lock:
                 self._is_taken = False
-            self._set(doing=Activity.NOTHING, is_stopping=False)
+            self.show(doing=Activity.NOTHING, is_stopping=False)
 
-    def _set(self, **changes: object) -> None:
-        self.state = replace(self.state, now_s=self._now(), **changes)  # type: ignore[arg-type]
+    def show(self, **changes: object) -> None:
+        """Change the state, and send it to the pages."""
+        self.state = replace(self.state, now_s=self.now(), **changes)  # type: ignore[arg-type]
         self.feed.put(SUBJECT, self.state, word=None)
         self.feed.beat()
 
-    def _cancelled(self) -> bool:
+    def cancelled(self) -> bool:
         """True if the current activity must end; called often."""
         self.feed.beat()
         left_s = self.state.power_cycle_left_s
-        if left_s(self._now()) != left_s(self.state.now_s):
-            self._set()
-        is_asked = self._stop.is_set() or self._ends_at_once
+        if left_s(self.now()) != left_s(self.state.now_s):
+            self.show()
+        is_asked = self._stop.is_set() or self._ends_at_once or bool(self._other_serial)
         if is_asked and not self.state.is_stopping:
-            self._set(is_stopping=True)
+            self.show(is_stopping=True)
         return is_asked
+
+    def ask_again(self) -> None:
+        """Begin to ask for agreement."""
+        self._agreement.clear()
+
+    @property
+    def is_agreed(self) -> bool:
+        """True if a user has agreed since `ask_again`."""
+        return self._agreement.is_set()
+
+    @property
+    def has_new_files(self) -> bool:
+        """True if a file was dropped that is not yet checked."""
+        return self._has_new_files.is_set()
+
+    def pause(self, duration_s: float) -> None:
+        """Wait; ends at once on Stop."""
+        self._stop.wait(duration_s)
 
     # -- the steps: orders -------------------------------------------------------------------------
 
@@ -249,21 +299,23 @@ class BenchController:
             was_looked_for=True,
             is_rescue=is_rescue,
             dropped=self.state.dropped,
+            session=self.state.session,
             unfinished=self.state.unfinished,
         )
         self.find_adapters()
 
     def find_adapters(self) -> None:
-        self._set(doing=Activity.ADAPTERS, unfinished=self._backend.unfinished())
-        self._set(adapters=tuple(self._backend.adapters(self._cancelled)), was_looked_for=True)
+        self.show(doing=Activity.ADAPTERS, unfinished=self.backend.unfinished())
+        self.show(adapters=tuple(self.backend.adapters(self.cancelled)), was_looked_for=True)
 
     def use_adapter(self, name: str) -> None:
         """Open an adapter and look for devices."""
         adapter = _known({each.name: each for each in self.state.adapters}, name)
-        self._backend.use(adapter)
+        self.backend.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
-        self._set(
-            adapter=adapter, adapters=marked, bike=None, target=None, offers=(), offer=None,
+        self.show(
+            adapter=adapter, adapters=marked, bike=None, target=None, is_bike=False, devices=(),
+            offers=(), offer=None,
             done=None, checks=(), notes=(), areas=None, saved=None, watched=None,
             waived=frozenset(), compared=None,
         )  # fmt: skip
@@ -272,61 +324,93 @@ class BenchController:
 
     def look(self) -> None:
         """Request the battery's identity, and receive from the others, which have no query."""
-        self._set(doing=Activity.LOOKING, bike=None, done=None, compared=None)
-        bike = self._seen(self._adapter(), BMS)
-        self._set(bike=bike)
+        self.show(doing=Activity.LOOKING, bike=None, done=None, compared=None)
+        bike = self.seen(BMS)
+        self.show(bike=bike)
         if not bike.survey.heard:
-            raise nothing_received_error(bike.survey, self._backend.bitrate_bps(self._adapter()))
+            raise nothing_received_error(bike.survey, self.backend.bitrate_bps(self.adapter()))
 
-    def _seen(self, adapter: Adapter, target: Target) -> DeviceInfo:
-        with self._backend.connect(adapter) as connection:
-            device = connection.device(target, dialect=self._backend.dialect)
-            return device.identify(cancelled=self._cancelled)
+    @contextmanager
+    def connected(self, *, asks: bool = True) -> Iterator[Connection]:
+        """Open the chosen adapter, or continue with the connection that is open."""
+        if self._connection is not None:
+            yield self._connection
+            return
+        with self.backend.connect(self.adapter(), asks=asks) as connection:
+            self._connection = connection
+            try:
+                yield connection
+            finally:
+                self._connection = None
+
+    def seen(self, target: Target, *taps: Tap) -> DeviceInfo:
+        """Ask a device for all it answers."""
+        with self.connected() as connection:
+            device = connection.device(target, dialect=self.backend.dialect)
+            return device.identify(cancelled=self.cancelled, taps=taps)
 
     def choose_target(self, name: str) -> None:
         """Select the device to upgrade, and check which images fit; "" deselects."""
+        self.show(is_bike=False, devices=())
         if not name:
-            self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
+            self.show(target=None, offers=(), offer=None, done=None, waived=frozenset())
             return
-        self._set(target=_known(TARGETS, name), offer=None, done=None, waived=frozenset())
+        target = _known(TARGETS, name)
+        has_settings = bool(settings_of(target, self.backend.dialect))
+        self.show(
+            target=target, offer=None, done=None, waived=frozenset(),
+            keeps_settings=self.backend.profile(target).keep_settings if has_settings else None,
+        )  # fmt: skip
         self.judge()
+
+    def keep_settings(self, keep: str) -> None:
+        """Choose whether the settings are kept: "yes" or "no"."""
+        self.show(keeps_settings=keep == "yes")
 
     def choose_image(self, name: str) -> None:
         """Select an image; "" deselects."""
         if not name:
-            self._set(done=None)
+            self.show(done=None)
             self.judge()
             return
         fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
         offer = _known(fitting, name)
         self._last_image = offer.path
-        self._set(offer=offer, done=None)
+        self.show(offer=offer, done=None)
 
     def use_folder(self, path: str) -> None:
-        self._backend.use_folder(path)
+        self.backend.use_folder(path)
+        self.judge()
+
+    def choose_bike(self) -> None:
+        """Select the whole bike, and check which sets of images can be used."""
+        self.choose_target("")
+        self.show(is_bike=True)
         self.judge()
 
     def judge(self) -> None:
-        """Check which images fit the selected device."""
-        self._set(doing=Activity.JUDGING, offers=(), offer=None)
-        self._adapter()
+        """Check which images fit the selected device, or which sets the bike."""
+        self.show(doing=Activity.JUDGING, offers=(), offer=None)
+        self.adapter()
         offers = []
-        paths = self._backend.images()
-        self._images_here = images_here(self.state.target or BMS, paths)
+        is_bike = self.state.is_bike
+        paths = self.backend.sets() if is_bike else self.backend.images()
+        if not is_bike:
+            self._images_here = images_here(self.state.target or BMS, paths)
         for path in paths:
-            if self._cancelled():
+            if self.cancelled():
                 break
-            offers.append(self._judged(path))
+            offers.append(self.judged_set(path) if is_bike else self.judged(path))
         offers.sort(key=lambda offer: (offer.refusal is not None, offer.name))
-        self._set(offers=tuple(offers))
+        self.show(offers=tuple(offers))
 
     def take_files(self) -> None:
         """Check files dropped on the page. The image that came last replaces the selected one, or
         its refusal does. Raises FlasherError for a refused one.
         """
         self._has_new_files.clear()
-        self._set(dropped=tuple(self._backend.dropped()))
-        if self.state.target is None or self.state.done is not None:
+        self.show(dropped=tuple(self.backend.dropped()))
+        if not (self.state.target or self.state.is_bike) or self.state.done is not None:
             return
         self.judge()
         self._select_last()
@@ -341,7 +425,7 @@ class BenchController:
     def _select(self, is_wanted: Callable[[Offer], bool]) -> None:
         """Select the first fitting image that is wanted, or none."""
         fitting = (each for each in self.state.offers if each.refusal is None)
-        self._set(offer=next(filter(is_wanted, fitting), None))
+        self.show(offer=next(filter(is_wanted, fitting), None))
 
     def waive(self, name: str, waiver: str) -> None:
         """Accept an image that this check refused."""
@@ -354,14 +438,14 @@ class BenchController:
             raise UsageError(
                 "That check has not refused this image; nothing was waived.", remedy="Look again."
             )
-        self._set(done=None, waived=self.state.waived | {(name, waiver)})
+        self.show(done=None, waived=self.state.waived | {(name, waiver)})
         self.judge()
         self._select(lambda offer: offer.name == name)
 
     def watch(self) -> None:
         """Show the bus traffic until stopped, without sending."""
         board = MessageTable()
-        since_s = self._now()
+        since_s = self.now()
         messages = troubles = 0
 
         def happened(event: object) -> None:
@@ -378,68 +462,32 @@ class BenchController:
                     )
                     for line in board.lines()
                 )
-                self._set(watched=BusWatch(self._now() - since_s, messages, troubles, rows))
+                self.show(watched=BusWatch(self.now() - since_s, messages, troubles, rows))
 
-        self._set(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
-        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._backend.dialect)
-        with self._backend.connect(self._adapter(), asks=False) as connection:
+        self.show(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
+        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self.backend.dialect)
+        with self.connected(asks=False) as connection:
             drive(
                 watcher, connection.link, connection.clock,
-                on_event=happened, cancelled=self._cancelled,
+                on_event=happened, cancelled=self.cancelled,
             )  # fmt: skip
-
-    def compare(self) -> None:
-        """Compare what the device runs with the chosen image. Nothing is written or reset."""
-        target, offer = self.state.target, self.state.offer
-        if target is None or offer is None:
-            raise UsageError("No image is chosen.", remedy="Choose the one to compare with.")
-        job = self._job(offer.path, target)
-        if Level.VERSION not in possible_levels(target, job.options):
-            raise UsageError(
-                text(
-                    "The documents give no query for what the {node} runs.", node=target.node.name
-                ),
-                remedy=text("Look into the history of this computer: it has each upgrade."),
-            )
-
-        def happened(event: object) -> None:
-            if isinstance(event, events.MemoryRead):
-                self._set(compared_bytes=event.read_bytes)
-
-        self._set(doing=Activity.COMPARING, compared=None, compared_bytes=0)
-        with self._backend.connect(self._adapter()) as connection:
-            device = connection.device(
-                target, dialect=self._backend.dialect, profile=self._backend.profile(target)
-            )
-            found, unread = compare(
-                device, job.plan, job.options, cancelled=self._cancelled, on_event=happened
-            )
-        error = found.error(target, is_after_upgrade=False)
-        if error is not None:
-            is_silent = found.verdict is Verdict.NO_ANSWER
-            error.remedy = (
-                text("Wake the device with its key, then compare again.")
-                if is_silent
-                else text("Upgrade it with this image, or choose the one that it should run.")
-            )
-        self._set(compared=Compared(offer, found, unread, error))
 
     def find_areas(self) -> None:
         """Find memory areas for a backup in the images that fit: reading an address that does not
         exist may crash a device.
         """
-        self._adapter()
-        self._set(doing=Activity.JUDGING, areas=None)
-        found = [area_of_profile(self._backend.profile(BMS)) or self._backend.model_area()]
-        for path in self._backend.images():
-            if self._cancelled():
+        self.adapter()
+        self.show(doing=Activity.JUDGING, areas=None)
+        found = [area_of_profile(self.backend.profile(BMS)) or self.backend.model_area()]
+        for path in self.backend.images():
+            if self.cancelled():
                 return
             with suppress(FlasherError):
-                found.append(area_of_image(self._job(path, BMS).plan.image))
-        self._set(areas=tuple(each for each in found if each is not None))
+                found.append(area_of_image(self.job(path, BMS).plan.image))
+        self.show(areas=tuple(each for each in found if each is not None))
 
     def leave_backup(self) -> None:
-        self._set(areas=None)
+        self.show(areas=None)
 
     def back_up(self, source: str) -> None:
         """Save the battery's answers and the memory of this area; "" for no memory."""
@@ -449,23 +497,68 @@ class BenchController:
         def happened(event: object) -> None:
             match event:
                 case events.QueryAnswered(content=Memory() as piece):
-                    self._set(saved_bytes=self.state.saved_bytes + len(memory_bytes(piece)))
+                    self.show(saved_bytes=self.state.saved_bytes + len(memory_bytes(piece)))
 
-        self._set(doing=Activity.SAVING, saved=None, saved_bytes=0)
-        self._set(
-            saved=self._backend.back_up(
-                self._adapter(), area, on_event=happened, cancelled=self._cancelled
+        self.show(doing=Activity.SAVING, saved=None, saved_bytes=0)
+        self.show(
+            saved=self.backend.back_up(
+                self.adapter(), area, on_event=happened, cancelled=self.cancelled
             ),
             areas=None,
         )
 
-    def _judged(self, path: Path) -> Offer:
+    def judged(self, path: Path) -> Offer:
+        """Check an image for the selected device."""
         try:
-            job = self._job(path, self.state.target)
-            self._check_sample(job.plan.image)
-            found = [*job.checks, *self._check_device(job)]
+            job = self.job(path, self.state.target)
+            return self._offer(path, job, self._check_device(job))
         except FlasherError as error:
             return Offer(path, refusal=error)
+
+    def judged_set(self, path: Path) -> Offer:
+        """Check a set of images for the bike."""
+        try:
+            parts = [
+                (target, self._offer(part.path, job, ()))
+                for target, (part, job) in self.set_jobs(path).items()
+            ]
+        except FlasherError as error:
+            return Offer(path, refusal=error)
+        offers = [offer for _, offer in parts]
+        return Offer(
+            path,
+            size_bytes=sum(each.size_bytes for each in offers),
+            packets=sum(each.packets for each in offers),
+            wire_s=sum(each.wire_s for each in offers),
+            sha256="".join(each.sha256 for each in offers),
+            origin=offers[0].origin,
+            warnings=tuple(dict.fromkeys(line for each in offers for line in each.warnings)),
+            parts=tuple(parts),
+        )
+
+    def set_jobs(self, path: Path) -> dict[Target, tuple[SetImage, Job]]:
+        """Prepare the upgrades of a set. A device that runs its version already is skipped.
+
+        Raises FlasherError for a set or an image that cannot be used.
+        """
+        rate = self.backend.bitrate_bps(self.adapter())
+        jobs = {}
+        for part in open_bike_set(path):
+            profile = self.backend.profile(part.target)
+            profile.check_fits(part.opened.image)
+            identity = profile.identity(
+                release=part.opened.release,
+                provenance=part.opened.provenance,
+                skip_same_version=True,
+                images_here=images_here(part.target, self.backend.images()),
+            )
+            job = prepare(part.opened.image, profile, bitrate_bps=rate, identity=identity)
+            jobs[part.target] = part, job.checked()
+        return jobs
+
+    def _offer(self, path: Path, job: Job, device_checks: Iterable[CheckResult]) -> Offer:
+        self._check_sample(job.plan.image)
+        found = [*job.checks, *device_checks]
         image, provenance = job.plan.image, job.identity.provenance
         return Offer(
             path,
@@ -480,11 +573,11 @@ class BenchController:
             warnings=() if provenance is None else provenance.warnings,
         )
 
-    def _job(self, path: Path, target: Target | None) -> Job:
+    def job(self, path: Path, target: Target | None) -> Job:
         if target is None:
             raise UsageError("No device is chosen.", remedy="Choose the one to upgrade.")
-        profile = self._backend.profile(target)
-        rate = self._backend.bitrate_bps(self._adapter())
+        profile = self.backend.profile(target)
+        rate = self.backend.bitrate_bps(self.adapter())
         name = visible(path.name)
         job = prepare(
             path,
@@ -497,8 +590,8 @@ class BenchController:
 
     def _check_sample(self, image: Image) -> None:
         """Refuse a firmware sample on a real bus; the upgrade checks again. Raises ImageError."""
-        adapter = self._adapter()
-        if is_sample(image) and self._backend.is_physical(adapter):
+        adapter = self.adapter()
+        if is_sample(image) and self.backend.is_physical(adapter):
             raise sample_error(image, adapter.name)
 
     def _check_device(self, job: Job) -> list[CheckResult]:
@@ -530,50 +623,94 @@ class BenchController:
                 "Another device or image was chosen meanwhile; nothing was sent.",
                 remedy="Check the selection, then start again.",
             )
-        if self._has_new_files.is_set():
+        if self.has_new_files:
             raise UsageError(
                 "A file came meanwhile; nothing was sent.",
                 remedy="Check the selection, then start again.",
             )
-        adapter = self._adapter()
-        self._set(
+        self._begin()
+        job = self.job(offer.path, chosen)
+        if job.plan.image.sha256 != offer.sha256:
+            raise changed_error(offer)
+        self.carry_out(job, offer)
+
+    def _begin(self) -> None:
+        self.show(
             doing=Activity.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
             repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
             adapter_left_s=None, watched=None, compared=None,
         )  # fmt: skip
         self._last_image = None
-        job = self._job(offer.path, chosen)
-        if job.plan.image.sha256 != offer.sha256:
-            raise ImageError(
-                f"{printable(offer.name)} has changed since it was chosen; nothing was sent.",
-                remedy="Choose the image again.",
-            )
-        carried = self._backend.upgrade(
-            adapter, job, on_event=self._happened, cancelled=self._cancelled
+
+    def carry_out(self, job: Job, offer: Offer) -> Done:
+        """Run a prepared upgrade, and read what the device answers after it."""
+        self._begin()
+        adapter = self.adapter()
+        carried = self.backend.upgrade(
+            adapter,
+            job,
+            self.connected,
+            keeps_settings=bool(self.state.keeps_settings),
+            on_event=self._happened,
+            cancelled=self.cancelled,
         )
+        if self._other_serial and isinstance(carried.error, InterruptedByUserError):
+            carried.error = WrongDeviceError(
+                text(
+                    "The unit {other} answers now, and {serial} was shown: nothing was written.",
+                    other=self._other_serial,
+                    serial=self._expected_serial,
+                ),
+                remedy=text("Leave one unit connected until its upgrade has ended."),
+                code=ErrorCode.NOT_FOR_DEVICE,
+            )
         if carried.error is not None:
-            again = _RESCUE if carried.error.needs_rescue else _AGAIN
+            again = RESCUE if carried.error.needs_rescue else _AGAIN
             carried.error.remedy = with_value(carried.error.remedy, AGAIN, again)
         state = self.state
         done = Done(
-            self._date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,
+            self.date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,
             carried.result, carried.error, carried.bundle, warning=carried.warning,
         )  # fmt: skip
-        self._set(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
+        self.show(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
+        version = None if done.before is None else done.before.version
+        self.note_session(serial_number(version), done.offer, done.error, is_left_out=False)
         is_new = carried.result is not None and carried.result.outcome.ok
         if is_new and done.target.has_version_query:
-            self._set(doing=Activity.LOOKING_AGAIN)
-            self._set(done=replace(done, after=self._seen(adapter, done.target)))
+            self.show(doing=Activity.LOOKING_AGAIN)
+            done = replace(done, after=self.seen(done.target))
+            self.show(done=done)
+        return done
+
+    def note_session(
+        self, serial: str, offer: Offer, error: FlasherError | None, *, is_left_out: bool = True
+    ) -> None:
+        """Add an upgrade to the list of the session, or a unit that was left out."""
+        target = self.state.target or BMS
+        entry = SessionEntry(self.date(), target, serial, offer.name, error, is_left_out)
+        self.show(session=(*self.state.session, entry))
+
+    def expect_unit(self, serial: str) -> None:
+        """Let the next upgrade write to the unit with this serial number only; "" for any."""
+        self._expected_serial, self._other_serial = serial, ""
+
+    def _check_unit(self, event: object) -> None:
+        """End the upgrade before it writes to another unit than the expected one."""
+        if isinstance(event, events.QueryAnswered) and self._expected_serial:
+            serial = serial_number(event.content if isinstance(event.content, Content) else None)
+            if serial not in ("", self._expected_serial):
+                self._other_serial = serial
 
     def _happened(self, event: object) -> None:
         """Process an event of an upgrade."""
+        self._check_unit(event)
         changes: dict[str, object] = {}
         match event:
             case events.PacketAcknowledged(number, _, _):
                 changes |= {"packet": number, "furthest": max(number, self.state.furthest)}
                 changes["power_cycle_s"] = None
                 began_s = self.state.transfer_began_s
-                changes["transfer_began_s"] = self._now() if began_s is None else began_s
+                changes["transfer_began_s"] = self.now() if began_s is None else began_s
             case events.PhaseEntered(phase, _):
                 changes["phase"] = phase
             case events.AttemptStarted():
@@ -581,7 +718,7 @@ class BenchController:
             case events.MessageRepeated():
                 changes["repetitions"] = self.state.repetitions + 1
             case events.PowerCycleAwaited(limit_s):
-                changes |= {"power_cycle_s": limit_s, "power_cycle_since_s": self._now()}
+                changes |= {"power_cycle_s": limit_s, "power_cycle_since_s": self.now()}
             case events.AdapterAwaited(left_s):
                 changes["adapter_left_s"] = left_s
             case events.AdapterBack() | events.BootVersionSeen():
@@ -591,14 +728,17 @@ class BenchController:
         if note := _note_of(event):
             changes["notes"] = (*self.state.notes, note)[-NOTES_KEPT:]
         if changes:
-            self._set(**changes)
+            self.show(**changes)
 
     def rescue_it(self) -> None:
         """Select the same device, and the same image unless the device refused it."""
         done = self.state.done
         if done is None:
             raise UsageError("No upgrade has failed.", remedy="Start with the adapter.")
-        self._set(is_rescue=True, done=None, offer=None, checks=(), notes=())
+        self.show(
+            is_rescue=True, is_bike=False, devices=(), target=done.target, done=None, offer=None,
+            checks=(), notes=(),
+        )  # fmt: skip
         self.judge()
         if self._last_image is not None:
             self._select_last()
@@ -619,7 +759,7 @@ class BenchController:
             self.choose_target(began.target)
             self._select(lambda offer: offer.sha256 == began.image_sha256)
 
-    def _adapter(self) -> Adapter:
+    def adapter(self) -> Adapter:
         if self.state.adapter is None:
             raise UsageError("No adapter is chosen.", remedy="Choose one.")
         return self.state.adapter
@@ -630,6 +770,14 @@ def _note_of(event: object) -> str:
     line = progress_line(event)
     warning = warning_text(event) or (line[0] if line and line[1] < 2 else "")
     return "" if isinstance(event, events.CheckMade) else warning
+
+
+def changed_error(offer: Offer) -> ImageError:
+    """Create the error for a file that is another one than when it was chosen."""
+    return ImageError(
+        f"{printable(offer.name)} has changed since it was chosen; nothing was sent.",
+        remedy="Choose the image again.",
+    )
 
 
 def _known(things: Mapping[str, T], name: str) -> T:

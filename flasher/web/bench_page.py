@@ -25,11 +25,15 @@ from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
 from flasher.release.places import SUFFIX
 from flasher.report.base import visible
+from flasher.settings.profile import FILE_NAME as PROFILE
 from flasher.trace.decoder import Field, content_fields
 from flasher.translation import Translator
 from flasher.web.bench import BenchController
+from flasher.web.bench_bike import upgrade_bike
+from flasher.web.bench_compare import compare
 from flasher.web.bench_state import BenchState, Done
 from flasher.web.pages import Pages, streamed
+from flasher.web.series import SHOWN_S, take_next_bikes
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
 """Maximum upload in bytes, above the largest image as Intel HEX."""
@@ -45,17 +49,21 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "look": (BenchController.look, ()),
     "watch": (BenchController.watch, ()),
     "areas": (BenchController.find_areas, ()),
-    "compare": (BenchController.compare, ()),
+    "compare": (compare, ()),
     "backup": (BenchController.back_up, ("source",)),
     "no-backup": (BenchController.leave_backup, ()),
     "target": (BenchController.choose_target, ("name",)),
     "images": (BenchController.judge, ()),
+    "settings": (BenchController.keep_settings, ("keep",)),
     "waive": (BenchController.waive, ("name", "waiver")),
     "folder": (BenchController.use_folder, ("path",)),
     "image": (BenchController.choose_image, ("name",)),
+    "bike": (BenchController.choose_bike, ()),
+    "upgrade-bike": (upgrade_bike, ("sha256",)),
     "upgrade": (BenchController.upgrade, ("target", "sha256")),
     "next": (BenchController.start_over, ()),
     "rescue": (partial(BenchController.start_over, is_rescue=True), ()),
+    "next-bikes": (take_next_bikes, ()),
     "rescue-it": (BenchController.rescue_it, ()),
     "rescue-unfinished": (BenchController.rescue_unfinished, ()),
 }
@@ -100,13 +108,29 @@ class Shelf:
 
     def files(self) -> list[Path]:
         """Possible images, dropped ones first; one hides a file of its name in the folder."""
+        # A release beside its image is opened with it.
+        return self._found(
+            lambda each: (
+                each.suffix.lower() in self._suffixes and not _belongs_to_image(each, SUFFIX)
+            )
+        )
+
+    def sets(self) -> list[Path]:
+        """Possible sets of images, in the same order."""
+        return self._found(
+            lambda each: (
+                each.suffix.lower() in (SUFFIX, _MANIFEST)
+                and each.name != PROFILE
+                and not _belongs_to_image(each, SUFFIX, _MANIFEST)
+            )
+        )
+
+    def _found(self, is_wanted: Callable[[Path], bool]) -> list[Path]:
         found: dict[str, Path] = {}
         for folder in (self._dropped, self.folder):
             if folder.is_dir():
                 for each in sorted(folder.iterdir()):
-                    # A release beside its image is opened with it.
-                    is_detached = each.suffix.lower() == SUFFIX and each.with_suffix("").is_file()
-                    if each.suffix.lower() in self._suffixes and each.is_file() and not is_detached:
+                    if is_wanted(each) and each.is_file():
                         found.setdefault(each.name, each)
         return list(found.values())[:_FILES_MAX]
 
@@ -125,6 +149,10 @@ class Shelf:
         path = (self.traces if is_trace else self._dropped) / plain
         path.write_bytes(data)
         return path
+
+
+def _belongs_to_image(path: Path, *suffixes: str) -> bool:
+    return path.suffix.lower() in suffixes and path.with_suffix("").is_file()
 
 
 def upload_limit(usual: int) -> Callable[[str], int]:
@@ -157,22 +185,23 @@ class BenchPage:
         return self._pages.show(request, "bench.html", is_mock=self._is_mock)
 
     async def _sheet(self, request: Request) -> Response:
-        done = self._bench.state.done
+        state = self._bench.state
         is_saved = "save" in request.query_params
-        if done is None:
+        ended = [each.done for each in state.devices if each.done is not None]
+        if state.done is None:
             return Response("No upgrade has ended.", 404)
+        upgrades = [(done, compared(done), identity(done)) for done in ended or [state.done]]
         page = self._pages.show(
             request,
             "bench_sheet.html",
-            done=done,
-            rows=compared(done),
-            device=identity(done),
+            upgrades=upgrades,
             waivers=WAIVERS,
             without_options=without_options,
             is_saved=is_saved,
         )
         if is_saved:
-            name = f"{done.target.name}-{done.at:%Y%m%d-%H%M%S}.html"
+            what = "bike" if ended else state.done.target.name
+            name = f"{what}-{state.done.at:%Y%m%d-%H%M%S}.html"
             page.headers["content-disposition"] = f'attachment; filename="{name}"'
         return page
 
@@ -198,6 +227,7 @@ class BenchPage:
             translate, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
             left_s=left_s(state), battery_answers=battery_answers(state), waivers=WAIVERS,
+            shown_s=SHOWN_S,
             without_options=without_options,
         )  # fmt: skip
 
@@ -205,8 +235,9 @@ class BenchPage:
         try:
             order = parse_json(await request.body())
             word = order["order"]
-            if word == "stop":
-                self._bench.stop()
+            at_once = {"stop": self._bench.stop, "agree": self._bench.agree}.get(word)
+            if at_once is not None:
+                at_once()
                 return JSONResponse({})
             step, fields = _ORDERS[word]
             values = [order[name] for name in fields]

@@ -31,6 +31,7 @@ class Activity(Enum):
     WATCHING = "watching"
     SAVING = "saving"
     COMPARING = "comparing"
+    SERIES = "series"
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ class Offer:
     origin: str = ""
     """Who signed the image, or that nobody did, as a sentence."""
     warnings: tuple[str, ...] = ()
+    parts: tuple[tuple[Target, Offer], ...] = ()
+    """Images of a set for the whole bike, in the order of the upgrades."""
 
     @property
     def name(self) -> str:
@@ -111,6 +114,13 @@ class Done:
         return result.ok
 
     @property
+    def is_sure(self) -> bool:
+        """True if the device runs the image, by its own report."""
+        if self.error is not None or self.result is None:
+            return False
+        return self.result.outcome.nothing_to_do or bool(self.is_running and self.is_completed)
+
+    @property
     def may_rescue_with_it(self) -> bool:
         """True if the device needs an image and has not refused this one."""
         error = self.error
@@ -119,6 +129,18 @@ class Done:
     @property
     def is_refused(self) -> bool:
         return self.error is not None and self.error.exit_code is self.error.exit_code.REFUSED
+
+
+@dataclass(frozen=True)
+class SetDevice:
+    """A device in the upgrade of a whole bike."""
+
+    target: Target
+    offer: Offer
+    done: Done | None = None
+    """None before its upgrade has ended."""
+    battery: str = ""
+    """Serial number of the battery at its upgrade; "" if unknown."""
 
 
 @dataclass(frozen=True)
@@ -170,12 +192,60 @@ class Compared:
     """Reason why the memory was not compared; None if it was."""
     error: FlasherError | None
     """Why the device does not run the image; None if it does, as far as it was compared."""
+    serial: str | None = None
+    """Serial number of the unit; "": it has none; None: it did not report any."""
 
     @property
     def is_sure(self) -> bool:
         """True if version or memory are the image's."""
         good = self.verification.verdict
         return good in (Verdict.VERSION_RIGHT, Verdict.MEMORY_RIGHT)
+
+
+class SeriesStep(Enum):
+    """What a series waits for or does."""
+
+    REMOVAL = "removal"
+    """The last unit is still connected."""
+    UNIT = "unit"
+    """Nothing is connected."""
+    READING = "reading"
+    ASKED = "asked"
+    """A user has to agree first."""
+    REFUSED = "refused"
+    """The image is not for the unit that is connected."""
+    SHOWN = "shown"
+    """The upgrade starts when the time is over."""
+    UPGRADING = "upgrading"
+    ADAPTER = "adapter"
+    """The adapter is lost."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A series that is under way (flasher.web.series)."""
+
+    step: SeriesStep
+    serial: str = ""
+    running: str = ""
+    """Firmware version that the unit reports."""
+    why: str = ""
+    """Reason of a question."""
+    refusal: FlasherError | None = None
+    left_s: int = 0
+    """Seconds until the upgrade starts."""
+
+
+@dataclass(frozen=True)
+class SessionEntry:
+    """An upgrade since the page's server was started, or a unit that was left out of a series."""
+
+    at: datetime
+    target: Target
+    serial: str
+    image: str
+    error: FlasherError | None
+    is_left_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -202,8 +272,15 @@ class BenchState:
     watched: BusWatch | None = None
     dropped: tuple[str, ...] = ()
     target: Target | None = None
+    """The device to upgrade; of a whole bike the one that is being upgraded."""
+    is_bike: bool = False
+    """The whole bike is chosen, and the offers are sets of images."""
+    devices: tuple[SetDevice, ...] = ()
+    """Devices of the whole bike, in the order of their upgrades; empty before it began."""
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None
+    keeps_settings: bool | None = None
+    """Save the settings before an upgrade and restore them after it; None: the device has none."""
     waived: frozenset[tuple[str, str]] = frozenset()
     """Names of images, each with a check that was waived."""
     phase: events.Phase | None = None
@@ -225,12 +302,31 @@ class BenchState:
     notes: tuple[str, ...] = ()
     is_stopping: bool = False
     done: Done | None = None
+    series: Series | None = None
+    """None while it is switched off."""
+    session: tuple[SessionEntry, ...] = ()
     trouble: FlasherError | None = None
     """Error of the last step; upgrades have theirs in `done`."""
 
     @property
     def is_idle(self) -> bool:
         return self.doing is Activity.NOTHING
+
+    @property
+    def is_sure(self) -> bool:
+        """True if the device, or each one of the bike, runs its image by its own report."""
+        ended = [each.done for each in self.devices] or [self.done]
+        return all(each is not None and each.is_sure for each in ended)
+
+    @property
+    def done_count(self) -> int:
+        """Number of upgrades of the session that succeeded."""
+        return sum(each.error is None for each in self.session)
+
+    @property
+    def failed_count(self) -> int:
+        """Number of upgrades of the session that failed."""
+        return sum(each.error is not None and not each.is_left_out for each in self.session)
 
     def power_cycle_left_s(self, now_s: float) -> int:
         """Whole seconds left to switch the device off and on."""

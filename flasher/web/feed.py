@@ -102,6 +102,11 @@ class Feed:
         """Note that the program is running."""
         self._beat_at = self._now()
 
+    @property
+    def is_followed(self) -> bool:
+        """True while a page is connected."""
+        return bool(self._followers)
+
     def close(self) -> None:
         """End all followers."""
         self._is_closed = True

@@ -1,17 +1,19 @@
-"""Virtual bikes for the bench page, each with one fault or none."""
+"""Virtual bikes for the bench page, each with one fault or none, or exchanged after an upgrade."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
+from functools import partial
+from math import inf
 from typing import Final
 
 from flasher import events
 from flasher.api import Connection, Job
 from flasher.bus.bit_rate import BitRate
-from flasher.bus.link import Clock, PacedClock, VirtualClock
+from flasher.bus.link import Clock, SteadyClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.i18n import text
 from flasher.mock.clients import ClientApplication
@@ -24,6 +26,8 @@ from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 _ONE_FAULT: Final = 1 << 3
 _HAND_S: Final = 2.0
 """Time until the user interrupts the power, and duration of the interruption."""
+_EXCHANGED_AFTER_S: Final = 8.0
+_AWAY_S: Final = 4.0
 _OTHER_HARDWARE: Final = "V0r0r1_20200101"
 _FOREIGN: Final = bytes.fromhex("55AA168700000000")
 """First bytes of a message that only a tool sends."""
@@ -40,6 +44,7 @@ class BikeFault(Enum):
     HARDWARE = "virtual bike 6"
     NO_APPLICATION = "virtual bike 7"
     OFF = "virtual bike 8"
+    EXCHANGED = "virtual bike 9"
 
 
 NOTES: Final = {
@@ -51,6 +56,7 @@ NOTES: Final = {
     BikeFault.HARDWARE: text("has other hardware, and reports a fault"),
     BikeFault.NO_APPLICATION: text("its upgrade was interrupted: its devices do not start"),
     BikeFault.OFF: text("is switched off"),
+    BikeFault.EXCHANGED: text("is taken away after its upgrade, and another one is connected"),
 }
 
 
@@ -60,7 +66,7 @@ class _BikeClock:
     def __init__(self, speed: float) -> None:
         self.speed = speed
         self._passed = 0.0
-        self._running: PacedClock | None = None
+        self._running: SteadyClock | None = None
 
     def now(self) -> float:
         return self._passed + (0.0 if self._running is None else self._running.now())
@@ -70,10 +76,58 @@ class _BikeClock:
             self._running.wait_until(moment - self._passed)
 
     def resume(self) -> None:
-        self._running = PacedClock(self.speed)
+        self._running = SteadyClock(self.speed)
 
     def rest(self) -> None:
         self._passed, self._running = self.now(), None
+
+
+class _Exchanged:
+    """Engine: place of a device that is taken out at a time, and replaced by another one."""
+
+    def __init__(self, made: Callable[[], FaultInjector]) -> None:
+        self._made = made
+        self._device: FaultInjector | None = made()
+        self._at = inf
+
+    def exchange(self, at_s: float) -> None:
+        self._at = at_s
+
+    @property
+    def done(self) -> bool:
+        return False
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self._device is not None:
+            self._device.receive(frame, now)
+
+    def tick(self, now: float) -> None:
+        if now >= self._at and self._device is not None:
+            self._device, self._at = None, now + _AWAY_S
+        elif now >= self._at:
+            self._device, self._at = self._made(), inf
+            self._device.device.power_on(now)
+        if self._device is not None:
+            self._device.tick(now)
+
+    def deadline(self) -> float | None:
+        wanted = None if self._device is None else self._device.deadline()
+        at = min(self._at, inf if wanted is None else wanted)
+        return None if at == inf else at
+
+    def next_frame(self, now: float) -> Frame | None:
+        return None if self._device is None else self._device.next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        if self._device is not None:
+            self._device.frame_sent(now)
+
+    def cancel(self, now: float) -> None:
+        if self._device is not None:
+            self._device.cancel(now)
+
+    def take_events(self) -> Sequence[object]:
+        return () if self._device is None else self._device.take_events()
 
 
 class VirtualBike:
@@ -86,14 +140,28 @@ class VirtualBike:
         self._bus = SimulatedBus(dialect.bitrate_bps, self._clock)
         self._link = self._bus.link()
         self._devices: dict[Target, FaultInjector] = {}
+        self._places: list[_Exchanged] = []
+        self._bikes = dict.fromkeys(TARGETS.values(), 0)
+        """Number of devices made so far for each target."""
         for target in TARGETS.values() if fault is not BikeFault.OFF else ():
-            self._devices[target] = FaultInjector(self._device(target))
-            self._bus.attach(self._devices[target])
+            if fault is BikeFault.EXCHANGED:
+                place = _Exchanged(partial(self._next_device, target))
+                self._places.append(place)
+                self._bus.attach(place)
+            else:
+                self._bus.attach(self._next_device(target))
         self._job: Job | None = None
+
+    def _next_device(self, target: Target) -> FaultInjector:
+        self._bikes[target] += 1
+        self._devices[target] = FaultInjector(self._device(target))
+        return self._devices[target]
 
     def _device(self, target: Target) -> MockDevice:
         fault = self._fault
         profile = DeviceProfile().speaking(self._dialect)
+        if fault is BikeFault.EXCHANGED:
+            profile = replace(profile, serial_number=f"W2605{self._bikes[target]:03}")
         if fault is BikeFault.REFUSES:
             profile = replace(profile, image_checksum="crc32")
         if fault is BikeFault.HARDWARE:
@@ -129,6 +197,11 @@ class VirtualBike:
         device = self._devices.get(job.plan.target)
         if device is not None and self._fault is BikeFault.POWER and not job.options.at_power_up:
             device.set(PowerCut(None), InOperation(job.plan.total_packets // 2))
+
+    def ended(self) -> None:
+        """The upgrade has ended: the bike is exchanged if it is such a one."""
+        for place in self._places:
+            place.exchange(self._clock.now() + _EXCHANGED_AFTER_S)
 
     def happened(self, event: object) -> None:
         job = self._job

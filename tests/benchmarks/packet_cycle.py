@@ -26,7 +26,7 @@ from udsoncan.connections import PythonIsoTpConnection
 
 from flasher import events
 from flasher.bus.adapter import CanLink, open_adapter
-from flasher.bus.link import MonotonicClock, PacedClock
+from flasher.bus.link import MonotonicClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
 from flasher.host.upgrade import Upgrade
@@ -36,6 +36,9 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, PACKET_DATA_SIZE, WELLING
+
+BUSY_WAIT_S = 0.0001
+"""Real seconds before a moment that a paced clock spends in a busy loop."""
 
 
 class Stopwatch:
@@ -166,6 +169,30 @@ def uds(blocks: int) -> list[float]:
     near.shutdown()
     far.shutdown()
     return cycles
+
+
+class PacedClock:
+    """Real time multiplied by `speed`, with the delays of this computer.
+
+    A sleep ends about 0.1 ms late, so the last part is waited for in a busy loop.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = speed
+        self._origin = time.perf_counter()
+
+    def now(self) -> float:
+        """Simulated seconds since the clock was created."""
+        return (time.perf_counter() - self._origin) * self.speed
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until the simulated `moment`."""
+        until = self._origin + moment / self.speed
+        remaining_s = until - time.perf_counter()
+        if remaining_s > BUSY_WAIT_S:
+            time.sleep(remaining_s - BUSY_WAIT_S)
+        while time.perf_counter() < until:
+            pass
 
 
 def line_share(packets: int) -> float:

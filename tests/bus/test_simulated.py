@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
 
 import pytest
 
 from flasher.bus.link import (
     SEND_LIMIT_S,
-    Clock,
     MonotonicClock,
-    PacedClock,
     SteadyClock,
     VirtualClock,
 )
@@ -206,14 +203,11 @@ def test_drain_forgets_what_has_arrived() -> None:
     link.close()
 
 
-@pytest.mark.parametrize("make", [PacedClock, SteadyClock])
-def test_a_paced_bus_takes_the_real_time_divided_by_its_speed(
-    make: Callable[[float], Clock],
-) -> None:
+def test_a_bus_with_a_steady_clock_takes_the_real_time_divided_by_its_speed() -> None:
     speed = 50.0
     frames = [Frame(0x725, bytes([number % 256] * 8)) for number in range(1000)]
     began = time.perf_counter()
-    clock = make(speed)
+    clock = SteadyClock(speed)
     bus = SimulatedBus(BITRATE, clock)
     bus.attach(Talker(*frames))
     link = bus.link()
@@ -225,7 +219,7 @@ def test_a_paced_bus_takes_the_real_time_divided_by_its_speed(
 
 
 def test_the_clocks_only_go_forward_and_do_not_wait_for_the_past() -> None:
-    for clock in (MonotonicClock(), PacedClock(2.0), SteadyClock(2.0), VirtualClock()):
+    for clock in (MonotonicClock(), SteadyClock(2.0), VirtualClock()):
         before = clock.now()
         clock.wait_until(before - 100.0)
         clock.wait_until(before + 0.001)

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from flasher.api import Device, DeviceInfo
+from flasher.cli.recording import bundle_folder
 from flasher.errors import InterruptedByUserError
 from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
@@ -142,6 +144,8 @@ def test_ctrl_c_in_an_upgrade_leaves_the_report_and_the_state(
     assert "state of the BMS: " in run.out
     assert report()["verdict"] == "incomplete"
     assert "with --force: it overwrites this report." in run.err
+    kept = [path.read_text() for path in bundle_folder().rglob("*.json")]
+    assert any("with --force: it overwrites this report." in each for each in kept)
 
 
 def test_without_a_terminal_or_agreement_it_is_refused(walk: Callable[..., Run]) -> None:
@@ -158,6 +162,23 @@ def test_an_older_report_is_kept_unless_forced(walk: Callable[..., Run]) -> None
     assert Path("acceptance-bms.json").read_text() == "kept"
     assert walk("--yes", "--interrupt", "--force").code == 0
     assert walk("--yes", "-o", "report.txt").code == 2
+
+
+def test_a_second_acceptance_with_the_same_new_report_is_refused_at_once(
+    walk: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second: list[Run] = []
+    identify = Device.identify
+
+    def identify_meanwhile(device: Device, **watch: Any) -> DeviceInfo:
+        if not second:
+            second.append(walk("--yes"))
+        return identify(device, **watch)
+
+    monkeypatch.setattr(Device, "identify", identify_meanwhile)
+    assert walk("--yes", "--interrupt").code == 0
+    assert second[0].code == 2
+    assert "acceptance-bms.html exists already" in second[0].err
 
 
 def test_an_image_for_another_target_is_refused_and_no_check_is_waived(flasher: Flasher) -> None:

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from intelhex import IntelHex
 
+from flasher.api import Device, DeviceInfo
 from flasher.errors import ExitCode
 from tests.api.battery import ANSWERS, Battery, opened
-from tests.cli.conftest import SAMPLES, Flasher
+from tests.cli.conftest import SAMPLES, Flasher, Run
 
 MOCK = ("--mock", "--mock-speed", "0")
 AREA = "[bms.application_area]\nstart = 0x1000\nsize_bytes = 0x210\n"
@@ -183,3 +184,35 @@ def test_the_device_model_knows_its_own_area(
     assert run.document["memory"]["names_running_version"] is True
     image = IntelHex(io.StringIO(unpacked(tmp_path / "b.zip")[1].decode()))
     assert image.tobinstr().startswith(b"factory application")
+
+
+@pytest.mark.usefixtures("battery")
+def test_a_second_backup_into_the_same_new_file_is_refused_while_the_first_one_runs(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "flasher.toml").write_text(AREA)
+    words = ("backup", "-t", "bms", "-o", "b.zip", *MOCK)
+    second: list[Run] = []
+    identify = Device.identify
+
+    def identify_meanwhile(device: Device, **watch: Any) -> DeviceInfo:
+        if not second:
+            second.append(flasher(*words))
+        return identify(device, **watch)
+
+    monkeypatch.setattr(Device, "identify", identify_meanwhile)
+    assert flasher(*words).code == ExitCode.OK
+    assert second[0].code == ExitCode.USAGE
+    assert "b.zip exists already" in second[0].err
+    assert zipfile.is_zipfile(tmp_path / "b.zip")
+
+
+@pytest.mark.usefixtures("battery")
+def test_restore_takes_a_profile(flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "flasher.toml").write_text(AREA)
+    assert flasher("backup", "-t", "bms", "-o", "b.zip", *MOCK).code == ExitCode.OK
+    words = ("backup", "restore", "b.zip", "--yes", *MOCK)
+    assert flasher(*words, "--profile", "flasher.toml").code == ExitCode.OK
+    run = flasher(*words, "--profile", "none.toml")
+    assert run.code == ExitCode.USAGE
+    assert "none.toml" in run.err

@@ -180,6 +180,17 @@ def test_a_release_with_several_images_is_a_set(
     assert bike.erased == [OBC, WMC, BMS]
 
 
+def test_a_device_that_is_left_out_and_not_in_the_set_is_named(
+    upgrade: Callable[..., Run], folder: Path
+) -> None:
+    path = folder / "bike.toml"
+    tables = path.read_text().split("[[target]]")
+    path.write_text("[[target]]".join(each for each in tables if '"obc"' not in each))
+    run = upgrade("--without", "obc", "--dry-run")
+    assert run.code == ExitCode.OK, run.err
+    assert "warning: --without obc changes nothing: the set has no image for it" in run.err
+
+
 def test_a_dry_run_shows_the_plan_of_each_device_and_opens_no_adapter(
     upgrade: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,14 @@ def test_the_sample_is_described_with_its_plan(flasher: Flasher) -> None:
     assert "on the wire" in run.out
 
 
+def test_an_empty_record_file_is_called_empty(flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "empty.hex").touch()
+    run = flasher("image-info", tmp_path / "empty.hex")
+    assert run.code == ExitCode.IMAGE
+    assert "empty.hex is empty: it contains no bytes to send" in run.err
+    assert "line 0" not in run.err
+
+
 def test_json_names_segments_vectors_and_hash(flasher: Flasher) -> None:
     document = flasher("image-info", SAMPLES / "wmc.hex", "--json").document
     assert document["ok"] is True

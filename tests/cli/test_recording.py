@@ -62,9 +62,12 @@ def test_a_trace_names_the_channel_that_was_opened(tmp_path: Path) -> None:
     assert path.read_text().split()[1] == "can2"
 
 
-def run_into(error: BaseException, options: RecordingOptions = NOTHING) -> None:
+def run_into(
+    error: BaseException, options: RecordingOptions = NOTHING, *, only_asks: bool = False
+) -> None:
     def command() -> None:
         with recording(options, Bus(), Output(), target=BMS) as record:
+            record.only_asks = only_asks
             for at, frame in Tape().to_packet(3).packet(3):
                 for tap in record.taps:
                     tap(frame, sent=frame.can_id == 0x752, now=at)
@@ -112,6 +115,16 @@ def test_what_was_interrupted_leaves_one_too(error: BaseException, bundle_folder
     (bundle,) = bundles(bundle_folder)
     assert report_of(bundle)["error"]["exit_code"] == ExitCode.INTERRUPTED
     assert bundle.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("error", [InterruptedByUserError("Stopped."), KeyboardInterrupt()])
+def test_an_interrupted_query_does_not_take_the_place_of_the_last_failure(
+    error: BaseException, bundle_folder: Path
+) -> None:
+    run_into(error, only_asks=True)
+    assert bundles(bundle_folder) == []
+    run_into(NoAnswerError("Nobody."), only_asks=True)
+    assert len(bundles(bundle_folder)) == 1
 
 
 def test_what_fails_before_a_frame_was_sent_or_heard_leaves_nothing(

@@ -211,6 +211,17 @@ def test_keys_and_trust_files_are_not_overwritten(run: Flasher) -> None:
     ).code == 2  # fmt: skip
 
 
+def test_a_trust_file_does_not_begin_after_its_end(run: Flasher, workshop: Path) -> None:
+    made(run, "trust", "key", "boss.key", *WITH)
+    refused = run(
+        "trust", "init", "trust.json", "--name", "X", "--grant", "root=boss.key.pub", "--key",
+        "boss.key", "--expires", "2020-01-01", *WITH,
+    )  # fmt: skip
+    assert refused.code == 2
+    assert "2020-01-01 has passed" in refused.err
+    assert not (workshop / "trust.json").exists()
+
+
 def test_a_private_key_is_encrypted_and_for_its_owner_alone(run: Flasher, workshop: Path) -> None:
     made(run, "trust", "key", "anna.key", *WITH)
     path = workshop / "anna.key"

@@ -111,7 +111,7 @@ def repair_of(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> Callable[...
     [
         ("flash a.hex -t bms", "rescue a.hex -t bms"),
         ("-v flash a.hex -t bms --json", "-v rescue a.hex -t bms --json"),
-        ("-vv flash -qt bms a.hex", "-v -v rescue a.hex -t bms -q"),
+        ("-v flash -vt bms a.hex", "-v rescue a.hex -t bms -v"),
         ("rescue a.hex -t bms --wait 300", "rescue a.hex -t bms --wait 300"),
         ("flash -t bms --timeout 5 a.hex", "rescue a.hex -t bms"),
         ("flash -t bms --timeout=5 a.hex", "rescue a.hex -t bms"),
@@ -149,7 +149,7 @@ def test_the_repair_is_what_was_typed_without_what_does_not_fit(
         ("flash bms -t bms", "rescue OTHER_IMAGE -t bms"),
         ("flash -t bms -- a.hex", "rescue OTHER_IMAGE -t bms"),
         (
-            "flash a.hex -t bms --base 0 --range=0:9 --man m.toml -f --allow-hardware -b 250000",
+            "flash a.hex -t bms --base 0 --range=0:0x9 --man m.toml -f --allow-hardware -b 250000",
             "rescue OTHER_IMAGE -t bms -b 250000",
         ),
     ],

@@ -207,7 +207,7 @@ def test_a_full_disk_ends_the_command_before_anything_is_erased(
     monkeypatch.setattr("flasher.cli.upgrade.settings.write_whole", write_whole)
     run = flash("--keep-settings")
     assert run.code == ExitCode.USAGE
-    assert "what to do: Make room there, or upgrade with --no-keep-settings." in run.err
+    assert "what to do: Make room there. Or upgrade with --no-keep-settings." in run.err
     assert battery.stage.has != IMAGE.data
 
 

@@ -26,7 +26,7 @@ FOLLOWED = {
 def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
     """Do what a page says. Nothing waits for the device model."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("flasher.bus.link.PacedClock", lambda _speed: VirtualClock())
+        patch.setattr("flasher.bus.link.SteadyClock", lambda _speed: VirtualClock())
         patch.setattr("flasher.cli.adapters.detect_adapters", lambda **_: DetectionResult())
         patch.setattr("can.util.load_file_config", lambda *_args: {})
         patch.setattr("can.util.load_environment_config", lambda *_args: {})

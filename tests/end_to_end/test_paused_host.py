@@ -10,6 +10,7 @@ from flasher import events
 from flasher.bus.simulated import SimulatedLink
 from flasher.host.options import UpgradeOptions
 from flasher.host.session import Result
+from flasher.host.table import Ending
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -22,16 +23,24 @@ ONE_TRY = UpgradeOptions(attempts=1, timings=replace(DEFAULT_TIMINGS, packet_tri
 
 
 class Pausing(SimulatedLink):
-    """An adapter whose computer pauses once, while it hands over a frame or while it waits for the
-    next one to come: the bus goes on.
+    """An adapter whose computer pauses once, or every `again_after` frames, while it hands over a
+    frame or while it waits for the next one to come: the bus goes on.
     """
 
     def __init__(
-        self, link: SimulatedLink, stage: Stage, after_frame: int, pause_s: float, *, sending: bool
+        self,
+        link: SimulatedLink,
+        stage: Stage,
+        after_frame: int,
+        pause_s: float,
+        *,
+        sending: bool,
+        again_after: int = 0,
     ) -> None:
         self.__dict__ = link.__dict__
         self.stage, self.pause_s, self.sending = stage, pause_s, sending
         self.frames_left = after_frame
+        self.again_after = again_after
 
     def send(self, frame: Frame) -> None:
         super().send(frame)
@@ -44,7 +53,8 @@ class Pausing(SimulatedLink):
 
     def _pause(self, here: bool) -> None:
         if here and self.frames_left <= 0 and self.pause_s:
-            pause_s, self.pause_s = self.pause_s, 0.0
+            pause_s, self.pause_s = self.pause_s, self.pause_s if self.again_after else 0.0
+            self.frames_left = self.again_after
             self.stage.wait(pause_s)
 
 
@@ -87,6 +97,16 @@ def test_a_pause_anywhere_else_ends_well_with_the_attempts_that_are_there(pause_
         stage, result = flash(after_frame, pause_s, sending=False, options=None)
         assert result.ok, after_frame
         assert stage.has == IMAGE.data
+
+
+def test_pauses_in_packet_after_packet_are_not_blamed_on_a_second_device() -> None:
+    stage = Stage(profile=SMALL)
+    first = frames_of_an_upgrade() - 54
+    stage.wrap = lambda link: Pausing(link, stage, first, 0.12, sending=True, again_after=23)
+    result = stage.flash(options=replace(ONE_TRY, attempts=3))
+    assert result.outcome.ending is Ending.COMPLETED, result.outcome.detail
+    assert result.outcome.statistics.naks > 1, "the device refused the parts"
+    assert stage.has == IMAGE.data
 
 
 def test_a_pause_is_reported_and_named_as_the_likely_cause() -> None:

@@ -476,6 +476,27 @@ def test_one_that_begins_its_burst_anew_at_each_update_command_is_one(early: int
 # -- the transfer ---------------------------------------------------------------------------------
 
 
+@each("has_paused, evidence", [(True, ""), (False, TOO_OFTEN)])
+def test_a_refusal_of_the_part_before_a_pause_of_this_computer_is_no_second_answer(
+    has_paused: bool, evidence: str
+) -> None:
+    watch = Watch().transfers(1)
+    for packet in (2, 3, 4):
+        if has_paused:
+            watch.duplicates.message_dropped()
+        watch.hears(Nak(packet)).sends(Command.PACKET, packet).hears(Ack(packet))
+    assert watch.evidence == evidence
+
+
+def test_a_pause_excuses_one_refusal_only() -> None:
+    watch = Watch().transfers(1)
+    watch.duplicates.message_dropped()
+    watch.hears(Nak(2)).sends(Command.PACKET, 2).hears(Ack(2))
+    for packet in (3, 4, 5):
+        watch.hears(Nak(packet)).sends(Command.PACKET, packet).hears(Ack(packet))
+    assert watch.evidence == TOO_OFTEN
+
+
 @each(
     "ticks_after_request, sends, what",
     [

@@ -46,12 +46,12 @@ def test_a_gap_beyond_the_limit_is_refused_with_the_segments_named() -> None:
         sparse((4, b"a"), (8, b"b")).join(2)
     message = str(caught.value)
     assert "a gap of 3 bytes between 0x00000005 and 0x00000008" in message
-    assert "0x00000004..0x00000004 (1 bytes), 0x00000008..0x00000008 (1 bytes)" in message
+    assert "0x00000004..0x00000004 (1 byte), 0x00000008..0x00000008 (1 byte)" in message
     assert "--fill-gaps-up-to 3" in message
 
 
 def test_a_message_names_at_most_eight_segments() -> None:
-    with pytest.raises(ImageError, match=r"0x0000000E \(1 bytes\) and 2 more"):
+    with pytest.raises(ImageError, match=r"0x0000000E \(1 byte\) and 2 more"):
         sparse(*((2 * index, b"a") for index in range(10))).join(0)
 
 

@@ -8,12 +8,14 @@ import hashlib
 import pytest
 
 from flasher.events import DeviceReported, DeviceStateEntered, ImageStored, PacketStored
+from flasher.host.duplicates import DuplicateDetector
 from flasher.mock.model import NO_VERSION
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import BootloaderState
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC, Command, Mode, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode
 from tests.loops import each
 from tests.mock.bench import QUICK, READ_VERSION, START_S, Bench, image_of, packets_of
@@ -335,6 +337,23 @@ def test_without_an_application_a_profile_may_listen_silently_after_the_burst() 
     assert bench.device.deadline() is None
     bench.upgrade(image_of(300))
     assert bench.device.stored_image == image_of(300)
+
+
+def test_a_device_model_whose_computer_stalls_is_not_taken_for_two_bootloaders() -> None:
+    bench = Bench(has_application=False)
+    bench.run(0.2)
+    bench.take_sent()
+    detector = DuplicateDetector(DEFAULT_TIMINGS)
+    announced = messages.BootVersion(BMS.boot_name, "V1.0.0").to_message(BMS.answer_id)
+    for late_s in (0.0, 0.045, 0.045, 0.0, 0.0, 0.0):
+        due = bench.device.deadline()
+        assert due is not None
+        bench.now = due + late_s
+        bench.device.tick(bench.now)
+        bench.run(0.001)
+        assert len(bench.take_sent()) == 1
+        detector.received(announced, due + late_s)
+    assert detector.evidence == ""
 
 
 def test_a_late_tick_does_not_make_the_announcements_catch_up() -> None:

@@ -291,9 +291,13 @@ def test_a_message_that_its_receiver_has_dropped_meanwhile_is_sent_anew_after_a_
 ) -> None:
     """The computer paused between two frames (R12)."""
     transmitter = Transmitter(_BITRATE_BPS, dropped_after_s=0.1)
+    dropped: list[bool] = []
+    transmitter.on_message_dropped = lambda: dropped.append(True)
     transmitter.queue(_FIRST)
     assert transmitter.next_frame(0.0) == _FIRST[0]
     transmitter.frame_sent(0.0)
+    assert (transmitter.next_frame(pause_s) is None) is is_sent_anew
+    assert dropped == [True] * is_sent_anew
     if not is_sent_anew:
         assert _send_all(transmitter, pause_s) == _FIRST[1:]
         return

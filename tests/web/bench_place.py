@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec
 
-from flasher.api import Job
+from flasher.api import Connection, Job
 from flasher.cli.look.backup import backup_folder
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
@@ -17,10 +18,14 @@ from flasher.cli.recording import bundle_folder
 from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import LastChoices, VirtualBikes
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
+from flasher.image.release import Release
+from flasher.protocol.spec import BMS
+from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
+from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
 from flasher.web.guard import BODY_MAX, BrowserEntry, application
@@ -42,6 +47,16 @@ def folder_of_images(folder: Path) -> Path:
     return folder
 
 
+def write_manifest(image: Path, hardware: str) -> None:
+    """The manifest of an image that is for this hardware of the battery only."""
+    data = image.read_bytes()
+    release = Release(
+        target=BMS, size_bytes=len(data), sha256=hashlib.sha256(data).hexdigest(),
+        hardware_versions=(hardware,), source="",
+    )  # fmt: skip
+    manifest_path(image).write_text(to_toml(release))
+
+
 class HeldBikes(VirtualBikes):
     """`hold` is called with each event of an upgrade, in the bench's thread."""
 
@@ -51,7 +66,9 @@ class HeldBikes(VirtualBikes):
         self,
         adapter: Adapter,
         job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
         *,
+        keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> bench.UpgradeEnding:
@@ -59,7 +76,14 @@ class HeldBikes(VirtualBikes):
             on_event(event)
             self.hold(event)
 
-        return super().upgrade(adapter, job, on_event=held, cancelled=cancelled)
+        return super().upgrade(
+            adapter,
+            job,
+            connect,
+            keeps_settings=keeps_settings,
+            on_event=held,
+            cancelled=cancelled,
+        )
 
 
 def order(
@@ -103,7 +127,7 @@ class BenchPlace:
             [*page.routes, *answer_routes(pages, ask, KEPT)], hosts={"127.0.0.1"},
             secret=_KEY, entry=entry, uploads=upload_limit(BODY_MAX),
         )  # fmt: skip
-        worker = threading.Thread(target=self.bench.run, daemon=True)
+        worker = threading.Thread(target=self.bench.run, args=(watch_compared,), daemon=True)
         with Server(app, "127.0.0.1", 0) as server:
             worker.start()
             yield server.url.rstrip("/") + entry.path

@@ -31,12 +31,10 @@ from flasher.history import MOCK, Began, Flash, FlashHistory, Reached, latest_le
 from flasher.host.event_text import progress_line
 from flasher.host.verify import Level, Verdict, Verification
 from flasher.i18n import Text, text, without_options
-from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
-from flasher.settings.manifest import manifest_path, to_toml
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
 from flasher.web.bench_page import as_it_is_now, battery_answers, facts
@@ -45,7 +43,7 @@ from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.loops import each
-from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
+from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order, write_manifest
 
 
 @pytest.fixture
@@ -145,19 +143,10 @@ def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPla
     assert state.offer is None
 
 
-def _for_other_hardware(folder: Path) -> None:
-    image = image_of(PACKETS, NEW)
-    release = Release(
-        target=BMS, size_bytes=image.size_bytes, sha256=image.sha256,
-        hardware_versions=("V1r2r0_*",), source="",
-    )  # fmt: skip
-    manifest_path(folder / IMAGE).write_text(to_toml(release))
-
-
 def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
     place: BenchPlace, tmp_path: Path
 ) -> None:
-    _for_other_hardware(tmp_path)
+    write_manifest(tmp_path / IMAGE, "V1r2r0_*")
     assert _chosen(place).offer is not None
     state = place.do(
         order(BenchController.use_adapter, BikeFault.HARDWARE.value),
@@ -254,7 +243,7 @@ def test_a_folder_that_may_not_be_listed_is_not_chosen(
 def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     place: BenchPlace, tmp_path: Path
 ) -> None:
-    _for_other_hardware(tmp_path)
+    write_manifest(tmp_path / IMAGE, "V1r2r0_*")
     place.do(
         order(BenchController.use_adapter, BikeFault.HARDWARE.value),
         order(BenchController.choose_target, "bms"),
@@ -276,7 +265,7 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
 
 
 def test_only_the_check_that_refused_can_be_waived(place: BenchPlace, tmp_path: Path) -> None:
-    _for_other_hardware(tmp_path)
+    write_manifest(tmp_path / IMAGE, "V1r2r0_*")
     place.do(
         order(BenchController.use_adapter, BikeFault.HARDWARE.value),
         order(BenchController.choose_target, "bms"),
@@ -798,3 +787,30 @@ def test_a_message_without_options_is_the_same_and_one_of_options_alone_is_empty
     assert without_options(joined) == "Wake it."
     assert isinstance(without_options(joined), Text), "it can be translated"
     assert without_options("Allow more time with --timeout.") == ""
+
+
+# -- settings --------------------------------------------------------------------------------------
+
+
+def test_settings_are_kept_when_a_user_chooses_so(place: BenchPlace) -> None:
+    state = _chosen(place)
+    assert state.keeps_settings is False, "as the profile has it"
+    assert not [made for made in _done(place).checks if made.check == "settings"]
+    _chosen(place)
+    state = place.do(order(BenchController.keep_settings, "yes"))
+    done = place.do(_upgrade(state)).done
+    assert done is not None
+    assert done.error is None
+    found = [made.text for made in done.checks if made.check == "settings"]
+    assert found[0].startswith("the settings are saved: `flasher backup restore /")
+    assert found[-1] == "7 of 7 settings read as before"
+
+
+def test_the_profile_decides_first_whether_settings_are_kept(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    profile = place.bikes.profile(BMS)
+    monkeypatch.setattr(place.bikes, "profile", lambda _: replace(profile, keep_settings=True))
+    assert _chosen(place).keeps_settings is True
+    assert place.do(order(BenchController.keep_settings, "no")).keeps_settings is False
+    assert _chosen(place, target="wmc").keeps_settings is None, "the documents give none"

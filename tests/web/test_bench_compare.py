@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
-from flasher.errors import ErrorCode, ExitCode
+from flasher.errors import BusError, ErrorCode, ExitCode
 from flasher.host.verify import Verdict
 from flasher.web.bench import BenchController
+from flasher.web.bench_compare import compare, watch_compared
 from flasher.web.bench_state import BenchState
-from flasher.web.virtual_bike import BikeFault
+from flasher.web.virtual_bike import BikeFault, VirtualBike
 from tests.loops import each
 from tests.web.bench_place import IMAGE, BenchPlace, order
 
@@ -43,7 +46,7 @@ def test_another_version_than_the_image_is_reported_and_nothing_is_sent_to_chang
     place: BenchPlace,
 ) -> None:
     chosen(place)
-    state = place.do(BenchController.compare)
+    state = place.do(compare)
     assert state.trouble is None
     assert state.compared is not None
     assert state.compared.verification.verdict is Verdict.VERSION_OTHER
@@ -62,7 +65,7 @@ def test_another_version_than_the_image_is_reported_and_nothing_is_sent_to_chang
 
 def test_the_image_that_runs_is_confirmed(place: BenchPlace) -> None:
     upgraded(place)
-    compared = place.do(BenchController.compare).compared
+    compared = place.do(compare).compared
     assert compared is not None
     assert compared.error is None
     assert compared.is_sure
@@ -71,7 +74,7 @@ def test_the_image_that_runs_is_confirmed(place: BenchPlace) -> None:
 
 def test_an_upgrade_makes_the_comparison_void(place: BenchPlace) -> None:
     state = chosen(place)
-    place.do(BenchController.compare)
+    place.do(compare)
     assert state.offer is not None
     done = place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
     assert done.compared is None
@@ -83,7 +86,7 @@ def test_a_device_without_a_version_query_cannot_be_compared(
 ) -> None:
     place = BenchPlace(tmp_path_factory.mktemp("place"))
     chosen(place, target=target)
-    state = place.do(BenchController.compare)
+    state = place.do(compare)
     assert state.compared is None
     assert state.trouble is not None
     assert "no query for what the" in state.trouble.what
@@ -96,7 +99,7 @@ def test_a_device_in_its_bootloader_is_no_match(place: BenchPlace) -> None:
     place.do(
         order(BenchController.choose_target, "bms"), order(BenchController.choose_image, IMAGE)
     )
-    state = place.do(BenchController.compare)
+    state = place.do(compare)
     assert state.compared is not None
     assert state.compared.error is not None
     assert state.compared.error.code in (ErrorCode.IN_BOOTLOADER, ErrorCode.NO_ANSWER)
@@ -104,7 +107,7 @@ def test_a_device_in_its_bootloader_is_no_match(place: BenchPlace) -> None:
 
 
 def test_without_an_image_nothing_is_compared(place: BenchPlace) -> None:
-    state = place.do(BenchController.compare)
+    state = place.do(compare)
     assert state.trouble is not None
     assert state.trouble.what == "No image is chosen."
     assert state.trouble.exit_code is ExitCode.USAGE
@@ -113,6 +116,69 @@ def test_without_an_image_nothing_is_compared(place: BenchPlace) -> None:
 def test_stop_ends_it_without_a_verdict(place: BenchPlace) -> None:
     chosen(place)
     place.bench.stop()
-    state = place.do(BenchController.compare)
+    state = place.do(compare)
     assert state.compared is None or state.compared.error is not None
     assert state.is_idle
+
+
+def _compared_and_then(place: BenchPlace, act: Callable[[BenchPlace], None]) -> BenchState:
+    """The state when the bench has watched the compared unit, and `act` was done meanwhile."""
+    chosen(place, BikeFault.EXCHANGED)
+    assert place.do(compare).compared is not None
+    act(place)
+    watch_compared(place.bench)
+    return place.bench.state
+
+
+def test_a_comparison_is_void_when_the_bike_is_exchanged(place: BenchPlace) -> None:
+    state = _compared_and_then(place, lambda place: _bike(place).ended())
+    assert state.compared is None
+    assert state.offer is not None, "the choice stays"
+
+
+def test_a_comparison_is_void_when_another_unit_answers_at_once(place: BenchPlace) -> None:
+    def exchange(place: BenchPlace) -> None:
+        for socket in _bike(place)._places:
+            socket._device = socket._made()
+
+    assert _compared_and_then(place, exchange).compared is None
+
+
+def test_a_comparison_is_void_when_the_adapter_is_lost(place: BenchPlace) -> None:
+    def unplug(place: BenchPlace) -> None:
+        def gone(*_args: object, **_named: object) -> NoReturn:
+            raise BusError("The adapter is gone.")
+
+        place.bikes.connect = gone  # type: ignore[method-assign]
+
+    assert _compared_and_then(place, unplug).compared is None
+
+
+def _order_the_next(place: BenchPlace) -> None:
+    assert place.bench.order(BenchController.look)
+
+
+def test_a_comparison_stays_until_the_next_order(place: BenchPlace) -> None:
+    state = _compared_and_then(place, _order_the_next)
+    assert state.compared is not None
+    assert state.trouble is None
+
+
+def _bike(place: BenchPlace) -> VirtualBike:
+    return place.bikes._bikes[BikeFault.EXCHANGED.value]
+
+
+def test_a_silent_device_stays_reported_as_silent(place: BenchPlace) -> None:
+    chosen(place, BikeFault.OFF)
+    assert place.do(compare).compared is not None
+    turns = 0
+
+    def beat() -> None:
+        nonlocal turns
+        turns += 1
+        if turns > 100:
+            place.bench.order(BenchController.look)
+
+    place.bench.feed.beat = beat  # type: ignore[method-assign]
+    watch_compared(place.bench)
+    assert place.bench.state.compared is not None

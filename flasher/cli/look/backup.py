@@ -20,7 +20,7 @@ from flasher import __version__
 from flasher.api import as_target
 from flasher.cli import values
 from flasher.cli.documents import as_json
-from flasher.cli.files import check_new, write_whole
+from flasher.cli.files import check_new, claimed, write_whole
 from flasher.cli.framework import argument, group, missing_option, option
 from flasher.cli.look.info import InfoDocument, info_document, silence_error
 from flasher.cli.look.memory import intel_hex, read_with_bar
@@ -201,7 +201,10 @@ def backup(
     check_new(file, _OUTPUT, force=force)
     area = None if no_memory else _address_range(image, profile, target, bus)
     bus = bus.with_profile(profile)
-    with recorded_device(recorded, bus, output, target) as (device, record):
+    with (
+        claimed(file, _OUTPUT, force=force),
+        recorded_device(recorded, bus, output, target) as (device, record),
+    ):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
         data = b""
@@ -210,8 +213,8 @@ def backup(
         if record.two_devices is not None:
             raise two_devices_error(target, record.two_devices, "No file was written.")
         made = backup_of(found, area, data, device.connection.name, file)
+        write_whole(file, made.archive, _OUTPUT, is_private=True)
     document, memory = made.document, made.document.memory
-    write_whole(file, made.archive, _OUTPUT, is_private=True)
     output.results(_lines(document))
     output.table(document.not_in_it.items(), indent=2)
     if memory is not None and memory.names_running_version is False:
@@ -229,15 +232,25 @@ def backup(
     "--force", is_flag=True, panel="restore", brief=True,
     help="write them to a unit with another serial number too",
 )  # fmt: skip
+@profile_option
 @bus_options()
 @recording_options
 def restore(
-    output: Output, bus: Bus, recorded: RecordingOptions, *, file: Path, yes: bool, force: bool
+    output: Output,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    file: Path,
+    yes: bool,
+    force: bool,
+    profile: str | None,
 ) -> int:
     """Write the settings of a backup back, those that changed and that a tool may write: user
     strings and check code. Each is read back. Memory is not written: flash memory.hex for that.
     """
     target, settings = _settings_of_file(file, bus)
+    bus = bus.with_profile(profile)
+    chosen = load_profile(profile, target, bus.dialect)
     if not yes and not can_ask():
         raise UsageError(
             "Writing settings needs a confirmation, and there is no terminal to ask.",
@@ -253,7 +266,7 @@ def restore(
         return output.document(
             RestoredDocument(target.name, str(file), []), exit_code=ExitCode.INTERRUPTED
         )
-    with recorded_device(recorded, bus, output, target) as (device, record):
+    with recorded_device(recorded, bus, output, target, chosen) as (device, record):
         results = list(restore_settings(device, settings, allow_other_unit=force))
         failed = [each for each in results if each.state is SettingState.NOT_RESTORED]
         error = None

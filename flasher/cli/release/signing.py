@@ -133,6 +133,14 @@ def today() -> str:
         ) from error
 
 
+def coming_date(text: str) -> str:
+    """Parse a date that has not passed."""
+    chosen = date(text)
+    if chosen < datetime.datetime.now(datetime.UTC).date().isoformat():
+        raise click.BadParameter(f"{chosen} has passed")
+    return chosen
+
+
 def date(text: str) -> str:
     """Parse a date, as 2027-11-24."""
     try:

@@ -17,7 +17,7 @@ from flasher.cli.framework import Decorator, argument, group, option, option_set
 from flasher.cli.output import Output, counted
 from flasher.cli.release.signing import (
     Passphrases,
-    date,
+    coming_date,
     key_option,
     open_keys,
     passphrase_options,
@@ -126,7 +126,7 @@ def trust() -> None:
 
 _file = argument("file", metavar="FILE", type=values.FilePath("json"))
 _expires = option(
-    "--expires", type=date, metavar="DATE", panel="trust file",
+    "--expires", type=coming_date, metavar="DATE", panel="trust file",
     help=f"last day for which releases may be stated (default: in {VALID_DAYS} days)",
 )  # fmt: skip
 

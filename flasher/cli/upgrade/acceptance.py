@@ -19,7 +19,7 @@ from flasher import __version__, api
 from flasher.cli import values
 from flasher.cli.adapters import choose_adapter
 from flasher.cli.documents import ImageDocument, as_json
-from flasher.cli.files import check_new, check_not_read, write_whole
+from flasher.cli.files import check_new, check_not_read, claimed, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line
 from flasher.cli.look.doctor import LISTEN_S, Diagnostics
 from flasher.cli.look.findings import Severity
@@ -39,7 +39,7 @@ from flasher.cli.upgrade import text
 from flasher.cli.upgrade.choices import EXIT_CODES
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
-from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import ErrorCode, ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.events import PacketAcknowledged
 from flasher.host.outcome import AGAIN, DeviceLeft
 from flasher.host.verify import Verdict
@@ -202,13 +202,15 @@ def acceptance(
             f"Take the maker's image for this {target.node.name}: an acceptance waives no check.",
         )
         raise
-    with stop_on_signal(
-        lambda: output.error_line("stopping at the end of the message ...")
-    ) as stop:
+    with (
+        claimed(path, _OUT, force=overwrites),
+        stop_on_signal(lambda: output.error_line("stopping at the end of the message ...")) as stop,
+    ):
         walk = _Walk(output, bus, job, settings, stop, path, agreed=yes, interrupts=interrupts)
         return walk.run()
 
 
+_AGAIN: Final = f"{AGAIN[:-1]} with --force: it overwrites this report."
 STEPS: Final = (
     "bus", "identity", "read", "first upgrade", "second upgrade", "interrupted and rescued",
     "identity afterwards",
@@ -431,7 +433,10 @@ class _Walk:
         )
 
     def _add_repair(self, error: FlasherError) -> None:
-        """Add the command that repairs a device left without an application."""
+        """Add the command that repairs a device left without an application; advice to repeat this
+        one has to name --force, because its report exists.
+        """
+        error.remedy = error.remedy.replace(AGAIN, _AGAIN)
         if error.needs_rescue and not self.bus.mock:
             ctx = click.get_current_context()
             words = rebuild_command_line(ctx, "rescue", without=_OWN_OPTIONS.__contains__)
@@ -498,9 +503,10 @@ class _Walk:
             self._add(name, state, what, time.perf_counter() - begun)
 
     def _fail(self, error: FlasherError) -> None:
-        _offer_no_waiver(
-            error, f"{without_options(error.remedy)} An acceptance waives no check.".lstrip()
-        )
+        remedy = without_options(error.remedy)
+        if error.code is ErrorCode.UNCHECKED:
+            remedy = "Take an image whose manifest has no rule that this device cannot answer."
+        _offer_no_waiver(error, f"{remedy} An acceptance waives no check.".lstrip())
         self.error = self.error or error
 
     def _name(self, name: str) -> None:
@@ -593,8 +599,7 @@ class _Walk:
             output.verdict(closing if not practice else closing._replace(colour="yellow"))
             return output.document(document)
         if self.error is not None:
-            again = f"{AGAIN[:-1]} with --force: it overwrites this report."
-            self.error.remedy = self.error.remedy.replace(AGAIN, again)
+            self.error.remedy = self.error.remedy.replace(AGAIN, _AGAIN)
             output.ending = lambda _error: closing
             return output.failure(self.error, document)
         output.verdict(closing)

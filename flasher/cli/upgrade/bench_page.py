@@ -28,6 +28,7 @@ from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, recording
 from flasher.cli.stop import Stop, stop_on_signal
+from flasher.cli.upgrade.settings import page_restore_command
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import FlasherError, UsageError
@@ -43,6 +44,7 @@ from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController
+from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Activity, Adapter, Saved
 from flasher.web.guard import BODY_MAX, BrowserEntry, application
@@ -93,6 +95,7 @@ class _Place:
     def __post_init__(self) -> None:
         self.dialect = self._bus.dialect
         self.images = self._shelf.files
+        self.sets = self._shelf.sets
         self.dropped = self._shelf.dropped
 
     def use_folder(self, path: str) -> None:
@@ -154,7 +157,9 @@ class _Place:
         self,
         adapter: Adapter,
         job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
         *,
+        keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> bench.UpgradeEnding:
@@ -173,9 +178,11 @@ class _Place:
             yield {"on_event": listener, "cancelled": cancelled, "hung_up": hung_up}
 
         upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
+        upgrade_run.keeps_settings = keeps_settings
+        upgrade_run.restore_command = page_restore_command
         result = None
         try:
-            result = upgrade_run.write_planned(lambda: self.connect(adapter), watching)
+            result = upgrade_run.write_planned(connect, watching)
         except FlasherError as error:
             upgrade_run.error = error
         bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
@@ -266,13 +273,24 @@ class VirtualBikes(_Place):
         self,
         adapter: Adapter,
         job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
         *,
+        keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> bench.UpgradeEnding:
         """Limit the attempts, to show a bike's fault before the overall deadline."""
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
-        return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
+        ending = super().upgrade(
+            adapter,
+            limited,
+            connect,
+            keeps_settings=keeps_settings,
+            on_event=on_event,
+            cancelled=cancelled,
+        )
+        self._bikes[adapter.name].ended()
+        return ending
 
     def _listener(
         self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
@@ -318,7 +336,7 @@ def serve(
 
         def work() -> None:
             with ctx.scope(cleanup=False):
-                machine.run()
+                machine.run(watch_compared)
 
         worker = threading.Thread(target=work, name="bench", daemon=True)
         with Server(app, "127.0.0.1", port) as server:

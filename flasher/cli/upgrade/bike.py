@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from flasher import api
 from flasher.bike import (
     ORDER_REASON,
     SetImage,
+    check_same_battery,
     in_safe_order,
     judge_bike,
     look_at_bike,
@@ -40,13 +41,10 @@ from flasher.cli.upgrade.text import (
 )
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.errors import (
-    ErrorCode,
     ExitCode,
     FlasherError,
     InterruptedByUserError,
-    NoAnswerError,
     UsageError,
-    WrongDeviceError,
 )
 from flasher.events import CheckMade
 from flasher.host.identity import CheckVerdict
@@ -135,6 +133,10 @@ class BikeUpgrade:
         )
         self._left_out = [each for each in parts if each.target in self.without]
         chosen = [each for each in parts if each.target not in self.without]
+        for absent in self.without - {each.target for each in parts}:
+            output.error_line(
+                f"warning: --without {absent.name} changes nothing: the set has no image for it"
+            )
         if not chosen:
             raise UsageError(
                 "--without leaves no device of the set.", remedy="Leave one --without out."
@@ -294,7 +296,9 @@ class BikeUpgrade:
 
         try:
             if device is not self._devices[0]:
-                self._check_same_bike(connection, stop)
+                check_same_battery(
+                    connection, self._profile(BMS), self._battery, cancelled=stop.asked
+                )
             device.state = DeviceState.FAILED
             result = upgrade_run.write_planned(lambda: nullcontext(connection), watching)
         except FlasherError as error:
@@ -306,25 +310,6 @@ class BikeUpgrade:
             device.is_sure = closing.colour == "green"
             device.state, device.summary = _ending(device.name, result)
         return upgrade_run.error
-
-    def _check_same_bike(self, connection: api.Connection, stop: Stop) -> None:
-        """Raise WrongDeviceError if the battery is another one than before the first upgrade."""
-        profile = self._profile(BMS)
-        request = profile.upgrade_options().version_request_for(BMS)
-        if not self._battery or request is None:
-            return
-        with suppress(NoAnswerError):  # the upgrade judges a silent device
-            battery = connection.device(profile=profile, cancelled=stop.asked)
-            now = serial_number(battery.ask(request))
-            if now and now != self._battery:
-                raise WrongDeviceError(
-                    f"The BMS has the serial number {now}, and had {self._battery} before the "
-                    "first upgrade.",
-                    cause="another bike is connected, or another battery",
-                    remedy="Connect the first bike with its battery and run the same command, then "
-                    "run it for the other one.",
-                    code=ErrorCode.NOT_FOR_DEVICE,
-                )
 
     def _trace_file(self, device: _Device) -> str | None:
         """Return the trace file of a device: the name of the option, with that of the device."""

@@ -231,14 +231,13 @@ class _Upgrade:
     def _open(self) -> api.OpenedImage:
         choices = self.choices
         choices.check_contradictions()
-        with self.image.advice():
-            return api.open_image(
-                self.image.source,
-                self.target,
-                manifest=choices.manifest,
-                require_signed=choices.require_signed,
-                **self.image.options(force=choices.force),
-            )
+        return api.open_image(
+            self.image.source,
+            self.target,
+            manifest=choices.manifest,
+            require_signed=choices.require_signed,
+            **self.image.options(force=choices.force),
+        )
 
     def _carry_out(self, job: api.Job, profile: Profile) -> int:
         output = self.output

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,8 +26,6 @@ from flasher.protocol.text import printable
 
 _OUT: Final = "-o/--output"
 _STANDARD_OUTPUT: Final = "-"
-_ADDRESS: Final = re.compile(r"0[xX][0-9A-Fa-f]{1,8}")
-"""With 0x: a decimal address would be the wrong one, and nothing would show it."""
 _EXAMPLES: Final = """\
 examples:
   flasher image info firmware.hex bootloader.bin
@@ -210,12 +207,13 @@ def _at_address(text: str) -> tuple[str, int | None]:
     path, at, address = text.rpartition("@")
     if not at or Path(text).exists():
         return text, None
-    if not _ADDRESS.fullmatch(address):
+    try:
+        return path, values.address(address)
+    except click.BadParameter as error:
         raise UsageError(
-            f"{printable(text)}: {printable(address)!r} is not an address in hexadecimal.",
+            f"{printable(text)}: {error.message}",
             remedy="Write FILE@ADDRESS, such as firmware.bin@0x8004000.",
-        )
-    return path, int(address, 16)
+        ) from error
 
 
 def _read(path: str, selection: Selection) -> Content:

@@ -16,10 +16,11 @@ from flasher.cli.framework import rebuild_command_line
 from flasher.cli.look.backup import backup_of, own_backup_path
 from flasher.errors import FlasherError, UsageError
 from flasher.events import SETTINGS, CheckMade
+from flasher.i18n import text
 from flasher.kept_settings import Setting, SettingState, restore_settings, settings_in, settings_of
 from flasher.protocol.text import printable
 
-_NOT_KEPT: Final = (
+_NOT_KEPT: Final = text(
     "not kept: what the new firmware does to serial number, model and production information (only "
     "the manufacturer may write them), to the history (no message writes it) and to an odometer "
     "(no query reads it)"
@@ -30,47 +31,67 @@ _NOT_KEPT: Final = (
 class SavedSettings:
     """Settings of a device before its upgrade, in a file."""
 
-    path: Path
     values: Mapping[str, Setting]
 
-    @property
-    def command(self) -> str:
-        """Command that writes them back, with the options of the adapter."""
-        ctx = click.get_current_context()
-        options = [each for each in ctx.command.params if getattr(each, "panel", "") == "bus"]
-        of_bus = {"--dialect", "--mock", "--mock-speed", *(each.opts[-1] for each in options)}
-        words = rebuild_command_line(
-            ctx, "backup", without=lambda name: name not in of_bus,
-            replaced={"image": ["restore", str(self.path)]},
-        )  # fmt: skip
-        return printable(shlex.join(["flasher", *words]))
+    command: str
+    """Command that writes them back."""
+
+
+def restore_command(path: Path) -> str:
+    """Build the command that writes settings back, with the options of the adapter of this one."""
+    ctx = click.get_current_context()
+    options = [each for each in ctx.command.params if getattr(each, "panel", "") == "bus"]
+    of_bus = {"--dialect", "--mock", "--mock-speed", *(each.opts[-1] for each in options)}
+    words = rebuild_command_line(
+        ctx, "backup", without=lambda name: name not in of_bus,
+        replaced={"image": ["restore", str(path)]},
+    )  # fmt: skip
+    return printable(shlex.join(["flasher", *words]))
+
+
+def page_restore_command(path: Path) -> str:
+    """Build the command for the page, whose adapter a user has chosen there."""
+    return printable(shlex.join(["flasher", "backup", "restore", str(path)]))
 
 
 Emit = Callable[[CheckMade], None]
 
 
-def save_settings(device: Device, emit: Emit, **watch: Unpack[CallOptions]) -> SavedSettings | None:
+def save_settings(
+    device: Device, emit: Emit, command: Callable[[Path], str], **watch: Unpack[CallOptions]
+) -> SavedSettings | None:
     """Save the settings; None for a device that has or answers none. Raises UsageError if they
     cannot be written to a file.
     """
     node = device.target.node.name
     if not settings_of(device.target, device.profile.dialect):
-        emit(CheckMade(SETTINGS, "unknown", f"the documents give no settings of the {node}"))
+        emit(
+            CheckMade(
+                SETTINGS, "unknown", text("the documents give no settings of the {node}", node=node)
+            )
+        )
         return None
     found = device.identify(**watch)
     values = settings_in(found)
     if not values:
-        emit(CheckMade(SETTINGS, "unknown", f"the {node} answers no query: nothing was saved"))
+        emit(
+            CheckMade(
+                SETTINGS,
+                "unknown",
+                text("the {node} answers no query: nothing was saved", node=node),
+            )
+        )
         return None
     path = own_backup_path(found)
     archive = backup_of(found, None, b"", device.connection.name, path).archive
     try:
         write_whole(path, archive, "", is_private=True)
     except UsageError as error:
-        error.remedy = "Make room there, or upgrade with --no-keep-settings."
+        error.remedy = "Make room there. Or upgrade with --no-keep-settings."
         raise
-    saved = SavedSettings(path, values)
-    emit(CheckMade(SETTINGS, "passed", f"the settings are saved: `{saved.command}` restores them"))
+    saved = SavedSettings(values, command(path))
+    what = text("the settings are saved: `{command}` restores them", command=saved.command)
+    emit(CheckMade(SETTINGS, "passed", what))
     emit(CheckMade(SETTINGS, "passed", _NOT_KEPT))
     return saved
 
@@ -89,18 +110,29 @@ def compare_settings(
                 case SettingState.KEPT:
                     kept += 1
                 case SettingState.RESTORED:
-                    emit(CheckMade(SETTINGS, "passed", f"the {name} had changed, and was restored"))
+                    what = text("the {name} had changed, and was restored", name=name)
+                    emit(CheckMade(SETTINGS, "passed", what))
                 case SettingState.CHANGED:
-                    what = f"the {name} has changed, and only its manufacturer may write it"
+                    what = text(
+                        "the {name} has changed, and only its manufacturer may write it", name=name
+                    )
                     emit(CheckMade(SETTINGS, "warned", what))
                 case SettingState.NOT_RESTORED | SettingState.UNKNOWN:
-                    why = each.detail or "it was not answered"
-                    what = f"the {name} was not restored: {why} `{saved.command}` tries again"
+                    what = text(
+                        "the {name} was not restored: {why} `{command}` tries again",
+                        name=name,
+                        why=each.detail or text("it was not answered"),
+                        command=saved.command,
+                    )
                     emit(CheckMade(SETTINGS, "warned", what))
     except FlasherError as error:
-        what = f"not all were compared: {error.what} {error.remedy} `{saved.command}` goes on"
+        what = text(
+            "not all were compared: {what} {remedy} `{command}` goes on",
+            what=error.what,
+            remedy=error.remedy,
+            command=saved.command,
+        )
         emit(CheckMade(SETTINGS, "warned", what))
     else:
-        emit(
-            CheckMade(SETTINGS, "passed", f"{kept} of {len(saved.values)} settings read as before")
-        )
+        what = text("{kept} of {count} settings read as before", kept=kept, count=len(saved.values))
+        emit(CheckMade(SETTINGS, "passed", what))

@@ -9,13 +9,19 @@ import datetime
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from flasher.api import CallOptions, Connection, Job
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
-from flasher.cli.upgrade.settings import SavedSettings, compare_settings, save_settings
+from flasher.cli.upgrade.settings import (
+    SavedSettings,
+    compare_settings,
+    restore_command,
+    save_settings,
+)
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import (
@@ -29,6 +35,7 @@ from flasher.events import (
 )
 from flasher.history import MOCK, Began, Ended, FlashHistory, Reached, left_open, working_folder
 from flasher.host.session import Result
+from flasher.i18n import text
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
@@ -49,6 +56,8 @@ class UpgradeRun:
     again: str = ""
     """Command that repeats the upgrade after this program was killed; empty for the page."""
     keeps_settings: bool = False
+    restore_command: Callable[[Path], str] = restore_command
+    """Builds the command that writes saved settings back."""
     checks: list[CheckMade] = field(default_factory=list)
     record: Recording | None = None
     document: UpgradeDocument | None = None
@@ -144,10 +153,10 @@ class UpgradeRun:
         calls: CallOptions = {"taps": record.taps, "cancelled": watch.get("cancelled")}
         if self.keeps_settings and self.job.options.at_power_up:
             # No application answers a query, and the announcement must not be missed meanwhile.
-            what = "not saved: no application runs that could report them"
+            what = text("not saved: no application runs that could report them")
             on_event(CheckMade(SETTINGS, "unknown", what))
         elif self.keeps_settings:
-            self._saved = save_settings(device, on_event, **calls)
+            self._saved = save_settings(device, on_event, self.restore_command, **calls)
         result = self.job.run(
             device,
             taps=record.taps,
@@ -163,9 +172,11 @@ class UpgradeRun:
         """Complete an error, with the command that restores the settings."""
         self.on_failure(error)
         if self._saved is not None:
-            command = self._saved.command
-            error.remedy = f"{error.remedy} Its settings are saved, and can be written back after "
-            error.remedy += f"that: `{command}`."
+            error.remedy = text(
+                "{remedy} Its settings are saved, and can be written back after that: `{command}`.",
+                remedy=error.remedy,
+                command=self._saved.command,
+            )
 
     # -- the history -------------------------------------------------------------------------------
 

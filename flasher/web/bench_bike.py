@@ -1,0 +1,109 @@
+"""Upgrade of a whole bike on the bench: all devices of a set, one after the other, on one bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+from flasher.bike import (
+    check_same_battery,
+    in_safe_order,
+    judge_bike,
+    look_at_bike,
+    serial_number,
+)
+from flasher.errors import FlasherError, InterruptedByUserError, UsageError
+from flasher.i18n import text, with_value
+from flasher.protocol.spec import BMS, Target
+from flasher.web.bench import RESCUE, BenchController, changed_error
+from flasher.web.bench_state import Activity, Done, Offer, SetDevice
+
+_GO_ON: Final = text("Then go on with the bike.")
+
+
+def upgrade_bike(bench: BenchController, sha256: str) -> None:
+    """Check the whole bike, then upgrade the devices of the chosen set in a safe order; begun
+    again, it goes on where it stopped. `sha256` are the digests of its images, joined.
+
+    Raises UsageError if the page was outdated, and FlasherError for what speaks against the
+    upgrade; the error of an upgrade that has begun is in its `done`.
+    """
+    chosen = bench.state.offer
+    if chosen is None or chosen.sha256 != sha256 or not chosen.parts or bench.has_new_files:
+        raise UsageError(
+            "Another device or image was chosen meanwhile; nothing was sent.",
+            remedy="Check the selection, then start again.",
+        )
+    offers = dict(chosen.parts)
+    jobs = {target: job for target, (_, job) in bench.set_jobs(chosen.path).items()}
+    if "".join(job.plan.image.sha256 for job in jobs.values()) != sha256:
+        raise changed_error(chosen)
+    before = bench.state.devices if bench.state.done is not None else ()
+    bench.show(doing=Activity.LOOKING, done=None, devices=(), compared=None)
+    profiles = {target: bench.backend.profile(target) for target in jobs}
+    try:
+        with bench.connected() as connection:
+            dialect = bench.backend.dialect
+            found = look_at_bike(connection, dialect, profiles, cancelled=bench.cancelled)
+            judge_bike(found, jobs, ())
+            battery = serial_number(found.answers[BMS].version)
+            kept = {
+                each.target: each
+                for each in before
+                if _is_done(each, offers, battery) and each.target not in found.broken
+            }
+            order = in_safe_order(list(jobs), found.broken)
+            devices = (
+                kept.get(each, SetDevice(each, offers[each], None, battery)) for each in order
+            )
+            bench.show(devices=tuple(devices))
+            is_first = True
+            for target in order:
+                if target in kept:
+                    continue
+                bench.show(target=target, offer=offers[target])
+                if not is_first:
+                    _check_goes_on(bench, battery)
+                is_first = False
+                done = bench.carry_out(found.ready(jobs[target]), offers[target])
+                _ended(bench, done)
+                if done.error is not None:
+                    if not done.is_refused:
+                        done.error.remedy = with_value(done.error.remedy, RESCUE, _GO_ON)
+                    return
+    finally:
+        bench.show(target=None, offer=chosen)
+
+
+def _is_done(device: SetDevice, offers: Mapping[Target, Offer], battery: str) -> bool:
+    """True if this device of this bike has this image, from the upgrade that is continued."""
+    done, offer = device.done, offers.get(device.target)
+    is_good = done is not None and done.error is None
+    is_same = offer is not None and device.offer.sha256 == offer.sha256
+    return is_good and is_same and bool(battery) and device.battery == battery
+
+
+def _check_goes_on(bench: BenchController, battery: str) -> None:
+    """Raise FlasherError if the next device must not be upgraded."""
+    if bench.cancelled():
+        raise InterruptedByUserError(
+            text("The upgrade of the bike was stopped between two devices."),
+            remedy=text("The same button goes on with the next one."),
+        )
+    with bench.connected() as connection:
+        try:
+            check_same_battery(
+                connection, bench.backend.profile(BMS), battery, cancelled=bench.cancelled
+            )
+        except FlasherError as error:
+            error.remedy = text("Connect the first bike, and press the same button again.")
+            raise
+
+
+def _ended(bench: BenchController, done: Done) -> None:
+    devices = (
+        replace(each, done=done) if each.target is done.target else each
+        for each in bench.state.devices
+    )
+    bench.show(devices=tuple(devices))
