@@ -22,6 +22,8 @@ from flasher.web.virtual_bike import BikeFault, VirtualBike
 from tests.loops import each
 from tests.web.bench_place import IMAGE, BenchPlace, order, write_manifest
 
+pytestmark = pytest.mark.slow
+
 
 class Session:
     """A series on a virtual bike; `at` is called once for each new step, and may stop it."""
@@ -347,17 +349,24 @@ def test_a_unit_taken_out_in_its_upgrade_ends_the_series_with_its_rescue(
     assert state.failed_count == 1
 
 
-def test_two_bikes_at_once_are_left_out(place: BenchPlace) -> None:
-    session = Session(place, BikeFault.EXCHANGED)
+@each("collides", [False, True])
+def test_two_bikes_at_once_get_nothing_by_themselves(
+    collides: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    session = Session(BenchPlace(tmp_path_factory.mktemp("place")), BikeFault.EXCHANGED)
 
     def add() -> None:
         profile = replace(DeviceProfile(), serial_number="W2605900")
-        device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
-        session.bike._bus.attach(device)
+        session.bike._bus._collides = collides
+        session.bike._bus.attach(MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile))
 
     session.at[SeriesStep.READING] = add
-    session.at[SeriesStep.REFUSED] = session.bench.stop
+    session.at[SeriesStep.REFUSED] = session.at[SeriesStep.ASKED] = session.bench.stop
     state = session.run()
+    assert SeriesStep.UPGRADING not in session.names
+    if collides:  # their answers destroy each other
+        assert session.names[-1] is SeriesStep.ASKED
+        return
     assert session.names[-1] is SeriesStep.REFUSED
     assert state.session[-1].is_left_out
     assert state.session[-1].error is not None
