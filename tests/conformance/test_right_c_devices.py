@@ -94,6 +94,13 @@ def test_a_reset_that_waited_for_the_end_of_an_erase_may_restart_the_bootloader(
     assert verdict(23, "BU-01", given) in HELD
 
 
+def test_noise_comes_when_one_that_is_deaf_in_its_burst_erases() -> None:
+    """It starts its old application so slowly that the reset after the noise was lost."""
+    given: dict[str, Value] = {"limits.first_version_s": 0.5, "limits.ack_s": 1.5}
+    given |= {"limits.erase_s": 0.61, "rs_03_old": "kept", "up_08": "rejected"}
+    assert verdict(49, "SE-03", given) in HELD
+
+
 def verdict(seed: int, case_id: str, given: dict[str, Value]) -> CaseVerdict:
     """Of that case with the sizes of the device, and `given`."""
     device = right_c_device(seed)
