@@ -177,6 +177,7 @@ def noise(bench: Bench) -> None:
             done = _continue_transfer(bench, image, stored)
     with bench.step("after complete"):
         _send_noise(bench)
+        bench.collect(bench.waits.silence_s)  # a bootloader's feedback is not its application's
         bench.check_image(image)
 
 
