@@ -316,9 +316,7 @@ def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(
             "bench_sheet.html",
             translate,
             "",
-            done=shown,
-            rows=[],
-            device=None,
+            upgrades=[(shown, [], [])],
             waivers={},
             is_saved=True,
         )
