@@ -9,6 +9,7 @@ from flasher.errors import ErrorCode, UsageError, how_to_install
 
 _PACKAGES: Final = {
     "cluster": ("distributed",),
+    "handover": ("aiomqtt", "httpx2", "procrastinate"),
     "mf4": ("asammdf",),
     "plant": ("alembic", "cryptography", "psycopg", "sqlalchemy"),
     "station": ("alembic", "argon2", "babel", "cryptography", "segno", "sqlalchemy", "stdnum"),

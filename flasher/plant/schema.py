@@ -20,6 +20,7 @@ from sqlalchemy import (
     ForeignKey,
     Identity,
     Index,
+    Integer,
     LargeBinary,
     MetaData,
     PrimaryKeyConstraint,
@@ -33,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "4"
+PLANT_SCHEMA: Final = "5"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -198,6 +199,39 @@ recipe_event: Final = Table(
 )
 """Who gave a recipe to which sockets of which station (null: all), or withdrew it. The newest row
 counts."""
+
+plant_receiver: Final = Table(
+    "plant_receiver",
+    metadata,
+    Column("name", Text, primary_key=True),
+    Column("since", DateTime(timezone=True), nullable=False, server_default=func.now()),
+    Column("stopped_at", DateTime(timezone=True)),
+)
+"""A system that receives the runs which arrive from `since` on. Its address and password are in the
+file of `flasher plant deliver`."""
+
+plant_delivery: Final = Table(
+    "plant_delivery",
+    metadata,
+    Column("receiver", Text, nullable=False),
+    Column("station", Uuid, nullable=False),
+    Column("number", BigInteger, nullable=False),
+    Column("state", Text, nullable=False, server_default="waiting"),
+    Column("attempts", Integer, nullable=False, server_default="0"),
+    Column("sent_at", DateTime(timezone=True)),
+    Column("answered_at", DateTime(timezone=True)),
+    Column("answer", Text, nullable=False, server_default=""),
+    Column("job", BigInteger, nullable=False),
+    PrimaryKeyConstraint("receiver", "station", "number"),
+    Index(
+        "plant_delivery_open", "state", "receiver", postgresql_where=text("state <> 'confirmed'")
+    ),
+)
+"""A run, by its row in the station's chain, and how far its hand-over to a receiver has come.
+`sent_at` and `answer` belong to the last attempt; `job` is Procrastinate's."""
+
+plant_queue: Final = Table("plant_queue", metadata, Column("migration", Text, primary_key=True))
+"""The last of Procrastinate's own migrations that its tables have."""
 
 OWN_PARTS: Final = (
     "run", "unit", "targets", "steps", "measurements", "writes", "attachments",

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, inspect, select, text
 from sqlalchemy.dialects.postgresql import insert
 
 from flasher.errors import ErrorCode, UsageError
-from flasher.plant import claim_functions, functions, release_functions, takeover_functions
+from flasher.plant import claim_functions, functions, queue, release_functions, takeover_functions
 from flasher.plant.central import Central, plant_location
 from flasher.plant.schema import (
     PLANT_SCHEMA,
@@ -34,6 +34,8 @@ READERS: Final = "flasher_readers"
 """Role with the right to read everything."""
 PUBLISHERS: Final = "flasher_publishers"
 """Role with the right to publish and to withdraw recipes, and to read everything."""
+DELIVERERS: Final = "flasher_deliverers"
+"""Role with the right to read everything and to hand runs over to the plant's systems."""
 MIGRATIONS: Final = "flasher.plant:migrations"
 _CHANGE_LIMIT_S: Final = 3600.0
 _LOCK: Final = 7053
@@ -101,14 +103,16 @@ def setup(
             )
         )
         is_new = _bring_up_to_date(connection, central, now)
-        for role in (STATIONS, READERS, PUBLISHERS):
+        for role in (STATIONS, READERS, PUBLISHERS, DELIVERERS):
             _make(connection, role)
+        _execute(connection, *queue.statements(connection))
         _execute(
             connection,
             *functions.FUNCTIONS,
             *claim_functions.FUNCTIONS,
             *takeover_functions.FUNCTIONS,
             *release_functions.FUNCTIONS,
+            *queue.FUNCTIONS,
         )
         database = connection.execute(text("SELECT current_database()")).scalar_one()
         quoted = [_quoted(connection, each) for each in (database, STATIONS, READERS)]
@@ -120,6 +124,7 @@ def setup(
         )
         quoted = [_quoted(connection, each) for each in (STATIONS, READERS, PUBLISHERS)]
         _execute(connection, release_functions.rights(*quoted))
+        _execute(connection, queue.rights(_quoted(connection, DELIVERERS), quoted[1]))
         made, named = [], []
         for station in dict.fromkeys((*stations, *renewed)):
             role = _add_station(connection, station)
@@ -193,7 +198,7 @@ def _add_station(connection: Connection, name: str) -> str:
     """Register a station; returns its role. Raises UsageError."""
     table = plant_station.c
     role = role_of(name)
-    if role in (STATIONS, READERS, PUBLISHERS):
+    if role in (STATIONS, READERS, PUBLISHERS, DELIVERERS):
         raise UsageError(
             f"A station cannot be called {printable(name)}: {role} is a role of all stations.",
             remedy="Give it another name.",

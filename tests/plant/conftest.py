@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.plant.broker import find_mosquitto
 from tests.plant.factory import Plant, Sender
 from tests.station.postgres import Server
 
@@ -21,3 +22,12 @@ def sender(plant: Plant) -> Iterator[Sender]:
     made = plant.sender("line-2")
     yield made
     made.close()
+
+
+@pytest.fixture(scope="session")
+def mosquitto() -> str:
+    """The program of a real broker."""
+    found = find_mosquitto()
+    if found is None:
+        pytest.skip("Mosquitto is not installed (Debian: apt-get install mosquitto)")
+    return found

@@ -12,7 +12,7 @@ import psycopg
 
 from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
-from flasher.plant.setup import READERS, role_of, setup
+from flasher.plant.setup import DELIVERERS, READERS, role_of, setup
 from flasher.plant.stations import StationStatus, stations_of
 from flasher.plant.store import PlantStore
 from flasher.station.records.store import Store
@@ -22,6 +22,7 @@ from tests.station.postgres import OWNER, Server
 STATIONS = ("line-2", "line-3")
 PASSWORD = "s3cr3t"  # noqa: S105  of a server that lives as long as the tests
 READER = "flasher_desk"
+COURIER = "flasher_courier"
 _TEMPLATE = "plant_template"
 
 
@@ -33,9 +34,10 @@ def _make_template(server: Server) -> None:
             return
         admin.execute(f"CREATE DATABASE {_TEMPLATE}".encode())
         setup(server.url(_TEMPLATE), STATIONS, datetime.now(UTC))
-        admin.execute(f"CREATE ROLE {READER} LOGIN".encode())
-        admin.execute(f"GRANT {READERS} TO {READER}".encode())
-        for role in (*map(role_of, STATIONS), READER):
+        for role, given in ((READER, READERS), (COURIER, DELIVERERS)):
+            admin.execute(f"CREATE ROLE {role} LOGIN".encode())
+            admin.execute(f"GRANT {given} TO {role}".encode())
+        for role in (*map(role_of, STATIONS), READER, COURIER):
             admin.execute(f"ALTER ROLE {role} PASSWORD '{PASSWORD}'".encode())
 
 

@@ -106,6 +106,10 @@ ATTEMPTS = {
         "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60)"
         " FROM generate_series(1, 1001) n", REFUSED,
     ),
+    "hand a run over again": (f"SELECT plant_enqueue('mes', {_THEIRS}, 4)", DENIED),
+    "confirm a delivery": ("UPDATE plant_delivery SET state = 'confirmed'", DENIED),
+    "read deliveries": ("SELECT * FROM plant_delivery", DENIED),
+    "stop a receiver": ("UPDATE plant_receiver SET stopped_at = now()", DENIED),
     "become the owner": ("SET ROLE postgres", DENIED),
     "make roles": ("CREATE ROLE another SUPERUSER", DENIED),
 }  # fmt: skip
@@ -144,5 +148,6 @@ def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
 
 def _everything(plant: Plant) -> dict[str, list[tuple[Any, ...]]]:
     tables = ("chain_row", "shared_part", "trace", "plant_station", "run", "unit", "station",
-              "plant_claim", "plant_pass", "plant_duplicate", "open_run")  # fmt: skip
+              "plant_claim", "plant_pass", "plant_duplicate", "open_run",
+              "plant_delivery", "plant_receiver")  # fmt: skip
     return {table: plant.rows(f"SELECT * FROM {table} ORDER BY 1, 2") for table in tables}

@@ -52,7 +52,7 @@ def test_two_stations_never_share_a_role(plant: Plant) -> None:
         setup(plant.url(), ["LINE 2"], NOW)
 
 
-@pytest.mark.parametrize("name", ["stations", "Readers"])
+@pytest.mark.parametrize("name", ["stations", "Readers", "deliverers"])
 def test_a_station_is_not_called_like_a_role_of_all(plant: Plant, name: str) -> None:
     with pytest.raises(UsageError, match=f"cannot be called {name}"):
         setup(plant.url(), [name], NOW)

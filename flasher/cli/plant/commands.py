@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
+import click
+
 from flasher.cli import values
 from flasher.cli.extras import need
 from flasher.cli.framework import argument, group, option, option_set
@@ -37,6 +39,8 @@ examples:
   flasher plant publish recipe.toml --station line-2 --database postgresql://anna@plant-db/flasher
   flasher plant recipes --database postgresql://reader@plant-db/flasher
   flasher plant send --sockets sockets.toml
+  flasher plant deliver --receivers receivers.toml --database postgresql://courier@plant-db/flasher
+  flasher plant deliveries --state refused --database postgresql://reader@plant-db/flasher
 """
 
 
@@ -266,3 +270,72 @@ def fetch(output: Output, sockets: Path) -> int:
     itself. Exit code 12 if one could not be fetched.
     """
     return _call("administration.fetch", output, sockets)
+
+
+# -- to the plant's systems ------------------------------------------------------------------------
+
+
+@plant.action("deliver")
+@option(
+    "--receivers", type=values.FilePath("toml", gives=Path), required=True, brief=True,
+    metavar="FILE", help="the file of receivers (TOML): their addresses",
+)  # fmt: skip
+@option("--once", is_flag=True, help="end when no run is due, instead of waiting for more")
+@_database_option
+def deliver(output: Output, receivers: Path, database: str, *, once: bool) -> int:
+    """Hand over the runs that arrive in the plant's database to the plant's other systems, by HTTP
+    or MQTT, until Ctrl-C. Each run comes with a key; it counts once if the receiver ignores a key
+    that it has already. A receiver is new when it is first in the file: it gets the runs that
+    arrive from then on.
+    """
+    return _call("handover.deliver", output, database, receivers, once=once)
+
+
+@plant.action("deliveries")
+@option("--receiver", metavar="NAME", brief=True, help="only to this receiver")
+@option(
+    "--state", type=click.Choice(("waiting", "sent", "confirmed", "unknown", "refused")),
+    brief=True, help="only in this state",
+)  # fmt: skip
+@option("--serial", metavar="SERIAL", help="only of this unit")
+@option("--key", metavar="KEY", help="only the run with this key; --json contains its document")
+@option(
+    "--limit", type=values.count, default="20", metavar="N",
+    help="list at most N, the newest (default 20)",
+)  # fmt: skip
+@option(
+    "--resend", is_flag=True, brief=True,
+    help="hand all runs that the options choose over again, or at once",
+)  # fmt: skip
+@option(
+    "--stop", metavar="NAME",
+    help="hand no further runs over to this receiver, which is no longer in the file",
+)  # fmt: skip
+@_database_option
+def deliveries(
+    output: Output,
+    receiver: str | None,
+    state: str | None,
+    serial: str | None,
+    key: str | None,
+    limit: int,
+    stop: str | None,
+    database: str,
+    *,
+    resend: bool,
+) -> int:
+    """List what was handed over to the plant's systems, and what they answered."""
+    chosen = {"receiver": receiver, "state": state, "serial": serial, "key": key}
+    return _call("handover.deliveries", output, database, chosen, limit, resend=resend, stop=stop)
+
+
+@plant.action("reconcile")
+@argument("list_", metavar="FILE", type=values.FilePath("csv", "json", gives=Path))
+@option("--receiver", metavar="NAME", required=True, brief=True, help="the receiver")
+@option("--resend", is_flag=True, brief=True, help="hand over again what is missing there")
+@_database_option
+def reconcile(output: Output, list_: Path, receiver: str, database: str, *, resend: bool) -> int:
+    """Compare the keys that a receiver has, from a CSV or JSON file, with what was handed over:
+    missing there, more than once there, unknown here. Exit code 10 if they differ.
+    """
+    return _call("handover.reconcile", output, database, receiver, list_, resend=resend)

@@ -8,9 +8,11 @@ from typing import Final
 from flasher.cli.station.documents import StationReportDocument
 from flasher.plant.activity import Activity
 from flasher.plant.alerts import StationCheck
+from flasher.plant.deliveries import Delivery, DeliveryState, ReceiverStatus, RunDocument
 from flasher.plant.fetcher import Fetched
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.recipes import RecipeEvent
+from flasher.plant.reconcile import Reconciliation
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
 from flasher.station.records.model import PassedTwice
@@ -87,6 +89,25 @@ class PlantUnitsDocument:
     units: list[InstalledUnit]
 
 
+@dataclass(frozen=True)
+class PlantDeliverDocument:
+    """Result of `flasher plant deliver`."""
+
+    attempts: dict[DeliveryState, int]
+    """Number of attempts by the state after them."""
+
+
+@dataclass(frozen=True)
+class PlantDeliveriesDocument:
+    """Hand-over of runs to the plant's systems."""
+
+    receivers: list[ReceiverStatus]
+    deliveries: list[Delivery]
+    """Newest first."""
+    document: RunDocument | None
+    """With --key: the run as it is handed over."""
+
+
 DOCUMENTS: Final = (
     PlantExamination,
     PlantUnitsDocument,
@@ -97,5 +118,8 @@ DOCUMENTS: Final = (
     PlantFetchDocument,
     PlantPublishDocument,
     PlantRecipesDocument,
+    PlantDeliverDocument,
+    PlantDeliveriesDocument,
+    Reconciliation,
 )
 LINES: Final[tuple[type, ...]] = ()

@@ -1,0 +1,152 @@
+"""`flasher plant deliver`, `deliveries` and `reconcile`: runs for the plant's other systems."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+from flasher.cli.documents import SCHEMA_VERSION
+from flasher.cli.extras import need
+from flasher.cli.output import Output, counted
+from flasher.cli.plant.documents import PlantDeliverDocument, PlantDeliveriesDocument
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, UsageError
+from flasher.plant.central import Central
+from flasher.plant.deliveries import (
+    Answer,
+    Attempt,
+    Deliveries,
+    Delivery,
+    DeliveryState,
+    ReceiverStatus,
+    unknown_receiver,
+)
+from flasher.plant.receivers import load_receivers
+from flasher.plant.reconcile import Reconciliation, compare, read_list
+from flasher.protocol.text import printable
+
+_SHOWN_MAX: Final = 20
+
+
+def deliver(output: Output, url: str, file: Path, *, once: bool) -> int:
+    need("Hand-over of runs", "handover")
+    from flasher.plant.courier import Courier  # noqa: PLC0415  an extra
+
+    receivers = load_receivers(file)
+    counts: Counter[DeliveryState] = Counter()
+
+    def report(attempt: Attempt, answer: Answer) -> None:
+        counts[answer.state] += 1
+        if answer.state is not DeliveryState.CONFIRMED:
+            words = f"{attempt.receiver}: {attempt.key} {answer.state}, {answer.text}"
+            output.progress(printable(words))
+
+    courier = Courier(url, receivers, SCHEMA_VERSION, report, output.progress)
+    with closing(courier), stop_on_signal() as stop:
+        names = ", ".join(each.name for each in receivers)
+        output.progress(f"delivers to {names}{'' if once else ' until Ctrl-C'}")
+        courier.deliver(stop, once=once)
+    made = ", ".join(f"{count:,} {state}" for state, count in sorted(counts.items()))
+    output.result(f"attempts: {made or 'none'}")
+    code = ExitCode.OK if once and not stop() else ExitCode.INTERRUPTED
+    return output.document(PlantDeliverDocument(dict(counts)), exit_code=code)
+
+
+# -- deliveries ------------------------------------------------------------------------------------
+
+
+def deliveries(
+    output: Output,
+    url: str,
+    chosen: Mapping[str, str | None],
+    limit: int,
+    *,
+    resend: bool,
+    stop: str | None,
+) -> int:
+    key, receiver = chosen["key"], chosen["receiver"]
+    has_filter = any(value is not None for value in chosen.values())
+    if resend and not has_filter:
+        raise UsageError(
+            "--resend would send every run again.",
+            remedy="Choose which: --state refused, --serial SERIAL, --key KEY or --receiver NAME.",
+        )
+    with closing(Central(url)) as central:
+        found = Deliveries(central)
+        if stop is not None:
+            found.stop(stop)
+            output.progress(printable(f"{stop} gets no run that arrives from now on"))
+        receivers = found.receivers()
+        if receiver is not None and receiver not in {each.name for each in receivers}:
+            raise unknown_receiver(receiver)
+        rows = found.listed(None if resend else limit, **chosen)
+        if resend:
+            for name in dict.fromkeys(row.receiver for row in rows):
+                found.send_again(name, [row.key for row in reversed(rows) if row.receiver == name])
+            rows = found.listed(None, **{**chosen, "state": None})[:limit]
+        document = found.document(key, SCHEMA_VERSION) if key is not None and rows else None
+    output.results(_receiver_lines(receivers))
+    output.results(printable(line) for row in rows for line in _lines(row))
+    if resend:
+        output.result(f"{counted(len(rows), 'run')} will be sent again")
+    return output.document(PlantDeliveriesDocument(receivers, rows, document))
+
+
+def _receiver_lines(receivers: list[ReceiverStatus]) -> Iterator[str]:
+    for each in receivers:
+        counts = ", ".join(f"{count:,} {state}" for state, count in sorted(each.counts.items()))
+        since = f"since {each.since:%Y-%m-%d %H:%M}"
+        stopped = "" if each.stopped_at is None else f", STOPPED {each.stopped_at:%Y-%m-%d %H:%M}"
+        yield f"{each.name}: {counts or 'no runs'}, {since}{stopped}"
+        if each.oldest_open_at is not None:
+            yield f"  the oldest open one arrived {each.oldest_open_at:%Y-%m-%d %H:%M:%S}"
+    if not receivers:
+        yield "no receivers: flasher plant deliver --receivers FILE --database URL adds them"
+
+
+def _lines(row: Delivery) -> Iterator[str]:
+    nature = ", VIRTUAL" if row.is_virtual else ""
+    yield f"{row.serial}, {row.outcome}{nature}, {row.station}: {row.state} to {row.receiver}"
+    yield f"  key {row.key}"
+    tried = counted(row.attempts, "attempt")
+    later = "" if row.next_at is None else f", next at {row.next_at:%H:%M:%S}"
+    yield f"  {tried}{later}{': ' if row.answer else ''}{row.answer}"
+
+
+# -- reconcile -------------------------------------------------------------------------------------
+
+
+def reconcile(output: Output, url: str, receiver: str, file: Path, *, resend: bool) -> int:
+    listed = read_list(file)
+    with closing(Central(url)) as central:
+        found = Deliveries(central)
+        if receiver not in {each.name for each in found.receivers()}:
+            raise unknown_receiver(receiver)
+        result = compare(receiver, listed, found.keys(receiver))
+        if resend:
+            found.send_again(receiver, result.missing)
+    output.results(_differences(result))
+    if resend and result.missing:
+        output.result(f"{counted(len(result.missing), 'run')} will be sent again")
+    code = ExitCode.OK if result.agrees else ExitCode.VERIFICATION
+    return output.document(result, exit_code=code)
+
+
+def _differences(found: Reconciliation) -> Iterator[str]:
+    for what, keys in (
+        ("confirmed, but missing there", found.missing),
+        ("more than once there", found.doubled),
+        ("there, but unknown here", found.unknown),
+        ("there, but not confirmed yet", found.unconfirmed),
+    ):
+        if keys:
+            yield f"{counted(len(keys), 'run')} {what}:"
+            yield from (printable(f"  {key}") for key in keys[:_SHOWN_MAX])
+        if len(keys) > _SHOWN_MAX:
+            yield f"  and {len(keys) - _SHOWN_MAX:,} more (--json lists them)"
+    ending = "agree" if found.agrees else "DIFFER"
+    rows = counted(found.listed, "row")
+    yield f"{rows} of the list and {found.delivered:,} confirmed runs: they {ending}"
