@@ -38,7 +38,15 @@ from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import RunState
-from flasher.station.socket import Binding, LastRun, Occupancy, Socket, SocketPhase, Source
+from flasher.station.socket import (
+    PLANT_ASKED,
+    Binding,
+    LastRun,
+    Occupancy,
+    Socket,
+    SocketPhase,
+    Source,
+)
 
 _COMMAND_MAX: Final = 200
 
@@ -254,6 +262,8 @@ def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
     `waiting`: the waiting scan of the same source.
     """
     for each in sockets.values():
+        if each.label == serial and each.asked == serial:
+            raise Refused("DOUBLE_SCAN", text("It was scanned already."), PLANT_ASKED)
         if each.label == serial:
             remedy = text(
                 "{wanted} If it is there, scan SOCKET {socket}, then the label.",

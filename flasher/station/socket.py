@@ -39,6 +39,7 @@ PIPE: Final = Source("standard input")
 FILE: Final = Source("file of scans")
 UNNAMED: Final = Source()
 """The source of a program that has only one."""
+PLANT_ASKED: Final = text("The plant is asked about this unit.")
 _SHOWN: Final = {
     TERMINAL.name: text("terminal"),
     PIPE.name: text("standard input"),
@@ -361,7 +362,7 @@ class Socket:
         if stopped is not None:
             return SocketState.STOPPED, "", stopped.reason
         if self.label and self.label == self.asked:
-            return SocketState.STARTING, self.label, text("The plant is asked about this unit.")
+            return SocketState.STARTING, self.label, PLANT_ASKED
         if self.label:
             own = printable(self.own or "")
             wanted = self.wanted

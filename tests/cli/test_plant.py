@@ -471,3 +471,45 @@ def test_a_spare_pc_continues_a_station_with_its_export(exported: Export) -> Non
     assert "taken-over" in flasher("plant", "send", "--sockets", exported.spare).err
     assert flasher("plant", "verify", "--database", url).code == ExitCode.OK
     assert PASSWORD not in run.out + shown.out + back.out
+
+
+def test_check_compares_the_clocks(flasher: Flasher, plant: Plant, tmp_path: Path) -> None:
+    file = tmp_path / "station.toml"
+    words = ("station", "check", write_recipe(tmp_path, USUAL), "--sockets", file)
+    file.write_text(STATION.format(plant=plant.url("flasher_line_2")), encoding="utf-8")
+    run = flasher(*words, "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, run.code)
+    assert abs(run.document["clock_offset_s"]) < 5.0
+    assert "differs by" in flasher(*words).out
+    file.write_text(STATION.format(plant="postgresql://x@127.0.0.1:1/plant"), encoding="utf-8")
+    run = flasher(*words)
+    assert run.code == ExitCode.OK
+    assert "warning: the clock was not compared with the plant's" in run.err
+    write_recipe(tmp_path, USUAL + '\n[plant]\nclock = "stop"\n')
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert "The clock was not compared" in run.err
+    write_recipe(tmp_path, USUAL + '\n[plant]\nclock = "stop"\nclock_unknown = "allow"\n')
+    assert flasher(*words).code == ExitCode.OK
+    file.write_text(STATION.format(plant=plant.url("flasher_line_2")), encoding="utf-8")
+    write_recipe(tmp_path, USUAL + '\n[plant]\nclock = "stop"\nclock_offset_max_s = 1e-9\n')
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert "Set the clock" in run.err
+
+
+def test_status_lists_units_that_passed_twice(
+    flasher: Flasher, plant: Plant, sender: Sender
+) -> None:
+    other = plant.sender("line-3")
+    for each in (sender, other):
+        each.bench.make()
+        each.send()
+    other.close()
+    run = flasher("plant", "status", "--database", plant.url(), "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, run.code)
+    (found,) = run.document["passed_twice"]
+    assert (found["first"]["station"], found["second"]["station"]) == ("line-2", "line-3")
+    for action in ("status", "report"):
+        shown = flasher("plant", action, "--database", plant.url()).out
+        assert "passed at two stations: 1 unit" in shown

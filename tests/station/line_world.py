@@ -24,7 +24,7 @@ from flasher.station.events import (
 )
 from flasher.station.line import Line
 from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged
-from flasher.station.records.model import Order, RunState
+from flasher.station.records.model import Admission, Order, RunState
 from flasher.station.socket import Binding, Socket
 from tests.station.line_inputs import RESULT, begun, saved
 
@@ -72,6 +72,8 @@ class World:
     seed: int
     sockets: tuple[str, ...] = SOCKETS
     make: Callable[..., Line] = Line
+    asks_plant: bool = False
+    """A plant is asked before each run; it answers after up to 15 s."""
     now: float = 0.0
     story: list[str] = field(default_factory=list)
     seen: Counter[str] = field(default_factory=Counter)
@@ -111,7 +113,12 @@ class World:
         interrupted = {name: bay.run for name, bay in self.bays.items() if bay.run}
         interrupted |= {name: label for name, (label, _) in self.open.items()}
         self.open.clear()
-        self.line = self.make([Socket(name) for name in self.sockets], check_serial, operator="jo")
+        more = {"asks_plant": True} if self.asks_plant else {}
+        self.asked: list[tuple[float, Order]] = []
+        """What the plant will answer, and when."""
+        self.line = self.make(
+            [Socket(name) for name in self.sockets], check_serial, operator="jo", **more
+        )
         for name, label in interrupted.items():
             self.line.sockets[name].interrupted = label
             self.runs[label] = RunState.INTERRUPTED
@@ -132,8 +139,19 @@ class World:
                     bay.differs_since = self.now
                 elif self.now - bay.differs_since >= 0.5:
                     self.settle(name)
+            self.answer()
         self.line.tick(self.now)
         self.write_planned()
+
+    def answer(self) -> None:
+        """The plant answers what is due."""
+        due = [each for each in self.asked if each[0] <= self.now]
+        for each in due:
+            self.asked.remove(each)
+            self.note(f"the plant answers for {each[1].serial}")
+            self.way = self.way or "card"
+            self.line.answered(each[1], Admission(), self.now)
+            self.write_planned()
 
     def note(self, what: object) -> None:
         """For whoever looks for the cause of a failure."""
@@ -161,6 +179,8 @@ class World:
                 match effect:
                     case Order(serial, socket):
                         self.claim(socket, serial)
+                    case line.AskPlant(order):
+                        self.asked.append((self.now + self.chance.uniform(0.0, 15.0), order))
                     case line.SaveAgain(sockets):
                         saved = [self.save(name) for name in sockets]
                         self.line.resumed(self.now, all_saved=all(saved))
@@ -169,7 +189,6 @@ class World:
                         | line.CheckPin()
                         | line.Reprint()
                         | line.Audit()
-                        | line.AskPlant()
                         | line.DropAdmission()
                     ):
                         pass

@@ -14,7 +14,7 @@ from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
 from flasher.station.messages import AdapterReady, PresenceChanged, RunResult
-from flasher.station.records.model import RunState
+from flasher.station.records.model import Admission, Order, RunState
 from flasher.station.socket import Binding, Occupancy, Socket, SocketPhase, Source
 from tests.loops import each
 from tests.station.line_inputs import saved
@@ -26,11 +26,11 @@ STEPS = 100
 Plant = Callable[[pytest.MonkeyPatch], None]
 
 
-def walks(sockets: tuple[str, ...], steps: int) -> Counter[str]:
+def walks(sockets: tuple[str, ...], steps: int, *, asks_plant: bool = False) -> Counter[str]:
     """Walk; what was seen. Raises AssertionError with the way to what must not be."""
     seen: Counter[str] = Counter()
     for seed in range(steps // STEPS):
-        world = World(seed, sockets)
+        world = World(seed, sockets, asks_plant=asks_plant)
         try:
             Walk(world).go(STEPS)
         except AssertionError as error:
@@ -47,6 +47,26 @@ def test_no_label_runs_on_another_unit_and_nobody_is_stuck(sockets: tuple[str, .
     if len(sockets) > 1:
         ways = ("named", "card", "said by the unit")
         assert all(seen[way] > 20 for way in ways), seen
+
+
+def test_a_unit_that_is_exchanged_while_the_plant_is_asked_is_not_run() -> None:
+    assert walks(("A", "B", "C"), 5_000, asks_plant=True)["run"] > 300
+
+
+def test_a_line_that_does_not_look_again_after_the_answer_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def answered(self: Line, order: Order, admission: Admission, now: float) -> None:
+        socket = self.sockets[order.socket]
+        socket.asked = ""
+        if socket.phase is SocketPhase.REST and socket.can_work:
+            socket.label = order.serial
+            self._begin(socket, admission)
+        self._go_on(now)
+
+    monkeypatch.setattr(Line, "answered", answered)
+    with pytest.raises(AssertionError, match="runs on the unit of"):
+        walks(("A", "B", "C"), 5_000, asks_plant=True)
 
 
 # -- faults that the steps have to find -----------------------------------------------------------

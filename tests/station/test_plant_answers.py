@@ -127,6 +127,15 @@ def test_another_label_during_the_question_waits_for_its_own_answer(plant: Plant
     assert plant.line.order("A").serial == "W2605003"
 
 
+def test_who_scans_again_while_the_plant_is_asked_learns_it(plant: Plant) -> None:
+    plant.scan()
+    plant.line.bench.clock.go_on(3.0)
+    plant.line.scan(SERIAL)
+    assert plant.line.last(ScanRefused).remedy == "The plant is asked about this unit."
+    plant.answer()
+    assert plant.line.state("A") is SocketState.RUNNING
+
+
 def test_a_line_that_stops_meanwhile_begins_nothing(plant: Plant) -> None:
     plant.scan()
     plant.line.station.line.stop("TEST", "stopped", "go on")
