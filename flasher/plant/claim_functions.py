@@ -45,7 +45,11 @@ BEGIN
         SELECT 'passed', n.name, s.name, r.begun_at::timestamptz, c.run_number
             INTO state, station, socket, at, run
             FROM unit u JOIN run r ON r.unit_id = u.id
-                JOIN chain_row c ON c.run_id = r.id AND c.content IS NOT NULL
+                JOIN (
+                    SELECT o.run_id, o.station, o.run_number FROM chain_row o
+                        WHERE o.content IS NOT NULL
+                    UNION ALL SELECT k.run_id, k.station, k.run_number FROM kept_run k
+                ) c ON c.run_id = r.id
                 JOIN socket s ON s.id = r.socket_id JOIN station n ON n.id = s.station_id
             WHERE u.part = of_part AND u.serial = of_serial AND r.state = 'PASS'
                 AND r.kind <> '{RunKind.GOLDEN}' AND r.is_virtual = of_virtual

@@ -270,6 +270,7 @@ CREATE UNIQUE INDEX artifact_as_stated ON artifact (sha256, target, name, versio
 ALTER TABLE recipe DROP CONSTRAINT recipe_sha256_key;
 CREATE UNIQUE INDEX recipe_as_stated ON recipe (sha256, name, revision, part,
     verification_required, allow_completed_not_read_back, md5(content));
+CREATE INDEX attachment_by_sha256 ON attachment (sha256);
 CREATE VIEW audit AS SELECT id, station_id, number, at, event, run_id, data, previous_hash, hash,
     signature FROM chain_row;
 {"".join(f"ALTER TABLE {table} ENABLE ROW LEVEL SECURITY;" for table in _GUARDED)}

@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "5"
+PLANT_SCHEMA: Final = "6"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -232,6 +232,46 @@ plant_delivery: Final = Table(
 
 plant_queue: Final = Table("plant_queue", metadata, Column("migration", Text, primary_key=True))
 """The last of Procrastinate's own migrations that its tables have."""
+
+archive_file: Final = Table(
+    "archive_file",
+    metadata,
+    Column("name", Text, primary_key=True),
+    Column("month", Text, nullable=False),
+    Column("sha256", Text, nullable=False),
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("written_at", DateTime(timezone=True), nullable=False),
+)
+"""A file with the records of a month that `flasher plant retire` took out of this database."""
+
+archive_chain: Final = Table(
+    "archive_chain",
+    metadata,
+    Column("station", Uuid, nullable=False),
+    Column("last", BigInteger, nullable=False),
+    Column("first", BigInteger, nullable=False),
+    Column("name", Text, nullable=False),
+    Column("records_id", Text, nullable=False),
+    Column("previous_hash", Text, nullable=False),
+    Column("hash", Text, nullable=False),
+    Column("keys", JSON, nullable=False),
+    Column("file", Text, nullable=False),
+    PrimaryKeyConstraint("station", "last"),
+)
+"""The audit rows `first` to `last` of a chain are in a file: the hashes before and after them, and
+the public keys up to the last row."""
+
+kept_run: Final = Table(
+    "kept_run",
+    metadata,
+    Column("run_id", BigInteger, primary_key=True, autoincrement=False),
+    Column("station", Uuid, nullable=False),
+    Column("run_number", BigInteger, nullable=False),
+    Column("file", Text, nullable=False),
+    Index("kept_run_of_file", "file", "station", "run_number"),
+)
+"""A retired run that stays, because it is the last one of its unit, or made its last transfer: the
+run itself, its targets and its writes. All of it is in the file."""
 
 OWN_PARTS: Final = (
     "run", "unit", "targets", "steps", "measurements", "writes", "attachments",

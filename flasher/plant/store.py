@@ -6,15 +6,17 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import fields
+from datetime import datetime
 from pathlib import Path
 from typing import Final, NoReturn
 
 from platformdirs import user_cache_path
-from sqlalchemy import Connection, select, text
+from sqlalchemy import Connection, func, select, text
 
 from flasher.errors import UsageError
+from flasher.plant.archive import month_after
 from flasher.plant.central import plant_location
-from flasher.plant.schema import trace
+from flasher.plant.schema import archive_file, trace
 from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
@@ -28,6 +30,7 @@ from flasher.station.records.model import (
     RunId,
     StationClock,
     StepName,
+    utc_moment,
 )
 from flasher.station.records.queries import Records
 from flasher.station.records.store import Store
@@ -132,6 +135,13 @@ class PlantStore(Store):
         """The newest units that passed at two stations. Raises RecordError."""
         with self.database.reading() as connection:
             return passed_twice(connection, limit)
+
+    def figures_begin(self) -> datetime | None:
+        """What was retired has no figures: of its runs only the last ones of units stay."""
+        query = select(func.max(archive_file.c.month))
+        with self.database.reading() as connection:
+            month = connection.execute(query).scalar_one()
+        return None if month is None else utc_moment(f"{month_after(month)}-01T00:00:00Z")
 
     def examine_run(self, run_id: RunId) -> RunExamination:
         _refuse_certificate()

@@ -7,24 +7,28 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 from uuid import UUID
 
 from sqlalchemy import Connection, func, select
 
 from flasher.i18n import text
-from flasher.plant.schema import OWN_PARTS, SHARED_PARTS, chain_row, shared_part
+from flasher.plant.archive import ArchivedChain
+from flasher.plant.archive_check import ArchiveExaminer, assembled, without_ids
+from flasher.plant.retire import last_archived, recorded_chains
+from flasher.plant.schema import SHARED_PARTS, archive_file, chain_row, kept_run, shared_part
 from flasher.plant.store import PlantStore
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
+from flasher.station.records.errors import RecordError
 from flasher.station.records.examination import (
     Examiner,
-    RunDigests,
     Trail,
     same_traces,
 )
-from flasher.station.records.model import Problem, RunDetails, RunId, WriteId
-from flasher.station.records.queries import details_of_content, is_whole
+from flasher.station.records.model import Problem
+from flasher.station.records.queries import is_whole
 from flasher.station.records.rows import batches
 from flasher.station.records.signatures import fingerprint
 
@@ -34,11 +38,12 @@ _UNSENT: Final = (
     .outerjoin(
         chain_row, (chain_row.c.run_id == schema.run.c.id) & chain_row.c.content.is_not(None)
     )
-    .where(chain_row.c.id.is_(None))
+    .outerjoin(kept_run, kept_run.c.run_id == schema.run.c.id)
+    .where(chain_row.c.id.is_(None), kept_run.c.run_id.is_(None))
     .order_by(schema.run.c.id)
     .limit(_AT_ONCE)
 )
-"""Runs that no chain has."""
+"""Runs that no chain and no file has."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +69,25 @@ class PlantExamination:
     """Number of runs that were compared with their audit rows."""
     traces: int
     """Number of PASS that were compared with their traces."""
+    archives: tuple[str, ...]
+    """Files of retired months that were examined."""
+    unexamined: tuple[str, ...]
+    """Files of retired months that were not."""
 
 
 class PlantExaminer(Examiner):
     """Examines a plant's database once."""
 
-    def __init__(self, store: PlantStore, progress: Callable[[int, int], None]) -> None:
+    def __init__(
+        self,
+        store: PlantStore,
+        progress: Callable[[int, int], None],
+        archives: Path | None = None,
+    ) -> None:
+        """`archives`: folder of the files of retired months."""
         super().__init__(store.database, store.files, store.signer.key_locations, progress)
         self._runs = 0
+        self._folder = archives
 
     def examine_plant(self) -> PlantExamination:
         """Examine everything. Raises RecordError."""
@@ -112,6 +128,17 @@ class PlantExaminer(Examiner):
                 for run_id in connection.execute(_UNSENT).scalars()
             )
             problems += same_traces(connection)
+            files = recorded_chains(connection)
+            problems += _gaps(files)
+        examined = [] if self._folder is None else [*files]
+        for name in examined:
+            problems += self._archive(name, files[name])
+        unexamined = () if self._folder is not None else tuple(files)
+        if unexamined:
+            self._remarks.append(
+                f"{len(unexamined)} files of retired months were not examined, nor the runs that"
+                " stayed of them: name their folder with --archive"
+            )
         if self._nameless:
             self._remarks.append(
                 f"{self._nameless} PASS of devices that report no serial number: their traces do"
@@ -119,8 +146,27 @@ class PlantExaminer(Examiner):
             )
         stations.sort(key=lambda each: each.station)
         return PlantExamination(
-            tuple(problems), tuple(self._remarks), tuple(stations), self._runs, self._traces
-        )
+            tuple(problems), tuple(self._remarks), tuple(stations), self._runs, self._traces,
+            tuple(examined), unexamined,
+        )  # fmt: skip
+
+    def _archive(self, name: str, chains: Sequence[ArchivedChain]) -> Iterator[Problem]:
+        """Examine a file of a retired month."""
+        assert self._folder is not None  # noqa: S101  or none is examined
+        with self._database.reading() as connection:
+            query = select(archive_file.c.sha256).where(archive_file.c.name == name)
+            stated = connection.execute(query).scalar_one_or_none()
+        examiner = ArchiveExaminer(self._database, self._folder / name, chains, self._progress)
+        try:
+            found = examiner.examine_file()
+        except RecordError as error:
+            yield Problem(printable(name), error.what)
+            return
+        yield from found.problems
+        if found.sha256 != stated:
+            yield Problem(printable(name), "it is not the file that was written: its hash differs")
+        self._runs += found.runs
+        self._traces += found.traces
 
     def _station(
         self, connection: Connection, station: UUID, trail: Trail, records_id: str
@@ -151,37 +197,18 @@ class PlantExaminer(Examiner):
             chain_row.c.station == station, chain_row.c.run_number.in_(numbers)
         )
         rows = connection.execute(query.order_by(chain_row.c.number)).mappings().all()
-        stated: dict[int, RunDigests] = defaultdict(RunDigests)
-        contents: dict[int, dict[str, Any]] = {}
-        central: dict[int, int] = {}
-        missing: set[int] = set()
-        digests = {row["number"]: chain.data_of(row["data"]).get("digests", {}) for row in rows}
-        parts = _parts(connection, station, digests.values())
-        for row in rows:
-            number, of_row = row["run_number"], digests[row["number"]]
-            if row["event"] == chain.CLAIMED:
-                stated[number].claim = of_row
-            if row["content"] is None:
-                continue
-            stated[number].ending = of_row
-            central[number] = row["run_id"]
-            named = {name: parts.get(of_row.get(name, ""), _NOTHING) for name in SHARED_PARTS}
-            own = {name: row["content"].get(name) for name in OWN_PARTS}
-            if any(each is _NOTHING for each in named.values()) or None in own.values():
-                missing.add(number)
-                continue
-            content = own | named
-            content[chain.CLAIM] = chain.claim_of({"run": own["run"], "targets": own["targets"]})
-            contents[number] = content
-        for number in missing:
+        digests = [chain.data_of(row["data"]).get("digests", {}) for row in rows]
+        found = assembled(rows, _parts(connection, station, digests))
+        central = {row["run_number"]: row["run_id"] for row in rows if row["content"] is not None}
+        for number in found.incomplete:
             yield Problem(text("run {run_id}", run_id=number), "a part of it is missing")
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-        yield from self._contents(contents, stated, changed)
+        yield from self._contents(found.contents, found.stated, changed)
         for (part, _), of_runs in changed.items():
             what = f"changed after it was recorded: {chain.NAMED[part]}"
             yield Problem(text("run {run_id}", run_id=of_runs[0]), what)
-        yield from self._projected(connection, contents, central)
-        self._runs += len(contents)
+        yield from self._projected(connection, found.contents, central)
+        self._runs += len(found.contents)
 
     def _projected(
         self, connection: Connection, contents: Mapping[int, Any], central: Mapping[int, int]
@@ -192,18 +219,28 @@ class PlantExaminer(Examiner):
             found = shown.get(central[number])
             if found is None or not is_whole(found):
                 what = "reports and pages do not have it as a whole"
-            elif _without_ids(found) != _without_ids(content):
+            elif without_ids(found) != without_ids(content):
                 what = "what reports and pages show differs from what the station signed"
             else:
                 continue
             yield Problem(text("run {run_id}", run_id=number), what)
 
 
-_NOTHING: Final = object()
+def _gaps(files: Mapping[str, Sequence[ArchivedChain]]) -> Iterator[Problem]:
+    """Files of a chain that do not continue one another."""
+    chains = sorted((each for some in files.values() for each in some), key=lambda each: each.last)
+    ends: dict[UUID, ArchivedChain] = {}
+    for each in chains:
+        before = ends.get(each.station)
+        last, last_hash = (0, chain.GENESIS) if before is None else (before.last, before.hash)
+        if (each.first - 1, each.previous_hash) != (last, last_hash):
+            what = f"the files of retired months do not continue at row {each.first}"
+            yield Problem(f"audit trail of {printable(each.name)}", what)
+        ends[each.station] = each
 
 
 def _parts(connection: Connection, station: UUID, digests: Any) -> Mapping[str, Any]:
-    """Shared parts of a station by their digest; `_NOTHING` for a missing one."""
+    """Shared parts of a station by their digest."""
     wanted = {each[name] for each in digests for name in SHARED_PARTS if name in each}
     found: dict[str, Any] = {}
     for some in batches(wanted):
@@ -216,7 +253,11 @@ def _parts(connection: Connection, station: UUID, digests: Any) -> Mapping[str, 
 
 
 def _begun(connection: Connection, station: UUID) -> tuple[Trail, str]:
-    """The chain's station and records, as its first row states them."""
+    """The chain's station and records, as its first row states them, or its part in files."""
+    retired = last_archived(connection, station)
+    if retired.last:
+        keys = list(retired.keys)
+        return Trail(retired.name, retired.last, retired.hash, keys=keys), retired.records_id
     query = select(chain_row.c.data).where(chain_row.c.station == station, chain_row.c.number == 1)
     data = chain.data_of(connection.execute(query).scalar_one_or_none() or "")
     return Trail(str(data.get("station", station))), str(data.get("records", ""))
@@ -225,15 +266,6 @@ def _begun(connection: Connection, station: UUID) -> tuple[Trail, str]:
 def _station_of(records_id: str, name: str) -> UUID:
     """As the function `plant_enter` computes it."""
     return UUID(hashlib.sha256(f"{records_id} {name}".encode()).hexdigest()[:32])
-
-
-def _without_ids(content: Mapping[str, Any]) -> RunDetails:
-    details = details_of_content(content, content["recipe"])
-    return replace(
-        details,
-        run=replace(details.run, run_id=RunId(0)),
-        writes=tuple(replace(each, write_id=WriteId(0)) for each in details.writes),
-    )
 
 
 def _fingerprint(key: str) -> str:

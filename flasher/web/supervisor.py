@@ -69,6 +69,8 @@ from flasher.web.query_processes import RUN, Answer, Question
 
 USUAL_DAYS: Final = 30
 """Default period of pages with figures: this number of days with runs."""
+MEASURED_DAYS: Final = 1
+"""Default period of measurements: no sums are kept of them."""
 CAUSES_DRAWN: Final = 12
 _HOURS_UP_TO: Final = timedelta(days=2)
 _DAYS_UP_TO: Final = timedelta(days=62)
@@ -325,8 +327,8 @@ class SupervisorPages:
             "stations": self.store.read.stations(),
         }
 
-    def _figured(self, question: Question) -> tuple[RunFilter, Span]:
-        """Filter and period of a page with figures."""
+    def _figured(self, question: Question, days: int = USUAL_DAYS) -> tuple[RunFilter, Span]:
+        """Filter and period of a page with figures; by default the last `days`."""
         chosen = filter_of(question)
         # The newest run of the filter is the last of any period, or the period has none.
         last = None if chosen.until else self.overview.last_begin(replace(chosen, since=None))
@@ -335,7 +337,8 @@ class SupervisorPages:
         end = chosen.until or last or self.now()
         if chosen.until is None:
             end += timedelta(microseconds=1)
-        begin = chosen.since or end - timedelta(days=USUAL_DAYS)
+        begin = chosen.since or end - timedelta(days=days)
+        begin = max(begin, self.store.figures_begin() or begin)
         return replace(chosen, since=begin, until=end), Span(begin, end)
 
     def yields(self, question: Question) -> Answer:
@@ -425,7 +428,7 @@ class SupervisorPages:
 
     def measurements(self, question: Question) -> Answer:
         translate = translator(question.language)
-        chosen, span = self._figured(question)
+        chosen, span = self._figured(question, MEASURED_DAYS)
         return self._page(
             question,
             "measurements.html",
@@ -440,7 +443,7 @@ class SupervisorPages:
         )
 
     def file_of_measurements(self, question: Question) -> Answer:
-        report = Report(self.store.read, self._figured(question)[0])
+        report = Report(self.store.read, self._figured(question, MEASURED_DAYS)[0])
         made = report.to_measurements_csv()
         return Answer(made.encode("utf-8"), _CSV, file_name="measurements.csv")
 

@@ -13,17 +13,30 @@ are no traces. `--more` runs are then sent by the forwarder of a station of its 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import psycopg
 
 from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
 from flasher.plant.setup import create_database, role_of, setup
+from flasher.plant.store import PlantStore
+from flasher.station.records.keys import KeyLocations
+from flasher.station.records.newest import PageCursor
+from flasher.station.records.overview import Overview
+from flasher.station.records.rollup import Rollup
+from flasher.station.shift_counts import DEFAULT_SHIFTS
+from flasher.web.plant import PlantPages
+from flasher.web.query_processes import Question
+from flasher.web.supervisor import open_supervisor
 from tests.benchmarks.bulk_records import RUNS_A_DAY as RUNS_A_DAY_OF_ONE
 from tests.benchmarks.bulk_records import fill
 from tests.station.factory import Bench, _begun_records
@@ -102,6 +115,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--runs", type=int, default=1_000_000)
     parser.add_argument("--more", type=int, default=2000)
+    parser.add_argument("--sums", action="store_true", help="make the daily sums of the pages")
     options = parser.parse_args()
     programs = find_programs()
     if programs is None:
@@ -114,6 +128,46 @@ def main() -> None:
         setup(url, (), datetime.now(UTC))
         if options.more:
             _send(url, options.more)
+        _measure(url, options.folder / "desk", with_sums=options.sums)
+
+
+def _measure(url: str, folder: Path, *, with_sums: bool) -> None:
+    pages = open_supervisor(url, folder, KeyLocations(), DEFAULT_SHIFTS, PlantStore, PlantPages)
+    with closing(pages.store), psycopg.connect(url, autocommit=True) as admin:
+        query = "SELECT count(*), pg_size_pretty(pg_database_size(current_database())) FROM run"
+        ((runs, size),) = admin.execute(query.encode()).fetchall()
+        print(f"{runs:,} runs, {size}", flush=True)
+        overview = Overview(pages.store.database)
+        for image in overview.images():
+            what = f"units of the image {image.sha256[:8]}, 1,000 of {{}}"
+            took_s, found = _timed(partial(overview.holders, image.sha256, PageCursor(), 1000))
+            print(f"{took_s:7.3f} s  {what.format(len(found.rows))}", flush=True)
+        if with_sums:
+            sums, began_s = Rollup(pages.store.database), time.perf_counter()
+            while sums.add(datetime.now(UTC)):
+                pass
+            print(f"{time.perf_counter() - began_s:7.1f} s  daily sums made", flush=True)
+        of_one = {"station": "hall-7"}
+        for path, fields in (
+            ("/stations", {}), ("/yield", {}), ("/yield", of_one),
+            ("/yield", {"from": "2020-01-01"}), ("/images", {}), ("/runs", {}),
+            ("/runs", of_one), ("/times", {}), ("/measurements", {}),
+            ("/measurements", of_one), ("/audit", {}),
+        ):  # fmt: skip
+            question = Question(path, fields)
+            first_s, _ = _timed(partial(pages.answer, question))
+            took_s, answer = _timed(partial(pages.answer, question))
+            print(
+                f"{took_s:7.3f} s  {answer.status} {path} {fields or ''} (first {first_s:.3f} s)",
+                flush=True,
+            )
+            assert answer.status in (200, 503), answer.body
+
+
+def _timed(ask: Callable[[], Any]) -> tuple[float, Any]:
+    began_s = time.perf_counter()
+    found = ask()
+    return time.perf_counter() - began_s, found
 
 
 def _fill(url: str, runs: int) -> None:
@@ -158,14 +212,31 @@ def _send(url: str, runs: int) -> None:
             bench.opened().database, bench.store.files, central, "line-2", bench.clock
         )
         with closing(forwarder):
-            began_s = time.perf_counter()
+            began_s, own_s = time.perf_counter(), time.process_time()
             while forwarder.forward():
                 pass
-            took_s = time.perf_counter() - began_s
+            took_s, own_s = time.perf_counter() - began_s, time.process_time() - own_s
+            server_s = _cpu_s(url, role)
         if forwarder.error is not None:
             raise forwarder.error
         bench.store.close()
-    print(f"{runs:,} runs sent: {runs / took_s:,.0f} runs/s", flush=True)
+    print(
+        f"{runs:,} runs sent: {runs / took_s:,.0f} runs/s; CPU a run: {own_s / runs * 1000:.1f} ms"
+        f" of the forwarder, {server_s / runs * 1000:.1f} ms of the server",
+        flush=True,
+    )
+
+
+def _cpu_s(url: str, role: str) -> float:
+    """CPU time of the server's processes for a role."""
+    with psycopg.connect(url) as admin:
+        query = "SELECT pid FROM pg_stat_activity WHERE usename = %s"
+        pids = [pid for (pid,) in admin.execute(query, [role])]
+    ticks = 0
+    for pid in pids:
+        fields = Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

@@ -513,3 +513,40 @@ def test_status_lists_units_that_passed_twice(
     for action in ("status", "report"):
         shown = flasher("plant", action, "--database", plant.url()).out
         assert "passed at two stations: 1 unit" in shown
+
+
+def test_retire_moves_months_to_files_that_verify_examines(
+    flasher: Flasher, plant: Plant, sender: Sender
+) -> None:
+    sender.bench.make()
+    sender.bench.clock.go_on(40 * 86_400.0)
+    sender.bench.make(serial="W2605003")
+    sender.send()
+    folder = plant.folder / "archive"
+    words = ("plant", "retire", "--database", plant.url(), "--archive", folder)
+    assert "either --before or --keep-months" in flasher(*words).err
+    assert "is not a month" in flasher(*words, "--before", "2026").err
+    shown = flasher(*words, "--before", "2026-06", "--dry-run")
+    assert (shown.code, shown.out) == (ExitCode.OK, "2026-05: 4 rows, 1 run\n")
+    assert not folder.exists()
+    reader = (*words[:3], plant.url("flasher_desk"), *words[4:])
+    refused = flasher(*reader, "--before", "2026-06")
+    assert refused.code == ExitCode.USAGE
+    assert "Only the owner" in refused.err
+    run = flasher(*words, "--before", "2026-06")
+    assert run.code == ExitCode.OK, run.err
+    assert run.out.startswith("2026-05: 4 rows, 1 run, 1 trace in flasher-")
+    again = flasher(*words, "--before", "2026-06", "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), again.out, again.code)
+    assert again.document["months"] == []
+    verify = ("plant", "verify", "--database", plant.url("flasher_desk"))
+    assert "1 files of retired months were not examined" in flasher(*verify).err
+    both = flasher(*verify, "--archive", folder)
+    assert both.code == ExitCode.OK
+    assert "  1 file of retired months, too" in both.out.splitlines()
+    report = flasher("plant", "report", "--database", plant.url("flasher_desk"))
+    assert "runs before 2026-06-01 are retired" in report.err
+    units = flasher(
+        "plant", "units", "--database", plant.url("flasher_desk"), "--image", BMS_SHA256
+    )
+    assert units.out.splitlines()[-1] == "2 units"

@@ -31,6 +31,10 @@ ATTEMPTS = {
     "empty the chains": ("TRUNCATE chain_row", DENIED),
     "empty the runs": ("TRUNCATE run CASCADE", DENIED),
     "delete traces": ("DELETE FROM trace", DENIED),
+    "retire the records of others": ("DELETE FROM kept_run", DENIED),
+    "state that its chain is in a file": (
+        "INSERT INTO archive_chain VALUES ('{theirs}', 1, 1, '', '', '', '', '[]', '')", DENIED,
+    ),
     "add a run beside the chain": (
         "INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W2605099')", DENIED,
     ),

@@ -38,6 +38,7 @@ examples:
   flasher plant verify --database postgresql://reader@plant-db/flasher
   flasher plant publish recipe.toml --station line-2 --database postgresql://anna@plant-db/flasher
   flasher plant recipes --database postgresql://reader@plant-db/flasher
+  flasher plant retire --database postgresql://owner@plant-db/flasher --archive DIR --keep-months 24
   flasher plant send --sockets sockets.toml
   flasher plant deliver --receivers receivers.toml --database postgresql://courier@plant-db/flasher
   flasher plant deliveries --state refused --database postgresql://reader@plant-db/flasher
@@ -157,11 +158,56 @@ def status(output: Output, bounds: BoundsOptions, database: str) -> int:
 
 @plant.action("verify")
 @_database_option
-def verify(output: Output, database: str) -> int:
+@option(
+    "--archive", type=values.FolderPath(), metavar="DIR", brief=True,
+    help="examine the files of retired months in this folder, too",
+)  # fmt: skip
+def verify(output: Output, database: str, archive: Path | None) -> int:
     """Examine every audit trail with its signatures, every run against its audit rows, and every
     PASS against its trace. Exit code 10 if something was changed.
     """
-    return _call("reading.verify", output, database)
+    return _call("reading.verify", output, database, archive)
+
+
+@plant.action("retire")
+@_database_option
+@option(
+    "--archive", type=values.FolderPath(), metavar="DIR", required=True, brief=True,
+    help="the folder of the files",
+)  # fmt: skip
+@option("--before", metavar="MONTH", brief=True, help="months before this one: 2024-01")
+@option(
+    "--keep-months", type=values.count, metavar="N", brief=True,
+    help="instead: months that ended at least N months ago",
+)  # fmt: skip
+@option("--dry-run", "-n", is_flag=True, help="change nothing: show what would be retired")
+@option(
+    "--with-problems", is_flag=True,
+    help="archive records that plant verify finds fault with as they are, instead of refusing",
+)  # fmt: skip
+def retire(
+    output: Output,
+    database: str,
+    archive: Path,
+    before: str | None,
+    keep_months: int | None,
+    *,
+    dry_run: bool,
+    with_problems: bool,
+) -> int:
+    """Move old months from the database to files, one for each month. A month is deleted only
+    after its file is on the disk and was verified. The last run of each unit, and its last
+    transfer, stay. Only the owner of the database may do it; when interrupted, run it again. Exit
+    code 10 if the records of a month have problems: it stays.
+    """
+    if (before is None) == (keep_months is None):
+        raise UsageError(
+            "Name either --before or --keep-months.", remedy="Add --before 2024-01, for example."
+        )
+    return _call(
+        "retiring.retire", output, database, archive, before, keep_months,
+        dry_run=dry_run, with_problems=with_problems,
+    )  # fmt: skip
 
 
 @plant.action("units")

@@ -13,6 +13,7 @@ from flasher.plant.fetcher import Fetched
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.recipes import RecipeEvent
 from flasher.plant.reconcile import Reconciliation
+from flasher.plant.retire import RetiredMonth
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
 from flasher.station.records.model import PassedTwice
@@ -81,6 +82,15 @@ class PlantRecipesDocument:
 
 
 @dataclass(frozen=True)
+class PlantRetireDocument:
+    """Result of `flasher plant retire`."""
+
+    before: str
+    """First month that stays."""
+    months: list[RetiredMonth]
+
+
+@dataclass(frozen=True)
 class PlantUnitsDocument:
     """Units whose last transfer to a target was of an image."""
 
@@ -110,6 +120,7 @@ class PlantDeliveriesDocument:
 
 DOCUMENTS: Final = (
     PlantExamination,
+    PlantRetireDocument,
     PlantUnitsDocument,
     StationReportDocument,
     PlantInitDocument,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output, counted
@@ -26,15 +27,18 @@ from flasher.station.records.overview import ImageRecord, InstalledUnit, Overvie
 _AT_ONCE = 1000
 
 
-def _records(url: str) -> RecordsOptions:
+def records_of_plant(url: str) -> RecordsOptions:
     return RecordsOptions(url, cache_folder(url), None, (), None)
 
 
-def verify(output: Output, url: str) -> int:
+def verify(output: Output, url: str, archive: Path | None) -> int:
     look = {"unit": " rows", "desc": "examined", "unit_scale": True}
-    with closing(open_to_read(_records(url), PlantStore)) as store, Bar(output, **look) as bar:
+    with (
+        closing(open_to_read(records_of_plant(url), PlantStore)) as store,
+        Bar(output, **look) as bar,
+    ):
         assert isinstance(store, PlantStore)  # noqa: S101  as asked for
-        found = PlantExaminer(store, bar.move_to).examine_plant()
+        found = PlantExaminer(store, bar.move_to, archive).examine_plant()
     for line in problem_lines(found.problems):
         output.result(printable(line))
     for line in found.remarks:
@@ -46,6 +50,8 @@ def verify(output: Output, url: str) -> int:
             f"{counted(found.runs, 'run')} and {counted(found.traces, 'trace')} of runs that"
             " passed agree with the signed audit trails"
         )
+    if found.archives:
+        output.result(f"  {counted(len(found.archives), 'file')} of retired months, too")
     for each in found.stations:
         keys = ", ".join(each.keys)
         last = f"to {each.last_at}, signed with {keys}"
@@ -60,7 +66,7 @@ def verify(output: Output, url: str) -> int:
 
 
 def units(output: Output, url: str, wanted: str) -> int:
-    with closing(open_to_read(_records(url), PlantStore)) as store:
+    with closing(open_to_read(records_of_plant(url), PlantStore)) as store:
         overview = Overview(store.database)
         images = [
             each
@@ -105,7 +111,7 @@ def _unit_lines(images: list[ImageRecord], found: list[InstalledUnit]) -> Iterat
 
 
 def report(output: Output, options: ReportOptions, url: str) -> int:
-    return station_report(output, options, _records(url), PlantStore)
+    return station_report(output, options, records_of_plant(url), PlantStore)
 
 
 def pages(
@@ -116,4 +122,4 @@ def pages(
 
     make = partial(PlantPages, bounds=bounds_of(bounds))
     paths = dict.fromkeys([STATIONS, *PLANT_PAGES])
-    return serve(output, address, options, _records(url), PlantStore, make, tuple(paths))
+    return serve(output, address, options, records_of_plant(url), PlantStore, make, tuple(paths))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -76,6 +77,10 @@ def report(
     )
     with closing(open_to_read(records, kind)) as store:
         _check_station(store, options.station)
+        first = store.figures_begin()
+        if first is not None and (chosen.since is None or chosen.since < first):
+            output.progress(f"note: runs before {first:%Y-%m-%d} are retired and not counted")
+            chosen = replace(chosen, since=first)
         made = Report(store.read, chosen)
         output.results(figure_lines(made.figures))
         output.results(capability_lines(made.capabilities))

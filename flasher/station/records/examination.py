@@ -67,6 +67,8 @@ class Trail:
     station: str
     begin: int = 0
     """Last row that an earlier examination covered."""
+    before: str = chain.GENESIS
+    """Hash of that row."""
     hashes: bytearray = field(default_factory=bytearray)
     """Hashes of later rows, packed as bytes: a plant has millions."""
     restored: dict[int, range] = field(default_factory=dict)
@@ -351,13 +353,13 @@ class Examiner:
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
     ) -> Iterator[Problem]:
-        """Check the rows of one chain in order. Yields problems and fills in `trail`."""
-        before = chain.GENESIS
-        if self._since is not None and trail.begin:
-            before = self._since.chains[trail.station].hash
+        """Check the rows of one chain after `trail.end`, in order. Yields problems and fills in
+        `trail`.
+        """
+        before = trail.hash_of(trail.end) or trail.before
         key = trail.keys[-1] if trail.keys else None
         shown = printable(trail.station)
-        for expected, row in enumerate(rows, trail.begin + 1):
+        for expected, row in enumerate(rows, trail.end + 1):
             where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
             if row["previous_hash"] != before or row["number"] != expected:
@@ -589,7 +591,7 @@ def _continued_trail(name: str, since: Examined | None) -> Trail:
     restored = {number: range(first, last + 1) for number, (first, last) in each.restored.items()}
     stated = (each.version, each.schema)
     return Trail(
-        name, each.rows, restored=restored, keys=list(each.keys), stated=stated,
+        name, each.rows, each.hash, restored=restored, keys=list(each.keys), stated=stated,
         first=dict(each.first),
     )  # fmt: skip
 

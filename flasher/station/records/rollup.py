@@ -41,7 +41,7 @@ from flasher.station.records.model import (
 from flasher.station.records.rows import batches, beside_index
 
 _LOG: Final = logging.getLogger(__name__)
-_LAYOUT: Final = 2
+_LAYOUT: Final = 3
 _RUNS_AT_ONCE: Final = 5000
 _PAUSE_S: Final = 0.2
 """Pause between batches, for other programs."""
@@ -49,6 +49,8 @@ _UNTIL_NEXT_S: Final = 600.0
 _SETTLED: Final = timedelta(hours=1)
 """Younger runs are not added: on a server, a run with a lower id may not be committed yet."""
 WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
+_FIRST: Final = select(func.min(schema.audit.c.id))
+"""A plant retires the runs of old months with their audit rows."""
 _TABLES: Final = """
 CREATE TABLE state (content TEXT);
 CREATE TABLE day (number INTEGER PRIMARY KEY, begin TEXT, end TEXT, month TEXT);
@@ -268,7 +270,8 @@ def _state(connection: Connection, run: int) -> dict[str, Any]:
     row = connection.execute(newest).one()
     records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
     return {
-        "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash
+        "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash,
+        "first": connection.execute(_FIRST).scalar_one(),
     }  # fmt: skip
 
 
@@ -280,7 +283,7 @@ def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
     if row is None:
         return 0
     found = json.loads(row[0])
-    if found["layout"] != _LAYOUT:
+    if found["layout"] != _LAYOUT or found["first"] != connection.execute(_FIRST).scalar_one():
         return None
     audit, info = schema.audit.c, schema.schema_info.c
     is_same = select(audit.id).where(audit.id == found["audit"], audit.hash == found["hash"])

@@ -43,6 +43,8 @@ def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None
     work_s = STATEMENT_LIMIT_S if statement_limit_s is None else statement_limit_s
     silence_s = SILENCE_LIMIT_S if statement_limit_s is None else statement_limit_s + 5.0
     limits = {
+        # It compiles what it plans as long, for longer than these queries then take.
+        "jit": "off",
         "lock_timeout": round(lock_timeout_s * 1000),
         "statement_timeout": round((lock_timeout_s + work_s) * 1000),
         **{f"tcp_{name}": value for name, value in _PROBES.items()},

@@ -393,6 +393,10 @@ class Store:
                 remarks += (f"the next examination starts from the beginning: {error.what}",)
         return replace(found, remarks=(*remarks, *found.remarks))
 
+    def figures_begin(self) -> datetime | None:
+        """Start of the period that figures can cover; None if they cover all runs."""
+        return None
+
     def examine_run(self, run_id: RunId) -> RunExamination:
         """Examine one run without reading all records. Raises RecordError."""
         note, _ = self._examined()
