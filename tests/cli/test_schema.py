@@ -6,6 +6,7 @@ import json
 import signal
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
@@ -284,6 +285,8 @@ def sample(hint: Any) -> Any:
         return list(hint)[-1]
     if get_origin(hint) is tuple:
         return (sample(get_args(hint)[0]),) * 2
+    if is_dataclass(hint):
+        return make(hint)
     if hint is object:
         return UserString(WireText(b"a\x1b"))
     return {int: 7, float: 0.5, bool: True, str: "text", bytes: b"\x00\xff"}[hint]

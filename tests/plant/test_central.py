@@ -22,9 +22,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def central(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> Iterator[Central]:
-    monkeypatch.setattr("flasher.plant.central.LOCK_TIMEOUT_S", 0.1)
     monkeypatch.setattr(server, "SILENCE_LIMIT_S", 0.3)
-    with closing(Central(plant.url(OWNER))) as made:
+    with closing(Central(plant.url(OWNER), lock_timeout_s=0.1)) as made:
         yield made
 
 
@@ -39,12 +38,10 @@ def test_a_table_that_another_session_holds_is_waited_for_and_then_an_error(
         connection.exec_driver_sql("LOCK TABLE chain_row")
 
 
-def test_a_statement_does_not_take_longer_than_its_limit(
-    plant: Plant, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("flasher.plant.central.LOCK_TIMEOUT_S", 0.05)
+def test_a_statement_does_not_take_longer_than_its_limit(plant: Plant) -> None:
+    url = plant.url(OWNER)
     with (
-        closing(Central(plant.url(OWNER), statement_limit_s=0.05)) as central,
+        closing(Central(url, lock_timeout_s=0.05, statement_limit_s=0.05)) as central,
         pytest.raises(RecordsLockedError),
         central.reading() as connection,
     ):
@@ -66,16 +63,13 @@ def test_a_server_that_hangs_is_given_up_and_used_again_when_it_works(
         connection.exec_driver_sql("SELECT 1")
 
 
-def test_a_server_that_is_not_there_or_sends_nothing_is_an_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("flasher.plant.central.LOCK_TIMEOUT_S", 0.1)
+def test_a_server_that_is_not_there_or_sends_nothing_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         url = f"postgresql://jo@127.0.0.1:{port}/records"
         began = time.perf_counter()
         with (
-            closing(Central(url)) as central,
+            closing(Central(url, lock_timeout_s=0.1)) as central,
             pytest.raises(RecordError, match="cannot be reached"),
             central.reading(),
         ):

@@ -176,7 +176,9 @@ def test_a_server_that_is_away_is_waited_for(plant: Plant, sender: Sender) -> No
     assert load_state(sender.bench.store.files.folder, sender.station) == state
     shown = check_of(sender)
     assert not shown.is_good
-    assert shown.text == f"{state.unsent} rows wait: sending to the plant failed: {state.fault}"
+    begin = f"{state.unsent} rows wait: sending to the plant failed: "
+    assert shown.text.removesuffix("...") in begin + state.fault
+    assert len(shown.text) > len(begin)
     assert sender.bench.store.read.run(run_id).run.state is RunState.PASS
     sender.start()
     sender.send()

@@ -48,7 +48,7 @@ class _Question:
     def __init__(self) -> None:
         self.answer = Answer(may_begin=True, text="yes")
 
-    def ask(self, _order: Order) -> Answer:
+    def ask(self, _order: Order, _recipe: object) -> Answer:
         return self.answer
 
     def silence(self) -> Answer:
