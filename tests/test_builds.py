@@ -161,4 +161,4 @@ def test_the_units_of_the_debian_package_are_valid(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (ran.returncode, ran.stdout + ran.stderr) == (0, "")
-    assert len(units) == 2
+    assert len(units) == 3

@@ -7,6 +7,7 @@ not (`UNKNOWN`). It is sent again then, with the same key.
 from __future__ import annotations
 
 import asyncio
+import math
 import ssl
 from typing import Any, Final
 
@@ -27,7 +28,10 @@ _LATER: Final = frozenset({408, 425, 429})
 """Refusals of HTTP that are not final."""
 _BODY_SHOWN: Final = 200
 _MEDIA_TYPE: Final = "application/json"
-_MQTT_FINAL: Final = frozenset({0x87, 0x90, 0x95, 0x99})
+_TOO_LARGE: Final = 0x95
+_PACKET_BYTES: Final = 1 + 4 + 2 + 2
+"""A packet without topic, properties and payload: its header, and the lengths and number in it."""
+_MQTT_FINAL: Final = frozenset({0x87, 0x90, _TOO_LARGE, 0x99})
 """Refusals of MQTT that are final: not authorized, topic name invalid, packet too large, payload
 format invalid."""
 
@@ -134,13 +138,27 @@ def _http_answer(status: int, body: str) -> Answer:
 
 
 class _Publisher(Client):
-    """A client of MQTT that keeps what the broker answers to its publication, and why it ends the
-    connection: aiomqtt drops the one, and waits on after the other.
+    """A client of MQTT that keeps what the broker accepts and answers to a publication, and why it
+    ends the connection: aiomqtt drops the first two, and waits on after the last.
     """
+
+    packet_max_bytes: int | None = None
+    """Largest packet that the broker accepts; None: it states no limit (MQTT 5, 3.2.2.3.6)."""
 
     reason: ReasonCode | None = None
     """Answer to the publication."""
     farewell: ReasonCode | None = None
+
+    def _on_connect(
+        self,
+        client: Any,
+        userdata: Any,
+        flags: Any,
+        reason_code: ReasonCode,
+        properties: Properties | None = None,
+    ) -> None:
+        self.packet_max_bytes = getattr(properties, "MaximumPacketSize", None)
+        super()._on_connect(client, userdata, flags, reason_code, properties)
 
     def _on_publish(
         self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Properties
@@ -187,6 +205,10 @@ class MqttTransport(Transport):
         try:
             async with asyncio.timeout(receiver.time_limit_s), client:
                 is_connected = True
+                size = _PACKET_BYTES + len(receiver.topic.encode()) + len(properties.pack())
+                # A broker that gets more ends the connection, and its reason is often not read.
+                if size + len(document) > (client.packet_max_bytes or math.inf):
+                    return _mqtt_answer(ReasonCode(PacketTypes.DISCONNECT, identifier=_TOO_LARGE))
                 await client.publish(receiver.topic, document, qos=1, properties=properties)
         except (MqttError, TimeoutError, OSError) as error:
             if not is_connected:
