@@ -5,6 +5,9 @@ A claim stays until its station sends the end of the run, or releases it because
 expires if its station does not renew it; from then on it refuses the unit nowhere, but the station
 may have passed the unit, which `plant_claim` states. So a unit is reported as free only while no
 run of it at another station can end with a PASS that is not here.
+
+A PC that was taken over may have passed units that it never sent: to the PC that continues the
+station its claims are those of another station, and it can claim nothing.
 """
 
 from __future__ import annotations
@@ -12,33 +15,47 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.plant.functions import DEFINER, REFUSED
+from flasher.station.records.chain import TAKEN_OVER
 from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
 
 _OPEN_MAX: Final = 1000
 """Claims of a station that have not expired; with 64 sockets it has a fraction of that."""
 _LEASE_MAX_S: Final = 600
 
+# Both had other arguments or results once.
+_OLD: Final = """
+DROP FUNCTION IF EXISTS plant_claim(text, text, text, boolean, text, double precision);
+DROP FUNCTION IF EXISTS plant_claims();
+"""
 _CLAIM: Final = f"""
 CREATE OR REPLACE FUNCTION plant_claim(
     of_token text, of_part text, of_serial text, of_virtual boolean, at_socket text,
-    lease_s double precision,
+    lease_s double precision, of_takeover text,
     OUT state text, OUT station text, OUT socket text, OUT at timestamptz, OUT run bigint
 ) LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     mine plant_station;
     other plant_claim;
     now timestamptz;
+    taken text;
 BEGIN
     SELECT * INTO mine FROM plant_station p WHERE p.role = session_user;
     IF mine.station IS NULL THEN
         RAISE EXCEPTION 'foreign: the user % has not sent from any records', session_user
             USING ERRCODE = '{REFUSED}';
     END IF;
+    SELECT c.hash INTO taken FROM chain_row c WHERE c.station = mine.station
+        AND c.event = '{TAKEN_OVER}' ORDER BY c.number DESC LIMIT 1;
+    IF taken <> of_takeover THEN
+        RAISE EXCEPTION 'taken-over: another PC continues station %', mine.name
+            USING ERRCODE = '{REFUSED}';
+    END IF;
     PERFORM pg_advisory_xact_lock(hashtextextended(of_part || E'\\x1f' || of_serial, 7053));
     now := clock_timestamp();
     -- Claims before runs: a claim goes when the end of its run comes.
     SELECT * INTO other FROM plant_claim c WHERE c.part = of_part AND c.serial = of_serial
-        AND c.station <> mine.station ORDER BY c.expires_at DESC LIMIT 1;
+        AND (c.station, c.takeover) <> (mine.station, of_takeover)
+        ORDER BY c.expires_at DESC LIMIT 1;
     IF other.expires_at > now THEN
         state := 'running';
     ELSE
@@ -69,9 +86,11 @@ BEGIN
             RAISE EXCEPTION 'foreign: station % claims too many units', mine.name
                 USING ERRCODE = '{REFUSED}';
         END IF;
-        INSERT INTO plant_claim (token, station, part, serial, socket, claimed_at, expires_at)
+        INSERT INTO plant_claim
+                (token, station, part, serial, socket, claimed_at, expires_at, takeover)
             VALUES (of_token, mine.station, of_part, of_serial, at_socket, now,
-                now + make_interval(secs => greatest(1, least(lease_s, {_LEASE_MAX_S}))));
+                now + make_interval(secs => greatest(1, least(lease_s, {_LEASE_MAX_S}))),
+                of_takeover);
     END IF;
 END $$
 """
@@ -92,12 +111,13 @@ $$
 """
 
 _CLAIMS: Final = f"""
-CREATE OR REPLACE FUNCTION plant_claims() RETURNS TABLE (token text, part text, serial text)
+CREATE OR REPLACE FUNCTION plant_claims()
+RETURNS TABLE (token text, part text, serial text, takeover text)
 LANGUAGE sql STABLE {DEFINER} AS $$
-    SELECT token, part, serial FROM plant_claim WHERE station = plant_my_station()
+    SELECT token, part, serial, takeover FROM plant_claim WHERE station = plant_my_station()
 $$
 """
-"""Claims of the station itself."""
+"""Claims of the station itself, and of PCs that were this station before a takeover."""
 
 _END: Final = f"""
 CREATE OR REPLACE FUNCTION plant_end_claims() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
@@ -129,12 +149,12 @@ CREATE TRIGGER plant_end_claims AFTER INSERT ON chain_row FOR EACH ROW
     WHEN (NEW.content IS NOT NULL) EXECUTE FUNCTION plant_end_claims();
 """
 
-FUNCTIONS: Final = (_CLAIM, _RENEW, _RELEASE, _CLAIMS, _END, _TRIGGER)
+FUNCTIONS: Final = (_OLD, _CLAIM, _RENEW, _RELEASE, _CLAIMS, _END, _TRIGGER)
 
 
 def rights(stations: str) -> str:
     """Statement that gives the role of all stations its rights; the name is quoted."""
     return f"""
-GRANT EXECUTE ON FUNCTION plant_claim(text, text, text, boolean, text, double precision),
+GRANT EXECUTE ON FUNCTION plant_claim(text, text, text, boolean, text, double precision, text),
     plant_renew(text[], double precision), plant_release(text[]), plant_claims() TO {stations};
 """

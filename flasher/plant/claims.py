@@ -16,7 +16,7 @@ from sqlalchemy import Connection, select, text
 
 from flasher.log import log_event
 from flasher.plant.central import Central
-from flasher.station.records import schema
+from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import (
@@ -41,7 +41,7 @@ _CLOSE_S: Final = 3.0
 
 _ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
 _CLAIM: Final = text(
-    "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s)"
+    "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s, :takeover)"
 )
 _RENEW: Final = text("SELECT plant_renew(:tokens, :lease_s)")
 _RELEASE: Final = text("SELECT plant_release(:tokens)")
@@ -90,6 +90,10 @@ class PlantClaims:
         self._left: set[str] = set()
         """Claims with which no run began."""
         self._is_entered = self._is_swept = False
+        self._takeover = ""
+        """Hash of the audit row with which this PC took the station over; "" without one."""
+        self._has_branches = False
+        """True if the records of each PC that was taken over were brought in."""
         self._fault: RecordError | None = None
         """Why the server did not answer last; None if it did."""
         self._clocks: tuple[float, float] | None = None
@@ -124,6 +128,7 @@ class PlantClaims:
         try:
             with self._central.writing() as central:
                 self._enter(central)
+                values["takeover"] = self._takeover
                 found = central.execute(_CLAIM, values).mappings().one()
         except RecordError as error:
             with self._mutex:
@@ -197,12 +202,22 @@ class PlantClaims:
             return
         with self._records.reading() as local:
             records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
+            takeovers = chain.rows_without_run(local, self._station, [chain.TAKEN_OVER])
+            branches = chain.rows_without_run(local, self._station, [chain.BRANCH])
         central.execute(_ENTER, {"records": records, "station": self._station})
+        self._takeover = takeovers[-1].hash if takeovers else ""
+        self._has_branches = len(branches) >= len(takeovers)
         self._is_entered = True
 
     def _unknown(self, central: Connection) -> list[str]:
-        """Claims of this station with which no run began: the station died in between."""
-        claims = central.execute(_CLAIMS).all()
+        """Claims of this station with which no run began: the station died in between. What a PC
+        that was taken over has run is not known before its records are brought in.
+        """
+        claims = [
+            each
+            for each in central.execute(_CLAIMS).all()
+            if self._has_branches or each.takeover == self._takeover
+        ]
         with self._mutex:
             earlier = [each for each in claims if each.token not in self._asked]
         return [

@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "6"
+PLANT_SCHEMA: Final = "7"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -137,10 +137,12 @@ plant_claim: Final = Table(
     Column("socket", Text, nullable=False),
     Column("claimed_at", DateTime(timezone=True), nullable=False),
     Column("expires_at", DateTime(timezone=True), nullable=False),
+    Column("takeover", Text, nullable=False, server_default=""),
     Index("claim_of_unit", "part", "serial"),
     Index("claim_of_station", "station", "expires_at"),
 )
-"""Claims of units by stations whose run has not arrived (`claim_functions`)."""
+"""Claims of units by stations whose run has not arrived (`claim_functions`). `takeover` is the hash
+of the audit row with which the claiming PC took the station over."""
 
 plant_pass: Final = Table(
     "plant_pass",

@@ -109,7 +109,7 @@ class _Link:
             centre.release(station, values["tokens"])
         elif statement is claims._CLAIMS:
             own = [
-                SimpleNamespace(token=token, part=PART, serial=each.serial)
+                SimpleNamespace(token=token, part=PART, serial=each.serial, takeover="")
                 for token, each in centre.claims.items()
                 if each.station == station
             ]

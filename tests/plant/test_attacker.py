@@ -104,10 +104,10 @@ ATTEMPTS = {
     ),
     "hide a duplicate": ("DELETE FROM plant_duplicate", DENIED),
     "claim one's own token twice": (
-        "SELECT plant_claim('{token}', 'BAT-36', 'W2605077', false, 'A', 60)", "23505",
+        "SELECT plant_claim('{token}', 'BAT-36', 'W2605077', false, 'A', 60, '')", "23505",
     ),
     "claim everything": (
-        "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60)"
+        "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60, '')"
         " FROM generate_series(1, 1001) n", REFUSED,
     ),
     "hand a run over again": (f"SELECT plant_enqueue('mes', {_THEIRS}, 4)", DENIED),
@@ -131,7 +131,7 @@ def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
     ((head,),) = plant.rows(query + " WHERE name = 'line-2' ORDER BY number DESC LIMIT 1")
     token = "0" * 32
     with plant.connect("flasher_line_3") as victim:
-        claim = f"SELECT plant_claim('{token}', 'BAT-36', 'W2605078', false, 'A', 60)"
+        claim = f"SELECT plant_claim('{token}', 'BAT-36', 'W2605078', false, 'A', 60, '')"
         victim.execute(claim.encode())
     before = _everything(plant)
     found = {}

@@ -22,7 +22,7 @@ from flasher.station.records.model import (
     RunState,
 )
 from tests.plant.claims_world import Centre, World
-from tests.plant.factory import Plant
+from tests.plant.factory import Plant, Sender
 from tests.station.factory import HEAD, SERIAL, SERIAL_NUMBER, USUAL
 
 SEEDS = 1500
@@ -91,8 +91,8 @@ def test_a_planted_mistake_is_found(centre: type[Centre]) -> None:
 class Line:
     """A station with its claims; everything in its own turn, as the test calls it."""
 
-    def __init__(self, plant: Plant, station: str) -> None:
-        self.sender = plant.sender(station)
+    def __init__(self, plant: Plant, station: str, sender: Sender | None = None) -> None:
+        self.sender = sender or plant.sender(station)
         self.bench = self.sender.bench
         self.start()
 

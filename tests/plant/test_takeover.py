@@ -16,17 +16,20 @@ from flasher.plant.takeover import TakenOver, Takeover
 from flasher.station.records.branch import BroughtIn, bring_in
 from flasher.station.records.database import locate_records, open_database
 from flasher.station.records.errors import (
+    ClaimRefusedError,
     KeyMissingError,
     NotFoundError,
     RecordsDamagedError,
     StationBusyError,
     UnprovenError,
 )
+from flasher.station.records.errors import Refusal as RefusalReason
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
 from flasher.station.records.signatures import SigningKey
 from tests.plant.factory import READER, Plant, Sender
+from tests.plant.test_claims import Line, expire
 from tests.plant.test_verify import examined
 from tests.station.factory import FakeClock
 
@@ -183,6 +186,53 @@ def test_a_unit_that_passes_at_both_pcs_is_named(
     assert len(brought(spare, sender.bench.path).runs) == 1
     spare.send()
     assert not examined(plant).problems
+
+
+def test_the_claims_of_the_pc_that_was_taken_over_stay_until_its_records_come(
+    plant: Plant, sender: Sender, key: bytes
+) -> None:
+    """It passed a unit, and did not send that."""
+    old, third = Line(plant, "line-2", sender), Line(plant, "line-3")
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    old.end(old.claim("W2605009"))
+    taken(plant, key)
+    spare = Line(plant, "line-2", spare_of(plant, sender))
+    with pytest.raises(ClaimRefusedError) as caught:
+        spare.claim("W2605009")
+    assert caught.value.refusal is RefusalReason.UNIT_RUNNING
+    expire(plant)
+    spare.claims.tend()
+    for each in (spare, third):
+        admission = each.asked("W2605009")
+        assert admission.doubt.startswith("line-2 claimed it")
+        each.gate.dropped(admission)
+        each.claims.tend()
+
+    sender.bench.store.close()
+    assert len(brought(spare.sender, sender.bench.path).runs) == 1
+    spare.start()
+    spare.claims.tend()
+    assert plant.rows("SELECT serial FROM plant_claim") == [("W2605009",)]  # it was not sent yet
+    spare.sender.send()
+    assert plant.rows("SELECT serial FROM plant_claim") == []
+    with pytest.raises(ClaimRefusedError) as caught:
+        third.claim("W2605009")
+    assert caught.value.refusal is RefusalReason.DUPLICATE
+    for line in (old, spare, third):
+        line.close()
+
+
+def test_a_pc_that_was_taken_over_claims_nothing(plant: Plant, sender: Sender, key: bytes) -> None:
+    old = Line(plant, "line-2", sender)
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    assert not old.asked("W2605002").doubt
+    taken(plant, key)
+    assert "taken-over" in old.asked("W2605003").doubt
+    old.claims.tend()
+    assert "taken-over" in old.asked("W2605003").doubt
+    old.close()
 
 
 def test_a_changed_branch_is_not_brought_in(
