@@ -64,10 +64,6 @@ class _Rows(Protocol):
 @contextmanager
 def _bulk(connection: Connection) -> Iterator[_Rows]:
     """Writes rows past triggers and durability; they are in force again afterwards."""
-    if connection.dialect.name == "postgresql":
-        with _copying(connection) as rows:
-            yield rows
-        return
     driver: Any = connection.connection.dbapi_connection
     rules = driver.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'").fetchall()
     for pragma in ("foreign_keys = 0", "synchronous = 0", "cache_size = -500000"):
@@ -91,28 +87,6 @@ def _bulk(connection: Connection) -> Iterator[_Rows]:
         driver.execute(statement)
     connection.commit()
     driver.execute("PRAGMA journal_mode = WAL")
-    connection.invalidate()
-
-
-@contextmanager
-def _copying(connection: Connection) -> Iterator[_Rows]:
-    driver: Any = connection.connection.dbapi_connection
-    connection.exec_driver_sql("SET session_replication_role = replica")
-    connection.exec_driver_sql("SET statement_timeout = 0")
-
-    def write(table: Table, rows: list[_Row]) -> None:
-        names = [column.name for column in table.columns]
-        with driver.cursor().copy(f"COPY {table.name} ({', '.join(names)}) FROM STDIN") as copy:
-            for row in rows:
-                copy.write_row([row[name] for name in names])
-
-    yield write
-    for table in schema.metadata.sorted_tables:
-        if "id" in table.c:
-            highest = f"(SELECT coalesce(max(id), 0) + 1 FROM {table.name})"
-            serial = f"pg_get_serial_sequence('{table.name}', 'id')"
-            connection.exec_driver_sql(f"SELECT setval({serial}, {highest}, false)")
-    connection.commit()
     connection.invalidate()
 
 
