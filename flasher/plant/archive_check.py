@@ -111,7 +111,24 @@ class _Traces(FileStore):
         return data
 
 
-class ArchiveExaminer(Examiner):
+class AssembledExaminer(Examiner):
+    """Examines runs that were put together from their parts."""
+
+    _runs = 0
+    """Number of runs that were examined."""
+
+    def _assembled(self, found: Assembled) -> Iterator[Problem]:
+        for number in found.incomplete:
+            yield Problem(text("run {run_id}", run_id=number), "a part of it is missing")
+        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
+        yield from self._contents(found.contents, found.stated, changed)
+        for (part, _), of_runs in changed.items():
+            what = f"changed after it was recorded: {chain.NAMED[part]}"
+            yield Problem(text("run {run_id}", run_id=of_runs[0]), what)
+        self._runs += len(found.contents)
+
+
+class ArchiveExaminer(AssembledExaminer):
     """Examines a file once. `chains`: what it has to contain."""
 
     def __init__(
@@ -127,7 +144,6 @@ class ArchiveExaminer(Examiner):
         self._chains = {each.station: each for each in chains}
         self._total = sum(each.last - each.first + 1 for each in chains)
         self._claims: dict[tuple[UUID, int], Mapping[str, str]] = {}
-        self._runs = 0
 
     def examine_file(self) -> ExaminedArchive:
         """Raises RecordError if the file cannot be read."""
@@ -175,14 +191,7 @@ class ArchiveExaminer(Examiner):
                 self._claims[rows.station, number] = stated.claim
             if stated.ending:
                 stated.claim = self._claims.pop((rows.station, number), {})
-        for number in found.incomplete:
-            yield Problem(text("run {run_id}", run_id=number), "a part of it is missing")
-        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-        yield from self._contents(found.contents, found.stated, changed)
-        for (part, _), of_runs in changed.items():
-            what = f"changed after it was recorded: {chain.NAMED[part]}"
-            yield Problem(text("run {run_id}", run_id=of_runs[0]), what)
-        self._runs += len(found.contents)
+        yield from self._assembled(found)
         yield from self._kept_runs(connection, rows.station, found.contents)
 
     def _kept_runs(

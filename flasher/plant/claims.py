@@ -16,6 +16,7 @@ from sqlalchemy import Connection, select, text
 
 from flasher.log import log_event
 from flasher.plant.central import Central
+from flasher.plant.forwarder import ENTER
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
@@ -39,7 +40,6 @@ CLOCK_KNOWN_S: Final = 12 * 3600.0
 than a second meanwhile."""
 _CLOSE_S: Final = 3.0
 
-_ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
 _CLAIM: Final = text(
     "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s, :takeover)"
 )
@@ -197,14 +197,14 @@ class PlantClaims:
             self._fault = None
 
     def _enter(self, central: Connection) -> None:
-        """Tell the database once from which records this station sends."""
+        """State once from which records this station sends."""
         if self._is_entered:
             return
         with self._records.reading() as local:
             records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
             takeovers = chain.rows_without_run(local, self._station, [chain.TAKEN_OVER])
             branches = chain.rows_without_run(local, self._station, [chain.BRANCH])
-        central.execute(_ENTER, {"records": records, "station": self._station})
+        central.execute(ENTER, {"records": records, "station": self._station})
         self._takeover = takeovers[-1].hash if takeovers else ""
         self._has_branches = len(branches) >= len(takeovers)
         self._is_entered = True
@@ -253,8 +253,8 @@ class PlantClaims:
                 except Exception as error:  # noqa: BLE001  claims expire, and runs are marked
                     log_event(error)
                 with self._mutex:
-                    is_behind = self._fault is not None
-                if is_behind:  # `dropped` must not ask a dead server again and again
+                    is_away = self._fault is not None
+                if is_away:  # `dropped` must not ask a dead server again and again
                     self._wait(RETRY_S)
                 else:
                     self._poke.wait(KEEP_S)

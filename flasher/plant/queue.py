@@ -15,14 +15,15 @@ from typing import Final
 
 from sqlalchemy import Connection, text
 
+from flasher.plant.functions import DEFINER
+
 TASK: Final = "flasher.deliver"
 OPEN: Final = "('waiting', 'sent', 'unknown')"
 """States of deliveries that are not settled."""
-_DEFINER: Final = "SECURITY DEFINER SET search_path = public, pg_temp"
 
 _ENQUEUE: Final = f"""
 CREATE OR REPLACE FUNCTION plant_enqueue(to_receiver text, of_station uuid, of_number bigint)
-RETURNS void LANGUAGE plpgsql {_DEFINER} AS $$
+RETURNS void LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     last_job bigint;
     status text;
@@ -54,7 +55,7 @@ END $$
 """Hands a run over as soon as possible, also one that was settled before."""
 
 _HAND_OVER: Final = f"""
-CREATE OR REPLACE FUNCTION plant_hand_over() RETURNS trigger LANGUAGE plpgsql {_DEFINER} AS $$
+CREATE OR REPLACE FUNCTION plant_hand_over() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 BEGIN
     PERFORM plant_enqueue(name, NEW.station, NEW.number) FROM plant_receiver
         WHERE stopped_at IS NULL;

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
+from uuid import UUID
 
 from platformdirs import user_cache_path
 from sqlalchemy import Connection, func, select, text
@@ -16,7 +18,7 @@ from sqlalchemy import Connection, func, select, text
 from flasher.errors import UsageError
 from flasher.plant.archive import month_after
 from flasher.plant.central import plant_location
-from flasher.plant.schema import archive_file, trace
+from flasher.plant.schema import SHARED_PARTS, archive_file, shared_part, trace
 from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
@@ -33,6 +35,7 @@ from flasher.station.records.model import (
     utc_moment,
 )
 from flasher.station.records.queries import Records
+from flasher.station.records.rows import batches
 from flasher.station.records.store import Store
 
 _USUAL: Final = KeyLocations()
@@ -62,6 +65,21 @@ _TWICE: Final = text(
     f" {_OF.format(of='first', key='first_run_id')} {_OF.format(of='second', key='run_id')}"
     " JOIN unit ON unit.id = second.unit_id ORDER BY d.run_id DESC LIMIT :limit"
 )
+
+
+def shared_parts(
+    connection: Connection, station: UUID, digests: Iterable[Mapping[str, str]]
+) -> Mapping[str, Any]:
+    """Parts that runs of a station share, by their digest."""
+    wanted = {each[name] for each in digests for name in SHARED_PARTS if name in each}
+    found: dict[str, Any] = {}
+    for some in batches(wanted):
+        query = select(shared_part.c.sha256, shared_part.c.content).where(
+            shared_part.c.station == station, shared_part.c.sha256.in_(some)
+        )
+        for sha256, content in connection.execute(query):
+            found[sha256] = json.loads(content)
+    return found
 
 
 def passed_twice(connection: Connection, limit: int) -> list[PassedTwice]:

@@ -7,7 +7,6 @@ refused from then on.
 
 from __future__ import annotations
 
-import json
 import platform
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,7 +23,14 @@ from sqlalchemy import Connection, select
 from flasher.errors import ErrorCode, UsageError
 from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.forwarder import ADD_ROW, ENTER, row_values
-from flasher.plant.schema import chain_row, open_run, plant_station, shared_part, trace
+from flasher.plant.schema import (
+    SHARED_PARTS,
+    chain_row,
+    open_run,
+    plant_station,
+    trace,
+)
+from flasher.plant.store import shared_parts
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database, Location, create_tables, create_triggers
@@ -37,14 +43,13 @@ from flasher.station.records.errors import (
 from flasher.station.records.files import FileStore, sync_folder
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
+from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.places import lasts
 from flasher.station.records.signatures import SigningKey, fingerprint, is_signed
 
 _AT_ONCE: Final = 500
 _TRIES: Final = 20
 """Attempts while the other PC still sends."""
-_NAMED: Final = ("station", "socket", "operator", "lot", "recipe", "artifacts")
-"""Parts that runs share, as an audit row names them."""
 _SHARED: Final = ("station", "socket", "operator", "lot", "recipe", "artifact", "unit")
 """Tables with rows that runs share."""
 _PARTS: Final = {
@@ -116,7 +121,7 @@ class Takeover:
             self.location.url.set(database=str(part)), self.location.folder, self.location.shown
         )
         with (
-            closing(Database(location, 5.0, changes_schema=True)) as database,
+            closing(Database(location, DEFAULT_LOCK_TIMEOUT_S, changes_schema=True)) as database,
             closing(Central(self.own_url)) as own,
         ):
             copy = _Copy(self.station, FileStore(location.folder))
@@ -254,7 +259,9 @@ class _Copy:
             .limit(1)
         )
         digests = chain.data_of(source.execute(first).scalar_one_or_none() or "").get("digests", {})
-        found = self._parts(source, [digests] if digests else []).get(digests.get("station"))
+        found = shared_parts(source, self.station, [digests] if digests else []).get(
+            digests.get("station")
+        )
         self._own_id = found["id"] if found else 1
         self._insert(connection, "station", [{"id": self._own_id, "name": self._name}])
 
@@ -304,10 +311,10 @@ class _Copy:
         """Add audit rows with the runs that end in them."""
         ended = [row for row in rows if row["event"] in chain.ENDINGS]
         stated = [chain.data_of(row["data"])["digests"] for row in ended]
-        parts = self._parts(source, stated)
+        parts = shared_parts(source, self.station, stated)
         for row, digests in zip(ended, stated, strict=True):
             own = row["content"]
-            self._add_shared(connection, {name: parts[digests[name]] for name in _NAMED}, own)
+            self._add_shared(connection, {name: parts[digests[name]] for name in SHARED_PARTS}, own)
             self._insert(connection, "run", [own["run"]])
             for name, table in _PARTS.items():
                 self._insert(connection, table, own[name])
@@ -326,7 +333,7 @@ class _Copy:
     def _add_shared(
         self, connection: Connection, named: Mapping[str, Any], own: Mapping[str, Any]
     ) -> None:
-        for name in _NAMED[:-1]:
+        for name in SHARED_PARTS[:-1]:
             if named[name] is not None:
                 self._insert(connection, name, [named[name]])
         self._insert(connection, "artifact", named["artifacts"])
@@ -343,13 +350,6 @@ class _Copy:
             names = [each.name for each in table.c]
             values = [{name: row[name] for name in names} for row in new.values()]
             connection.execute(table.insert(), values)
-
-    def _parts(self, source: Connection, digests: Iterable[Mapping[str, str]]) -> Mapping[str, Any]:
-        wanted = {each[name] for each in digests for name in _NAMED if name in each}
-        query = select(shared_part.c.sha256, shared_part.c.content).where(
-            shared_part.c.station == self.station, shared_part.c.sha256.in_(wanted)
-        )
-        return {sha256: json.loads(content) for sha256, content in source.execute(query)}
 
     def _fetch(self, source: Connection, wanted: Iterable[str]) -> None:
         """Fetch attachments that are not here. One that the plant lacks is left out: `verify`
@@ -376,11 +376,11 @@ class _Copy:
         )
         contents = {row.run_number: row.content for row in source.execute(query)}
         stated = {number: data["digests"] for number, data in self._claimed.items()}
-        parts = self._parts(source, stated.values())
+        parts = shared_parts(source, self.station, stated.values())
         found: list[tuple[Mapping[str, Any], Mapping[str, Any]]] = []
         for number, digests in stated.items():
             own: dict[str, Any] = contents.get(number) or {}
-            named = {name: parts.get(digests[name]) for name in _NAMED}
+            named = {name: parts.get(digests[name]) for name in SHARED_PARTS}
             shown = own and own | named | {chain.CLAIM: chain.claim_of(own)}
             if not shown or any(
                 chain.digest(shown[name]) != digest for name, digest in digests.items()

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from typing import Final
 
-_DEFINER: Final = "SECURITY DEFINER SET search_path = public, pg_temp"
+from flasher.plant.functions import DEFINER
 
 _TAKEN_OVER: Final = f"""
 CREATE OR REPLACE FUNCTION plant_taken_over(
     OUT number bigint, OUT hash text, OUT at text, OUT data text
-) RETURNS SETOF record LANGUAGE sql STABLE {_DEFINER} AS $$
+) RETURNS SETOF record LANGUAGE sql STABLE {DEFINER} AS $$
     SELECT c.number, c.hash, c.at, c.data FROM chain_row c
         WHERE c.station = plant_my_station() AND c.event = 'taken over'
         ORDER BY c.number DESC LIMIT 1
@@ -20,7 +20,7 @@ $$
 
 _REPORT: Final = f"""
 CREATE OR REPLACE FUNCTION plant_report_other(refused text) RETURNS void
-LANGUAGE sql {_DEFINER} AS $$
+LANGUAGE sql {DEFINER} AS $$
     UPDATE plant_station SET other_refusal = left(refused, 1000),
         other_reported_at = clock_timestamp() WHERE role = session_user
 $$
@@ -28,7 +28,7 @@ $$
 """Report of a PC that was taken over: it leaves the report of the station as it is."""
 
 _CLOSE: Final = f"""
-CREATE OR REPLACE FUNCTION plant_close() RETURNS trigger LANGUAGE plpgsql {_DEFINER} AS $$
+CREATE OR REPLACE FUNCTION plant_close() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 BEGIN
     DELETE FROM open_run WHERE station = NEW.station AND run_number = NEW.run_number;
     RETURN NULL;

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +13,19 @@ from sqlalchemy import Connection, func, select
 
 from flasher.i18n import text
 from flasher.plant.archive import ArchivedChain
-from flasher.plant.archive_check import ArchiveExaminer, assembled, without_ids
+from flasher.plant.archive_check import (
+    ArchiveExaminer,
+    AssembledExaminer,
+    assembled,
+    without_ids,
+)
 from flasher.plant.retire import last_archived, recorded_chains
-from flasher.plant.schema import SHARED_PARTS, archive_file, chain_row, kept_run, shared_part
-from flasher.plant.store import PlantStore
+from flasher.plant.schema import archive_file, chain_row, kept_run
+from flasher.plant.store import PlantStore, shared_parts
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.errors import RecordError
-from flasher.station.records.examination import (
-    Examiner,
-    Trail,
-    same_traces,
-)
+from flasher.station.records.examination import Trail, same_traces
 from flasher.station.records.model import Problem
 from flasher.station.records.queries import is_whole
 from flasher.station.records.rows import batches
@@ -75,7 +74,7 @@ class PlantExamination:
     """Files of retired months that were not."""
 
 
-class PlantExaminer(Examiner):
+class PlantExaminer(AssembledExaminer):
     """Examines a plant's database once."""
 
     def __init__(
@@ -86,7 +85,6 @@ class PlantExaminer(Examiner):
     ) -> None:
         """`archives`: folder of the files of retired months."""
         super().__init__(store.database, store.files, store.signer.key_locations, progress)
-        self._runs = 0
         self._folder = archives
 
     def examine_plant(self) -> PlantExamination:
@@ -198,17 +196,10 @@ class PlantExaminer(Examiner):
         )
         rows = connection.execute(query.order_by(chain_row.c.number)).mappings().all()
         digests = [chain.data_of(row["data"]).get("digests", {}) for row in rows]
-        found = assembled(rows, _parts(connection, station, digests))
+        found = assembled(rows, shared_parts(connection, station, digests))
         central = {row["run_number"]: row["run_id"] for row in rows if row["content"] is not None}
-        for number in found.incomplete:
-            yield Problem(text("run {run_id}", run_id=number), "a part of it is missing")
-        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-        yield from self._contents(found.contents, found.stated, changed)
-        for (part, _), of_runs in changed.items():
-            what = f"changed after it was recorded: {chain.NAMED[part]}"
-            yield Problem(text("run {run_id}", run_id=of_runs[0]), what)
+        yield from self._assembled(found)
         yield from self._projected(connection, found.contents, central)
-        self._runs += len(found.contents)
 
     def _projected(
         self, connection: Connection, contents: Mapping[int, Any], central: Mapping[int, int]
@@ -237,19 +228,6 @@ def _gaps(files: Mapping[str, Sequence[ArchivedChain]]) -> Iterator[Problem]:
             what = f"the files of retired months do not continue at row {each.first}"
             yield Problem(f"audit trail of {printable(each.name)}", what)
         ends[each.station] = each
-
-
-def _parts(connection: Connection, station: UUID, digests: Any) -> Mapping[str, Any]:
-    """Shared parts of a station by their digest."""
-    wanted = {each[name] for each in digests for name in SHARED_PARTS if name in each}
-    found: dict[str, Any] = {}
-    for some in batches(wanted):
-        query = select(shared_part.c.sha256, shared_part.c.content).where(
-            shared_part.c.station == station, shared_part.c.sha256.in_(some)
-        )
-        for sha256, content in connection.execute(query):
-            found[sha256] = json.loads(content)
-    return found
 
 
 def _begun(connection: Connection, station: UUID) -> tuple[Trail, str]:
