@@ -47,8 +47,17 @@ _LOCK: Final = 7054
 
 
 @dataclass(frozen=True)
+class DueMonth:
+    """A month that would be retired."""
+
+    month: str
+    rows: int
+    runs: int
+
+
+@dataclass(frozen=True)
 class RetiredMonth:
-    """A month that is in a file now, or would be."""
+    """A month that is in a file now."""
 
     month: str
     file: str
@@ -110,17 +119,19 @@ class Retirement:
                 remedy=f"Use the user {printable(owner)}.",
             )
 
-    def months(self, before: str) -> list[tuple[str, int, int]]:
-        """Months before `before` with their numbers of audit rows and runs; nothing is changed."""
+    def months(self, before: str) -> list[DueMonth]:
+        """Months before `before` with what would be retired of them; nothing is changed."""
         month = func.substr(chain_row.c.at, 1, 7).label("month")
+        same = chain_row.alias()
+        newest = select(func.max(same.c.number)).where(same.c.station == chain_row.c.station)
         query = (
             select(month, func.count(), func.count(chain_row.c.content))
-            .where(chain_row.c.at < before)
+            .where(chain_row.c.at < before, chain_row.c.number < newest.scalar_subquery())
             .group_by(month)
             .order_by(month)
         )
         with self._central.reading() as connection:
-            return [(each, rows, runs) for each, rows, runs in connection.execute(query)]
+            return [DueMonth(each, rows, runs) for each, rows, runs in connection.execute(query)]
 
     def retire(self, before: str, *, with_problems: bool = False) -> Iterator[RetiredMonth]:
         """Retire every month before `before`, oldest first. Raises RecordError, UsageError."""

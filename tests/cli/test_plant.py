@@ -528,6 +528,13 @@ def test_retire_moves_months_to_files_that_verify_examines(
     assert "is not a month" in flasher(*words, "--before", "2026").err
     shown = flasher(*words, "--before", "2026-06", "--dry-run")
     assert (shown.code, shown.out) == (ExitCode.OK, "2026-05: 4 rows, 1 run\n")
+    due = flasher(*words, "--before", "2026-07", "--dry-run", "--json")
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), due.out, due.code)
+    # The newest row of a station stays.
+    assert due.document["due"] == [
+        {"month": "2026-05", "rows": 4, "runs": 1},
+        {"month": "2026-06", "rows": 1, "runs": 0},
+    ]
     assert not folder.exists()
     reader = (*words[:3], plant.url("flasher_desk"), *words[4:])
     refused = flasher(*reader, "--before", "2026-06")
@@ -536,6 +543,8 @@ def test_retire_moves_months_to_files_that_verify_examines(
     run = flasher(*words, "--before", "2026-06")
     assert run.code == ExitCode.OK, run.err
     assert run.out.startswith("2026-05: 4 rows, 1 run, 1 trace in flasher-")
+    again = flasher(*words, "--before", "2026-06", "--dry-run")
+    assert again.out == "nothing to retire before 2026-06\n"
     again = flasher(*words, "--before", "2026-06", "--json")
     hold_output(json.loads(SCHEMA.read_text("utf-8")), again.out, again.code)
     assert again.document["months"] == []

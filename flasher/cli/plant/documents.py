@@ -13,7 +13,7 @@ from flasher.plant.fetcher import Fetched
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.recipes import RecipeEvent
 from flasher.plant.reconcile import Reconciliation
-from flasher.plant.retire import RetiredMonth
+from flasher.plant.retire import DueMonth, RetiredMonth
 from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
 from flasher.station.records.model import PassedTwice
@@ -88,6 +88,8 @@ class PlantRetireDocument:
     before: str
     """First month that stays."""
     months: list[RetiredMonth]
+    due: list[DueMonth]
+    """With --dry-run: what would be retired."""
 
 
 @dataclass(frozen=True)

@@ -46,20 +46,24 @@ def retire(
     ):
         work = Retirement(central, store.database, folder, bar.move_to)
         if dry_run:
-            for month, rows, runs in work.months(before):
-                output.result(printable(f"{month}: {counted(rows, 'row')}, {counted(runs, 'run')}"))
-            return output.document(PlantRetireDocument(before, months))
+            due = work.months(before)
+            for each in due:
+                held = f"{counted(each.rows, 'row')}, {counted(each.runs, 'run')}"
+                output.result(printable(f"{each.month}: {held}"))
+            if not due:
+                output.result(f"nothing to retire before {before}")
+            return output.document(PlantRetireDocument(before, months, due))
         try:
-            for each in work.retire(before, with_problems=with_problems):
-                months.append(each)
-                output.result(printable(_line(each)))
+            for retired in work.retire(before, with_problems=with_problems):
+                months.append(retired)
+                output.result(printable(_line(retired)))
         except ArchiveRefusedError as error:
             for problem in error.problems:
                 output.result(printable(f"PROBLEM  {problem.where}: {problem.what}"))
             raise
     if not months:
         output.result(f"nothing to retire before {before}")
-    return output.document(PlantRetireDocument(before, months))
+    return output.document(PlantRetireDocument(before, months, []))
 
 
 def _line(each: RetiredMonth) -> str:
