@@ -51,6 +51,8 @@ def _start_frozen() -> NoReturn:
     os.environ.pop("LD_LIBRARY_PATH", None)
     if before is not None:
         os.environ["LD_LIBRARY_PATH"] = before
+    # But its own processes get those of the folder again, as they did not inherit them.
+    os.environ["PYINSTALLER_RESET_ENVIRONMENT"] = "1"
     freeze_support()
     sys.exit(main())
 

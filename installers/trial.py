@@ -1,12 +1,14 @@
 """Tries a build of flasher as its users run it, on a computer without a network.
 
-`unshare --user --map-root-user --net -- python3 installers/trial.py CHECKOUT COMMAND...` with the
-words that start the build. Ends with 1 and the output of what went wrong. `--core` before CHECKOUT
-tries a build without pages and station.
+`unshare --user --map-root-user --net --mount -- python3 installers/trial.py CHECKOUT COMMAND...`
+with the words that start the build. Ends with 1 and the output of what went wrong. `--core` before
+CHECKOUT tries a build without pages and station. Libraries that a build brings are hidden on this
+computer: others do not have them.
 """
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import os
 import re
@@ -22,6 +24,7 @@ from pathlib import Path
 
 LIMIT_S = 120.0
 START_LIMIT_S = 1.5
+_MS_BIND = 4096
 _UP = 0x8914, 0x1  # SIOCSIFFLAGS, IFF_UP: pages are served on the loopback interface
 
 
@@ -32,6 +35,7 @@ def main() -> int:
     samples = Path(checkout).resolve() / "firmware_samples"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as loopback:
         fcntl.ioctl(loopback, _UP[0], struct.pack("16sh", b"lo", _UP[1]))
+    _hide_libraries_of(Path(program[0]).parent / "_internal")
     with tempfile.TemporaryDirectory() as home:
         os.chdir(home)
         os.environ |= {"HOME": home, "SHIV_ROOT": f"{home}/shiv"}
@@ -52,6 +56,18 @@ def main() -> int:
             trial.station(samples)
             trial.pages(samples)
     return 0
+
+
+def _hide_libraries_of(build: Path) -> None:
+    system = Path("/usr/lib", f"{os.uname().machine}-linux-gnu")
+    for library in build.glob("*.so*"):
+        place = system / library.name
+        if place.exists():
+            hidden = ctypes.CDLL(None, use_errno=True).mount(
+                b"/dev/null", bytes(place), None, _MS_BIND, None
+            )
+            if hidden:
+                sys.exit(f"{place} cannot be hidden: {os.strerror(ctypes.get_errno())}")
 
 
 class Trial:

@@ -316,7 +316,7 @@ def _begin_sqlite(connection: Connection) -> None:
 def no_records(location: Location) -> UsageError:
     return UsageError(
         f"There are no records at {location.shown}.",
-        remedy="Correct the name of the file.",
+        remedy="Correct the name of the file. `flasher station run` makes those of a new station.",
         code=ErrorCode.FILE_NOT_READ,
     )
 
