@@ -267,8 +267,8 @@ def judge_bike(
 def check_same_battery(
     connection: Connection, profile: Profile, serial: str, **watch: Unpack[CallOptions]
 ) -> None:
-    """Raise WrongDeviceError if the battery is another one than before the first upgrade; `serial`
-    is its serial number then, "" if unknown, `profile` that of the battery.
+    """Raise WrongDeviceError if the battery is another one than before; `serial` is its serial
+    number then, "" if unknown, `profile` that of the battery.
     """
     request = profile.upgrade_options().version_request_for(BMS)
     if not serial or request is None:
@@ -277,7 +277,7 @@ def check_same_battery(
         now = serial_number(connection.device(profile=profile, **watch).ask(request))
         if now and now != serial:
             raise WrongDeviceError(
-                f"The BMS has the serial number {now}, and had {serial} before the first upgrade.",
+                f"The BMS has the serial number {now}, and had {serial} before.",
                 cause="another bike is connected, or another battery",
                 remedy="Connect the first bike with its battery and run the same command, then "
                 "run it for the other one.",

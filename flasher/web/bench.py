@@ -18,7 +18,7 @@ from typing import Final, Protocol, TypeVar
 
 from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
-from flasher.bike import SetImage, open_bike_set, serial_number
+from flasher.bike import SetImage, check_same_battery, open_bike_set, serial_number
 from flasher.driver import Tap, drive
 from flasher.errors import (
     ErrorCode,
@@ -45,8 +45,7 @@ from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
 from flasher.kept_settings import settings_of
 from flasher.procedures import nothing_received_error
-from flasher.protocol.contents import Memory, RunningInformation
-from flasher.protocol.fields import Content
+from flasher.protocol.contents import Memory, RunningInformation, VersionInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.release.places import SUFFIX as RELEASE_SUFFIX
@@ -174,8 +173,8 @@ class BenchController:
         self._is_closing = self._ends_at_once = False
         self._expected_serial = ""
         """Serial number of the unit that may be upgraded; "" for any."""
-        self._other_serial = ""
-        """Serial number that another unit has reported instead."""
+        self._other_serial: str | None = None
+        """Serial number that another unit has reported instead; "": it has none."""
         self._connection: Connection | None = None
         """Open while an order needs the bus from one step to the next."""
         self.show()
@@ -267,7 +266,7 @@ class BenchController:
         left_s = self.state.power_cycle_left_s
         if left_s(self.now()) != left_s(self.state.now_s):
             self.show()
-        is_asked = self._stop.is_set() or self._ends_at_once or bool(self._other_serial)
+        is_asked = self._stop.is_set() or self._ends_at_once or self._other_serial is not None
         if is_asked and not self.state.is_stopping:
             self.show(is_stopping=True)
         return is_asked
@@ -632,7 +631,31 @@ class BenchController:
         job = self.job(offer.path, chosen)
         if job.plan.image.sha256 != offer.sha256:
             raise changed_error(offer)
-        self.carry_out(job, offer)
+        bike = self.state.bike
+        shown = "" if bike is None or self.state.is_rescue else serial_number(bike.version)
+        if chosen is not BMS:  # its upgrade does not ask the battery
+            self.check_same_bike(shown)
+        self._expected_serial = shown
+        try:
+            self.carry_out(job, offer)
+        finally:
+            self._expected_serial, self._other_serial = "", None
+
+    def check_same_bike(self, battery: str) -> None:
+        """Raise WrongDeviceError if another battery answers than the one with this serial number;
+        "" if it is unknown.
+        """
+        with self.connected() as connection:
+            try:
+                check_same_battery(
+                    connection, self.backend.profile(BMS), battery, cancelled=self.cancelled
+                )
+            except FlasherError as error:
+                error.remedy = text(
+                    "Connect the first bike and press the same button again, or look again for "
+                    "this one."
+                )
+                raise
 
     def _begin(self) -> None:
         self.show(
@@ -654,11 +677,11 @@ class BenchController:
             on_event=self._happened,
             cancelled=self.cancelled,
         )
-        if self._other_serial and isinstance(carried.error, InterruptedByUserError):
+        if self._other_serial is not None and isinstance(carried.error, InterruptedByUserError):
             carried.error = WrongDeviceError(
                 text(
                     "The unit {other} answers now, and {serial} was shown: nothing was written.",
-                    other=self._other_serial,
+                    other=self._other_serial or text("without serial number"),
                     serial=self._expected_serial,
                 ),
                 remedy=text("Leave one unit connected until its upgrade has ended."),
@@ -678,8 +701,9 @@ class BenchController:
         is_new = carried.result is not None and carried.result.outcome.ok
         if is_new and done.target.has_version_query:
             self.show(doing=Activity.LOOKING_AGAIN)
-            done = replace(done, after=self.seen(done.target))
-            self.show(done=done)
+            after = self.seen(done.target)
+            done = replace(done, after=after)
+            self.show(done=done, bike=after if done.target is BMS else state.bike)
         return done
 
     def note_session(
@@ -690,15 +714,12 @@ class BenchController:
         entry = SessionEntry(self.date(), target, serial, offer.name, error, is_left_out)
         self.show(session=(*self.state.session, entry))
 
-    def expect_unit(self, serial: str) -> None:
-        """Let the next upgrade write to the unit with this serial number only; "" for any."""
-        self._expected_serial, self._other_serial = serial, ""
-
     def _check_unit(self, event: object) -> None:
         """End the upgrade before it writes to another unit than the expected one."""
-        if isinstance(event, events.QueryAnswered) and self._expected_serial:
-            serial = serial_number(event.content if isinstance(event.content, Content) else None)
-            if serial not in ("", self._expected_serial):
+        content = event.content if isinstance(event, events.QueryAnswered) else None
+        if isinstance(content, VersionInformation) and self._expected_serial:
+            serial = serial_number(content)
+            if serial != self._expected_serial:
                 self._other_serial = serial
 
     def _happened(self, event: object) -> None:

@@ -7,13 +7,12 @@ from dataclasses import replace
 from typing import Final
 
 from flasher.bike import (
-    check_same_battery,
     in_safe_order,
     judge_bike,
     look_at_bike,
     serial_number,
 )
-from flasher.errors import FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import InterruptedByUserError, UsageError
 from flasher.i18n import text, with_value
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import RESCUE, BenchController, changed_error
@@ -91,14 +90,7 @@ def _check_goes_on(bench: BenchController, battery: str) -> None:
             text("The upgrade of the bike was stopped between two devices."),
             remedy=text("The same button goes on with the next one."),
         )
-    with bench.connected() as connection:
-        try:
-            check_same_battery(
-                connection, bench.backend.profile(BMS), battery, cancelled=bench.cancelled
-            )
-        except FlasherError as error:
-            error.remedy = text("Connect the first bike, and press the same button again.")
-            raise
+    bench.check_same_bike(battery)
 
 
 def _ended(bench: BenchController, done: Done) -> None:

@@ -129,6 +129,10 @@ class _SeriesRun:
                 return True
         elif not self._count_down(changes, serial, running):
             return False
+        if serial:  # a unit that was just taken out does not answer any more
+            answers = watch.answers
+            if not self._run(lambda _now: watch.changes != changes or watch.answers > answers):
+                return False
         if watch.changes != changes:
             return True
         return self._upgrade(serial, offer)
@@ -164,20 +168,19 @@ class _SeriesRun:
         bench = self._bench
         bench.show(offer=offer)
         self._show(SeriesStep.UPGRADING, serial=serial)
-        bench.expect_unit(serial)
         try:
             bench.upgrade(self._target.name, offer.sha256)
-        finally:
-            bench.expect_unit("")
-        done = bench.state.done
+        finally:  # also if the adapter is lost while the unit is read after its upgrade
+            done = bench.state.done
+            if done is not None:
+                self._remember(done)
+                self._watched().start_over()
+            self._followed_at = bench.now()
         assert done is not None  # noqa: S101  an upgrade that returns has ended
-        self._remember(done)
         error = done.error
         has_ended = isinstance(error, BusError | InterruptedByUserError)
-        if error is not None and (error.needs_rescue or has_ended):
-            return False  # the result has the error, and leads to the rescue
-        self._watched().start_over()
-        return True
+        # The result has the error, and leads to the rescue.
+        return error is None or not (error.needs_rescue or has_ended)
 
     def _judged(self) -> Offer:
         """Check the image against the unit that is connected now. Raises ImageError if the file is

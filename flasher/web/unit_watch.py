@@ -61,6 +61,11 @@ class UnitWatch:
         self.unchanged_since = -inf
         """Time of the last of them."""
 
+    @property
+    def answers(self) -> int:
+        """Number of version answers of the unit that is there."""
+        return sum(each.answers for each in self._presence.watchers)
+
     def until(self, is_enough: Callable[[float], bool]) -> UnitWatch:
         """Return this engine, to run until the condition holds; it gets the time."""
         self._is_enough, self.done = is_enough, False

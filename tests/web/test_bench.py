@@ -19,6 +19,7 @@ from flasher import events
 from flasher.cli.upgrade.bench_page import LastChoices
 from flasher.errors import (
     BusError,
+    ErrorCode,
     ImageError,
     InterruptedByUserError,
     NoAnswerError,
@@ -31,10 +32,11 @@ from flasher.history import MOCK, Began, Flash, FlashHistory, Reached, latest_le
 from flasher.host.event_text import progress_line
 from flasher.host.verify import Level, Verdict, Verification
 from flasher.i18n import Text, text, without_options
+from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
-from flasher.protocol.spec import BMS
+from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
 from flasher.web.bench_page import as_it_is_now, battery_answers, facts
@@ -117,6 +119,40 @@ def test_an_upgrade_that_the_history_cannot_take_says_so(
     done = _done(place)
     assert done.is_completed
     assert done.warning.startswith("no history in ")
+
+
+@each(
+    "target, serial, words",
+    [
+        ("bms", "W2605777", "The unit W2605777 answers now, and W2605001 was shown"),
+        ("bms", "", "The unit without serial number answers now, and W2605001 was shown"),
+        ("wmc", "W2605777", "The BMS has the serial number W2605777, and had W2605001"),
+    ],
+)
+def test_another_bike_than_the_one_shown_gets_nothing(
+    target: str, serial: str, words: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = BenchPlace(tmp_path_factory.mktemp("place"))
+    state = _chosen(place, BikeFault.EXCHANGED, target=target)
+    bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
+    made = bike._device
+
+    def other(target: Target) -> MockDevice:
+        if target is not BMS:
+            return made(target)
+        profile = replace(DeviceProfile(), serial_number=serial)
+        return MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+
+    bike._device = other  # type: ignore[method-assign]
+    for socket in bike._places:
+        socket._device = socket._made()
+    state = place.do(_upgrade(state))
+    error = state.trouble if state.done is None else state.done.error
+    assert error is not None
+    assert error.code is ErrorCode.NOT_FOR_DEVICE
+    assert words in error.what
+    assert not error.needs_rescue
+    assert state.packet == 0
 
 
 def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:

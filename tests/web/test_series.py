@@ -10,13 +10,15 @@ from pathlib import Path
 import pytest
 
 from flasher import events
+from flasher.driver import Tap
 from flasher.errors import BusError, ErrorCode
 from flasher.mock.faults import AtTime, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.procedures import DeviceInfo
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.web.bench import BenchController
-from flasher.web.bench_state import BenchState, Series, SeriesStep
+from flasher.web.bench_state import Activity, BenchState, Series, SeriesStep
 from flasher.web.series import SHOWN_S, take_next_bikes
 from flasher.web.virtual_bike import BikeFault, VirtualBike
 from tests.loops import each
@@ -233,6 +235,56 @@ def test_another_unit_than_the_one_shown_is_not_written_to(place: BenchPlace) ->
     assert not failed.error.needs_rescue
     assert state.done is not None
     assert state.done.packet == 0
+
+
+@each("target", ["bms", "wmc"])
+def test_a_unit_taken_out_in_the_last_seconds_gets_nothing(
+    target: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = BenchPlace(tmp_path_factory.mktemp("place"))
+    session = Session(place, BikeFault.EXCHANGED, target=target)
+
+    def take_out() -> None:
+        if len([each for each in session.steps if each.step is SeriesStep.SHOWN]) == 1:
+            for socket in session.bike._places:
+                socket.exchange(session.bike._clock.now() + SHOWN_S - 1.0)
+
+    session.at[SeriesStep.SHOWN] = take_out
+    session.at[SeriesStep.REMOVAL] = session.stop_after(2)
+    state = session.run()
+    assert [(each.serial, each.error) for each in state.session] == [
+        ("W2605001", None),
+        ("W2605003", None),
+    ]
+
+
+def test_a_unit_whose_adapter_was_lost_after_its_upgrade_is_not_upgraded_again(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(place, BikeFault.EXCHANGED)
+    seen = place.bench.seen
+    monkeypatch.setattr(session.bike, "ended", lambda: None)  # it stays
+
+    def lost(target: Target, *taps: Tap) -> DeviceInfo:
+        if place.bench.state.doing is Activity.LOOKING_AGAIN:
+            place.bench.seen = seen  # type: ignore[method-assign]
+            raise BusError("The adapter is gone.")
+        return seen(target, *taps)
+
+    place.bench.seen = lost  # type: ignore[method-assign]
+    place.bench.pause = lambda duration_s: None  # type: ignore[method-assign]  # noqa: ARG005
+    turns = 0
+
+    def now() -> float:
+        nonlocal turns
+        turns += SeriesStep.ADAPTER in session.names
+        if turns > 1000:
+            place.bench.stop()
+        return 0.0
+
+    place.bench.now = now
+    session.run()
+    assert session.names[-2:] == [SeriesStep.ADAPTER, SeriesStep.REMOVAL]
 
 
 def test_an_image_that_is_not_meant_for_the_unit_is_not_written(place: BenchPlace) -> None:
