@@ -301,13 +301,20 @@ class Deliveries:
             rows = connection.execute(query, {"receiver": receiver})
             return {key_of(row.station, row.number): DeliveryState(row.state) for row in rows}
 
-    def send_again(self, receiver: str, keys: Sequence[str]) -> None:
-        """Hand runs over again, or sooner than planned. Raises UsageError."""
+    def send_again(self, receiver: str, keys: Sequence[str]) -> list[str]:
+        """Hand runs over again, or sooner than planned. Returns the keys of those that cannot be:
+        they were retired. Raises UsageError.
+        """
+        retired = []
         with self._central.writing() as connection:
             for key in keys:
                 station, number = parse_key(key)
                 of = {"receiver": receiver, "station": station, "number": number}
-                connection.execute(_ENQUEUE, of)
+                if connection.execute(_RUN_OF, of).first() is None:
+                    retired.append(key)
+                else:
+                    connection.execute(_ENQUEUE, of)
+        return retired
 
     def stop(self, receiver: str) -> None:
         """Hand over no further runs to a receiver. Raises UsageError."""

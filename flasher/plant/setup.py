@@ -174,6 +174,12 @@ def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -
 
 
 def _migrate(connection: Connection, central: Central) -> None:
+    is_current(connection, central)
+    _alembic(connection, "upgrade")
+
+
+def is_current(connection: Connection, central: Central) -> bool:
+    """False if the tables have an older schema. Raises UsageError if they have a newer one."""
     query = text(f"SELECT version_num FROM {VERSION_TABLE}")  # noqa: S608  a constant
     found = str(connection.execute(query).scalar_one_or_none())
     if found.isdecimal() and int(found) > int(PLANT_SCHEMA):
@@ -184,7 +190,7 @@ def _migrate(connection: Connection, central: Central) -> None:
             remedy="Use that newer flasher.",
             code=ErrorCode.RECORDS_VERSION,
         )
-    _alembic(connection, "upgrade")
+    return found == PLANT_SCHEMA
 
 
 def _alembic(connection: Connection, action: str) -> None:

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from flasher.errors import FlasherError, UsageError
 from flasher.plant import archive, retire
@@ -127,6 +128,7 @@ def test_a_month_that_is_not_handed_over_stays(plant: Plant, sender: Sender) -> 
         assert attempt is not None
         deliveries.end(attempt, Answer(DeliveryState.CONFIRMED, "200"))
         assert [each.month for each in retired(plant, "2026-06")] == ["2026-05"]
+        assert deliveries.send_again("mes", [oldest.key]) == [oldest.key]
         # Its key stays, so that it is not unknown when a receiver lists it.
         assert deliveries.keys("mes")[oldest.key] is DeliveryState.CONFIRMED
 
@@ -335,6 +337,14 @@ def test_figures_begin_after_what_was_retired(three_months: Plant) -> None:
         begin = store.figures_begin()
         assert begin == datetime(2026, 6, 1, tzinfo=UTC)
         assert store.read.figures(RunFilter(since=begin)).units == 4
+
+
+@pytest.mark.parametrize(("schema", "what"), [("99", "has schema 99"), ("5", "an older flasher")])
+def test_tables_of_another_version_are_not_retired(plant: Plant, schema: str, what: str) -> None:
+    with closing(Central(plant.url())) as central, central.writing() as connection:
+        connection.execute(text("UPDATE plant_version SET version_num = :to"), {"to": schema})
+    with pytest.raises(UsageError, match=what), retirement(plant):
+        pass
 
 
 def test_months() -> None:

@@ -126,11 +126,12 @@ def reconcile(output: Output, url: str, receiver: str, file: Path, *, resend: bo
         if receiver not in {each.name for each in found.receivers()}:
             raise unknown_receiver(receiver)
         result = compare(receiver, listed, found.keys(receiver))
-        if resend:
-            found.send_again(receiver, result.missing)
+        retired = found.send_again(receiver, result.missing) if resend else []
     output.results(_differences(result))
     if resend and result.missing:
-        output.result(f"{counted(len(result.missing), 'run')} will be sent again")
+        output.result(f"{counted(len(result.missing) - len(retired), 'run')} will be sent again")
+    for key in retired:
+        output.progress(f"note: {key} was retired to a file, and is not sent again")
     code = ExitCode.OK if result.agrees else ExitCode.VERIFICATION
     return output.document(result, exit_code=code)
 

@@ -209,8 +209,8 @@ _TOO_SLOW: Final[_Kind] = (
 )
 _NO_TABLES: Final[_Kind] = (
     RecordError,
-    "the database has other tables",
-    "Name the right database. flasher plant init, or a station's first start, makes the tables.",
+    "a table is not in the database",
+    "Name the right database, or run flasher plant init, which makes or updates the tables.",
 )
 """Undefined table or function."""
 _POSTGRESQL: Final[dict[str, _Kind]] = {
@@ -226,7 +226,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "42501": (
         RecordsReadOnlyError,
         "this user of the database lacks the right",
-        "The owner of the plant's database grants it: flasher plant init.",
+        "Use a user that has it. After an update of flasher, run flasher plant init again.",
     ),
     "53": (
         DiskFullError,
