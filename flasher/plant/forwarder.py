@@ -4,8 +4,9 @@
         while forwarder.forward():     # a batch is one transaction
             pass
 
-The database says which row it has last (`plant_enter`), so nothing is remembered here: whatever is
-killed at whatever moment, the next batch begins after that row. Rows that arrive twice are ignored.
+The database states which row it has last (`plant_enter`), so nothing is remembered here: whatever
+is killed at whatever moment, the next batch begins after that row. Rows that arrive twice are
+ignored.
 """
 
 from __future__ import annotations

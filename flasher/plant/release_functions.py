@@ -2,8 +2,8 @@
 """SQL functions and rights for recipes that the plant gives out.
 
 A station may execute three functions, which show it what is published for it and nothing else.
-Members of `flasher_publishers` add rows; nobody changes or deletes one, and the database states who
-added it and when.
+Members of `flasher_publishers` add rows, which are never changed or deleted; the database states
+who added each one, and when.
 """
 
 from __future__ import annotations

@@ -162,6 +162,7 @@ plant_duplicate: Final = Table(
     Column("first_run_id", BigInteger, nullable=False),
 )
 """A PASS of a unit of which another station's PASS had arrived."""
+
 released_file: Final = Table(
     "released_file",
     metadata,

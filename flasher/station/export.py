@@ -58,7 +58,7 @@ def seal(path: Path, members: Mapping[str, bytes], passphrase: str) -> None:
 
 def unseal(path: Path, passphrase: str) -> dict[str, bytes]:
     """Read an export. Raises UsageError for another file, UnprovenError for a wrong passphrase or a
-    changed file, which cannot be told apart.
+    changed file: the cipher does not distinguish them.
     """
     data = read(path, EXPORT_MAX_SIZE, what="export")
     shown = printable(str(path))

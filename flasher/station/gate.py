@@ -156,7 +156,7 @@ class Gate:
             self._claims.dropped(admission.claim)
 
     def close(self) -> None:
-        """Release the claims of questions that nobody waits for any more."""
+        """Release the claims of questions without an answer."""
         for asked in self._open:
             self.dropped(asked.admission)
         if self._claims is not None:
