@@ -15,7 +15,7 @@ from sqlalchemy import Connection, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import Central
-from flasher.plant.queue import OPEN, TASK
+from flasher.plant.queue import TASK
 from flasher.protocol.text import printable
 from flasher.station.records.errors import NotFoundError
 from flasher.station.records.model import RunDetails
@@ -29,10 +29,34 @@ JOB_MAX_S: Final = 300.0
 """Time after which a job of a living worker is regarded as lost: its end could not be recorded. An
 attempt and its statements take less."""
 
+
+class DeliveryState(StrEnum):
+    """How far the hand-over of a run to a receiver has come."""
+
+    WAITING = "waiting"
+    """It was not sent, or the receiver did not take it and will be asked again."""
+    SENT = "sent"
+    """It is being sent."""
+    CONFIRMED = "confirmed"
+    """The receiver, or the broker of MQTT, has it."""
+    UNKNOWN = "unknown"
+    """It was sent, and no answer says whether it was taken; it will be sent again."""
+    REFUSED = "refused"
+    """The receiver refuses it; it is sent again by hand only."""
+
+    @property
+    def is_settled(self) -> bool:
+        return self in (DeliveryState.CONFIRMED, DeliveryState.REFUSED)
+
+
+_OPEN: Final = "({})".format(
+    ", ".join(f"'{each}'" for each in DeliveryState if not each.is_settled)
+)
+"""For `IN`: deliveries that are not settled."""
 _OF: Final = "(receiver, station, number) = (:receiver, :station, :number)"
 _BEGIN: Final = text(
     f"UPDATE plant_delivery SET state = 'sent', attempts = attempts + 1, sent_at ="
-    f" clock_timestamp() WHERE {_OF} AND state IN {OPEN} RETURNING attempts"
+    f" clock_timestamp() WHERE {_OF} AND state IN {_OPEN} RETURNING attempts"
 )
 _RUN_OF: Final = text(
     "SELECT run_id FROM chain_row WHERE (station, number) = (:station, :number)"
@@ -67,19 +91,19 @@ SELECT procrastinate_retry_job_v2(id, now(), NULL, NULL, NULL) FROM lost
 """Jobs of dead workers are due again."""
 _JOBLESS: Final = text(f"""
 SELECT plant_enqueue(d.receiver, d.station, d.number) FROM plant_delivery d
-WHERE d.state IN {OPEN} AND NOT EXISTS (
+WHERE d.state IN {_OPEN} AND NOT EXISTS (
     SELECT FROM procrastinate_jobs j WHERE j.id = d.job AND j.status IN ('todo', 'doing'))
 """)
 """An open delivery whose job is gone gets another one."""
 _ENQUEUE: Final = text("SELECT plant_enqueue(:receiver, :station, :number)")
-_RECEIVERS: Final = text("""
+_RECEIVERS: Final = text(f"""
 SELECT r.name, r.since, r.stopped_at, coalesce(d.state, '') AS state, d.amount,
     o.oldest AS oldest_open_at
 FROM plant_receiver r
     LEFT JOIN (SELECT receiver, state, count(*) AS amount FROM plant_delivery GROUP BY 1, 2) d
         ON d.receiver = r.name
     LEFT JOIN (SELECT p.receiver, min(c.arrived_at) AS oldest FROM plant_delivery p
-        JOIN chain_row c USING (station, number) WHERE p.state NOT IN ('confirmed', 'refused')
+        JOIN chain_row c USING (station, number) WHERE p.state IN {_OPEN}
         GROUP BY 1) o ON o.receiver = r.name
 ORDER BY r.name
 """)
@@ -98,25 +122,6 @@ _CONDITIONS: Final = {
     "serial": "u.serial = :serial",
     "station_id": "d.station = :station_id AND d.number = :number",
 }
-
-
-class DeliveryState(StrEnum):
-    """How far the hand-over of a run to a receiver has come."""
-
-    WAITING = "waiting"
-    """It was not sent, or the receiver did not take it and will be asked again."""
-    SENT = "sent"
-    """It is being sent."""
-    CONFIRMED = "confirmed"
-    """The receiver, or the broker of MQTT, has it."""
-    UNKNOWN = "unknown"
-    """It was sent, and no answer says whether it was taken; it will be sent again."""
-    REFUSED = "refused"
-    """The receiver refuses it; it is sent again by hand only."""
-
-    @property
-    def is_settled(self) -> bool:
-        return self in (DeliveryState.CONFIRMED, DeliveryState.REFUSED)
 
 
 @dataclass(frozen=True)

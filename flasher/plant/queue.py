@@ -18,8 +18,6 @@ from sqlalchemy import Connection, text
 from flasher.plant.functions import DEFINER
 
 TASK: Final = "flasher.deliver"
-OPEN: Final = "('waiting', 'sent', 'unknown')"
-"""States of deliveries that are not settled."""
 
 _ENQUEUE: Final = f"""
 CREATE OR REPLACE FUNCTION plant_enqueue(to_receiver text, of_station uuid, of_number bigint)
