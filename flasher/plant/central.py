@@ -11,10 +11,10 @@ from typing import Final
 from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError
 
-from flasher.errors import ErrorCode, UsageError, how_to_install
+from flasher.errors import UsageError
 from flasher.plant.functions import REFUSED
 from flasher.protocol.text import printable
-from flasher.station.records.database import Location, locate
+from flasher.station.records.database import Location, locate, server_engine
 from flasher.station.records.errors import RuleBrokenError, mapped
 
 LOCK_TIMEOUT_S: Final = 10.0
@@ -99,19 +99,10 @@ class Central:
         lock_timeout_s: float = LOCK_TIMEOUT_S,
     ) -> None:
         self.location = plant_location(url)
-        try:
-            from flasher.station.records.server import make_engine  # noqa: PLC0415  an extra
-        except ImportError as error:
-            raise UsageError(
-                "A plant's database needs a driver that is not installed.",
-                cause=printable(str(error)),
-                remedy=how_to_install("plant"),
-                code=ErrorCode.PACKAGE_MISSING,
-            ) from error
         address = (
             self.location.url if database is None else self.location.url.set(database=database)
         )
-        self._engine = make_engine(address, lock_timeout_s, statement_limit_s)
+        self._engine = server_engine(address, lock_timeout_s, statement_limit_s)
 
     @property
     def shown(self) -> str:

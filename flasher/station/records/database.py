@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib
 import os
 import re
 import sqlite3
@@ -18,7 +17,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Final
 from uuid import uuid4
 
@@ -199,8 +197,7 @@ class Database:
 
     def _engine(self) -> Engine:
         if self.location.url.get_backend_name() != "sqlite":
-            made: Engine = _server().make_engine(self.location.url, self._lock_timeout_ms / 1000)
-            return made
+            return server_engine(self.location.url, self._lock_timeout_ms / 1000)
         options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
         if self.location.file is None:
             options = {
@@ -277,10 +274,12 @@ class StationLock:
         self._lock.release(force=True)
 
 
-def _server() -> ModuleType:
-    """Import the server's driver. Raises UsageError when it is not installed."""
+def server_engine(
+    url: URL, lock_timeout_s: float, statement_limit_s: float | None = None
+) -> Engine:
+    """As `server.make_engine`. Raises UsageError when its driver is not installed."""
     try:
-        return importlib.import_module("flasher.station.records.server")
+        from flasher.station.records.server import make_engine  # noqa: PLC0415  an extra
     except ImportError as error:
         raise UsageError(
             "A plant's database needs a driver that is not installed.",
@@ -288,6 +287,7 @@ def _server() -> ModuleType:
             remedy=how_to_install("plant"),
             code=ErrorCode.PACKAGE_MISSING,
         ) from error
+    return make_engine(url, lock_timeout_s, statement_limit_s)
 
 
 def read_only_sqlite(file: Path) -> sqlite3.Connection:
