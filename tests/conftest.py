@@ -96,7 +96,7 @@ def pytest_collection_finish() -> None:
     collector need not look through it again and again.
     """
     if "flasher.station.records.database" in sys.modules:
-        from tests.station import statements  # noqa: PLC0415  needs the extra `postgres`
+        from tests.station import statements  # noqa: PLC0415  needs the extra `plant`
 
         statements.share()
     gc.collect()

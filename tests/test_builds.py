@@ -56,8 +56,8 @@ def test_what_one_file_lacks_is_installed_into_an_environment_of_its_own() -> No
 
 @pytest.mark.usefixtures("frozen")
 def test_an_extra_comes_with_the_wheel_of_the_same_version() -> None:
-    assert how_to_install("station,postgres").endswith(
-        f"flasher-env/bin/python -m pip install '{WHEEL}[station,postgres]'"
+    assert how_to_install("station,web").endswith(
+        f"flasher-env/bin/python -m pip install '{WHEEL}[station,web]'"
     )
 
 

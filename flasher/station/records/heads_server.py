@@ -1,6 +1,6 @@
 """Stores chain heads in an append-only table of a PostgreSQL server.
 
-Needs the extra `postgres`; imported only when a server is configured.
+Needs the extra `plant`; imported only when a server is configured.
 """
 
 from __future__ import annotations

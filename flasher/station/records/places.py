@@ -5,7 +5,6 @@ there.
 from __future__ import annotations
 
 import hashlib
-import re
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any, Final, Protocol, TypeVar
 
 from flasher.errors import ErrorCode, FlasherError, UsageError, how_to_install
 from flasher.protocol.text import printable
-from flasher.station.records.database import locate
+from flasher.station.records.database import in_file_name, locate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.heads import ChainHead, Checkpoint, HeadsFault, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
@@ -90,7 +89,7 @@ def place_of(text: str) -> Place:
         raise UsageError(
             "Heads on a PostgreSQL server need a driver that is not installed.",
             cause=printable(str(error)),
-            remedy=how_to_install("station,postgres"),
+            remedy=how_to_install("plant"),
             code=ErrorCode.PACKAGE_MISSING,
         ) from error
     return ServerPlace(location)
@@ -98,7 +97,7 @@ def place_of(text: str) -> Place:
 
 def file_name(station: str, records_id: str, suffix: str) -> str:
     """File name for a station and its records; different names never collide."""
-    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
+    plain = in_file_name(station)[:40]
     mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
     return f"{plain}-{mark}{suffix}"
 

@@ -1,6 +1,6 @@
 """Connects to a PostgreSQL server, with timeouts.
 
-Needs the extra `postgres` or `plant`; imported only when a server is configured.
+Needs the extra `plant`; imported only when a server is configured.
 """
 
 from __future__ import annotations
