@@ -108,9 +108,6 @@ class PlantClaims:
     # -- `Claims` of a gate -----------------------------------------------------------------------
 
     def claim(self, token: str, order: Order, part: str) -> Elsewhere | None:
-        """Claim a unit if no other station does. Raises RecordError if it is not known whether the
-        unit was claimed.
-        """
         with self._mutex:
             fault = self._fault
             if not self._is_swept:

@@ -20,9 +20,8 @@ from flasher.plant.fetcher import FETCH_S, Fetcher
 from flasher.plant.forwarder import Forwarder
 from flasher.processes import signals_blocked
 from flasher.station.given_recipes import RecipeFolder
-from flasher.station.records.database import Database, Location, locate_records, open_database
+from flasher.station.records.database import locate_records, open_read_only
 from flasher.station.records.files import FileStore
-from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import SystemClock
 
 LOOK_S: Final = 1.0
@@ -53,25 +52,16 @@ class Sending:
         """Open the folder of the plant's recipes. Raises UsageError, RecordError."""
         location = locate_records(self.records, self.files)
         folder = RecipeFolder.of(location.folder, self.station)
-        return Fetcher(
-            Central(self.url), self._records(location), folder, self.station, self.recipes_for
-        )
+        records = open_read_only(location, SystemClock().utc())
+        return Fetcher(Central(self.url), records, folder, self.station, self.recipes_for)
 
     def open(self) -> Forwarder:
         """Open the station's records for reading. Raises UsageError, RecordError."""
         location = locate_records(self.records, self.files)
         central, files = Central(self.url), FileStore(location.folder)
-        return Forwarder(self._records(location), files, central, self.station, SystemClock())
-
-    @staticmethod
-    def _records(location: Location) -> Database:
-        return open_database(
-            location,
-            SystemClock().utc(),
-            lock_timeout_s=DEFAULT_LOCK_TIMEOUT_S,
-            create=False,
-            read_only=True,
-        )
+        clock = SystemClock()
+        records = open_read_only(location, clock.utc())
+        return Forwarder(records, files, central, self.station, clock)
 
 
 def keep_sending(forwarder: Forwarder, wait: Callable[[float], bool]) -> None:

@@ -36,6 +36,7 @@ PUBLISHERS: Final = "flasher_publishers"
 """Role with the right to publish and to withdraw recipes, and to read everything."""
 DELIVERERS: Final = "flasher_deliverers"
 """Role with the right to read everything and to hand runs over to the plant's systems."""
+_GROUPS: Final = (STATIONS, READERS, PUBLISHERS, DELIVERERS)
 MIGRATIONS: Final = "flasher.plant:migrations"
 _CHANGE_LIMIT_S: Final = 3600.0
 _LOCK: Final = 7053
@@ -103,7 +104,7 @@ def setup(
             )
         )
         is_new = _bring_up_to_date(connection, central, now)
-        for role in (STATIONS, READERS, PUBLISHERS, DELIVERERS):
+        for role in _GROUPS:
             _make(connection, role)
         _execute(connection, *queue.statements(connection))
         _execute(
@@ -115,16 +116,15 @@ def setup(
             *queue.FUNCTIONS,
         )
         database = connection.execute(text("SELECT current_database()")).scalar_one()
-        quoted = [_quoted(connection, each) for each in (database, STATIONS, READERS)]
+        quoted = {role: _quoted(connection, role) for role in _GROUPS}
         _execute(
             connection,
-            functions.rights(*quoted),
-            claim_functions.rights(quoted[1]),
-            takeover_functions.rights(*quoted[1:]),
+            functions.rights(_quoted(connection, database), quoted[STATIONS], quoted[READERS]),
+            claim_functions.rights(quoted[STATIONS]),
+            takeover_functions.rights(quoted[STATIONS], quoted[READERS]),
+            release_functions.rights(quoted[STATIONS], quoted[READERS], quoted[PUBLISHERS]),
+            queue.rights(quoted[DELIVERERS], quoted[READERS]),
         )
-        quoted = [_quoted(connection, each) for each in (STATIONS, READERS, PUBLISHERS)]
-        _execute(connection, release_functions.rights(*quoted))
-        _execute(connection, queue.rights(_quoted(connection, DELIVERERS), quoted[1]))
         made, named = [], []
         for station in dict.fromkeys((*stations, *renewed)):
             role = _add_station(connection, station)
@@ -204,7 +204,7 @@ def _add_station(connection: Connection, name: str) -> str:
     """Register a station; returns its role. Raises UsageError."""
     table = plant_station.c
     role = role_of(name)
-    if role in (STATIONS, READERS, PUBLISHERS, DELIVERERS):
+    if role in _GROUPS:
         raise UsageError(
             f"A station cannot be called {printable(name)}: {role} is a role of all stations.",
             remedy="Give it another name.",

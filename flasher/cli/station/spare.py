@@ -26,7 +26,7 @@ from flasher.station.records.database import (
     Location,
     StationLock,
     locate_records,
-    open_database,
+    open_read_only,
 )
 from flasher.station.records.errors import KeyMissingError, NotFoundError, mapped
 from flasher.station.records.files import FileStore, whole_file
@@ -183,10 +183,7 @@ def _bring(
 
 
 def _opened(file: Path, folder: Path) -> Database:
-    return open_database(
-        locate_records(str(file), folder), SystemClock().utc(), lock_timeout_s=5.0, create=False,
-        read_only=True,
-    )  # fmt: skip
+    return open_read_only(locate_records(str(file), folder), SystemClock().utc())
 
 
 def _check_alone(location: Location, station: str) -> None:

@@ -7,7 +7,7 @@ runs keep their numbers, which the station left free (`RUNS_LEFT_FREE`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
@@ -25,6 +25,9 @@ from flasher.station.records.rows import find_or_insert, insert
 from flasher.station.records.signatures import is_signed
 from flasher.station.records.store import Store
 
+_ROW: Final = (
+    "number", "at", "event", "run_id", "data", "previous_hash", "hash", "signature",
+)  # fmt: skip
 _UNENDED: Final = {
     "state": RunState.INTERRUPTED.value,
     "code": "STATION_DIED",
@@ -131,17 +134,14 @@ def _last(connection: Connection, station: str) -> int:
 
 
 def _rows_after(connection: Connection, station: str, number: int) -> list[dict[str, Any]]:
-    names = [
-        schema.audit.c[name]
-        for name in ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
-    ]
+    row = schema.audit.c
     query = (
-        select(*names, schema.audit.c.signature)
+        select(*(row[name] for name in _ROW))
         .join(schema.station)
-        .where(schema.station.c.name == station, schema.audit.c.number > number)
-        .order_by(schema.audit.c.number)
+        .where(schema.station.c.name == station, row.number > number)
+        .order_by(row.number)
     )
-    return [dict(row) for row in connection.execute(query).mappings()]
+    return [dict(each) for each in connection.execute(query).mappings()]
 
 
 def _check(
@@ -187,7 +187,7 @@ def _free_numbers(connection: Connection, contents: Mapping[int, Any]) -> dict[i
     return numbers
 
 
-def _passed_twice(connection: Connection, run_ids: Iterator[int] | Any) -> tuple[str, ...]:
+def _passed_twice(connection: Connection, run_ids: Iterable[int]) -> tuple[str, ...]:
     run, unit = schema.run.c, schema.unit.c
     passed = run.state == RunState.PASS.value
     brought = select(run.unit_id).where(run.id.in_(list(run_ids)), passed)
@@ -203,7 +203,7 @@ def _passed_twice(connection: Connection, run_ids: Iterator[int] | Any) -> tuple
 
 
 class _Run:
-    """Adds a run of a branch with the ids of the station's records, past no rule of them."""
+    """Adds a run of a branch under ids of the station's records, by their rules."""
 
     def __init__(self, content: Mapping[str, Any], number: int) -> None:
         self._content = content

@@ -39,7 +39,7 @@ from flasher.station.records.errors import (
     mapped,
 )
 from flasher.station.records.files import FileStore, sync_folder, whole_file
-from flasher.station.records.model import Backup, utc_text
+from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S, Backup, utc_text
 from flasher.station.records.schema import (
     SCHEMA_VERSION,
     alembic_version,
@@ -342,6 +342,13 @@ def open_database(
         database.close()
         raise
     return database
+
+
+def open_read_only(location: Location, now: datetime) -> Database:
+    """`open_database` for a station's existing records that are only read."""
+    return open_database(
+        location, now, lock_timeout_s=DEFAULT_LOCK_TIMEOUT_S, create=False, read_only=True
+    )
 
 
 def check_schema(database: Database, now: datetime, *, create: bool) -> None:
