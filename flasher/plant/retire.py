@@ -38,7 +38,7 @@ from flasher.station.records import schema
 from flasher.station.records.chain import GENESIS
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError, RecordsDamagedError
-from flasher.station.records.model import FLASH, Problem
+from flasher.station.records.model import DUPLICATES, FLASH, Problem, StepName
 
 LIMIT_S: Final = 3600.0
 """Time limit of one statement."""
@@ -395,6 +395,10 @@ CREATE TEMPORARY TABLE kept ON COMMIT DROP AS SELECT g.* FROM gone g JOIN run r 
     OR r.id IN (SELECT run_id FROM plant_duplicate UNION SELECT first_run_id FROM plant_duplicate);
 """
 """The last run of a unit, the last transfer to each target, and what claims compare with."""
+_MARK: Final = (
+    f"s.position = 1 AND s.name = '{StepName.PLANT}' AND s.run_id IN (SELECT run_id FROM kept)"
+)
+"""The step with the mark of a unit whose duplicates were not checked."""
 _DELETIONS: Final = (
     _GONE,
     "CREATE INDEX ON gone (run_id); ANALYZE gone",
@@ -410,8 +414,11 @@ _DELETIONS: Final = (
         " FROM attachment a JOIN gone g USING (run_id)"
     ),
     "DELETE FROM attachment a USING gone g WHERE a.run_id = g.run_id",
-    "DELETE FROM measurement m USING step s, gone g WHERE m.step_id = s.id AND s.run_id = g.run_id",
-    "DELETE FROM step s USING gone g WHERE s.run_id = g.run_id",
+    (
+        "DELETE FROM measurement m USING step s, gone g WHERE m.step_id = s.id"
+        f" AND s.run_id = g.run_id AND NOT (m.name = '{DUPLICATES}' AND {_MARK})"
+    ),
+    f"DELETE FROM step s USING gone g WHERE s.run_id = g.run_id AND NOT ({_MARK})",
     "DELETE FROM gone g USING kept k WHERE k.run_id = g.run_id",
     "DELETE FROM device_write w USING gone g WHERE w.run_id = g.run_id",
     "DELETE FROM run_target t USING gone g WHERE t.run_id = g.run_id",

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 from sqlalchemy import text
@@ -20,7 +21,7 @@ from flasher.plant.retire import ArchiveRefusedError, RetiredMonth, Retirement, 
 from flasher.plant.store import PlantStore
 from flasher.plant.verify import PlantExamination, PlantExaminer
 from flasher.station.records.errors import RecordError
-from flasher.station.records.model import RunFilter, RunState
+from flasher.station.records.model import Admission, Order, RunFilter, RunState
 from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import Overview
 from tests.plant.factory import READER, Plant, Sender
@@ -337,6 +338,24 @@ def test_figures_begin_after_what_was_retired(three_months: Plant) -> None:
         begin = store.figures_begin()
         assert begin == datetime(2026, 6, 1, tzinfo=UTC)
         assert store.read.figures(RunFilter(since=begin)).units == 4
+
+
+@pytest.mark.parametrize("doubt", ["", "no answer"])
+def test_the_mark_of_duplicates_stays_with_the_last_run_of_a_unit(
+    plant: Plant, sender: Sender, doubt: str
+) -> None:
+    bench = sender.bench
+    order = Order("W2605002", "A", "jo", admission=Admission(uuid4().hex, doubt))
+    run_id = bench.store.claim(order, bench.recipe).run_id
+    bench.work(run_id)
+    bench.store.finish(run_id, bench.ending(RunState.PASS, "OK", bench.traced("W2605002")))
+    bench.clock.go_on(MONTH_S)
+    bench.make(serial="W2605003")
+    sender.send()
+    retired(plant, "2026-06")
+    assert examined(plant, plant.folder / "archive").problems == ()
+    marks = plant.rows("SELECT text FROM measurement WHERE name = 'duplicates'")
+    assert [tuple(each) for each in marks] == [(f"not checked: {doubt}" if doubt else "checked",)]
 
 
 @pytest.mark.parametrize(("schema", "what"), [("99", "has schema 99"), ("5", "an older flasher")])
