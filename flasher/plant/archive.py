@@ -11,7 +11,6 @@ import gzip
 import hashlib
 import io
 import json
-import os
 import re
 import tarfile
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -29,7 +28,7 @@ from flasher.plant.schema import SHARED_PARTS, chain_row, shared_part, trace
 from flasher.protocol.text import printable
 from flasher.station.records import chain
 from flasher.station.records.errors import RecordError, RecordsDamagedError
-from flasher.station.records.files import sync_folder
+from flasher.station.records.files import whole_file
 from flasher.station.records.rows import batches
 
 FORMAT: Final = 1
@@ -110,24 +109,20 @@ def write_archive(
     progress: Callable[[int], None],
 ) -> None:
     """Write a file; it has its name only when it is whole and on the disk. Raises OSError."""
-    part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as file:
-        with (
-            gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as packed,
-            tarfile.open(fileobj=packed, mode="w|") as tar,
-        ):
-            writer = _Writer(connection, tar)
-            for each in chains:
-                writer.add_chain(each, progress)
-            manifest = Manifest(
-                FORMAT, plant, month, chains, writer.rows, writer.runs, writer.traces,
-                tuple(writer.missing),
-            )  # fmt: skip
-            writer.add(_MANIFEST, _READ.dump_json(manifest, indent=1))
-        file.flush()
-        os.fsync(file.fileno())
-    part.rename(path)
-    sync_folder(path.parent)
+    with (
+        whole_file(path) as part,
+        part.open("wb") as file,
+        gzip.GzipFile("", "wb", _LEVEL, file, mtime=0) as packed,
+        tarfile.open(fileobj=packed, mode="w|") as tar,
+    ):
+        writer = _Writer(connection, tar)
+        for each in chains:
+            writer.add_chain(each, progress)
+        manifest = Manifest(
+            FORMAT, plant, month, chains, writer.rows, writer.runs, writer.traces,
+            tuple(writer.missing),
+        )  # fmt: skip
+        writer.add(_MANIFEST, _READ.dump_json(manifest, indent=1))
 
 
 class _Writer:

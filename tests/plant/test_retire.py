@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 from uuid import uuid4
 
 import pytest
@@ -221,7 +223,7 @@ def test_a_call_that_is_killed_loses_nothing_and_the_next_one_goes_on(
             case "write":
                 patch.setattr(archive._Writer, "_add_traces", die)
             case "rename":
-                patch.setattr(Path, "rename", die)
+                patch.setattr(Path, "replace", die)
             case "examine":
                 patch.setattr(ArchiveExaminer, "examine_file", die)
             case "delete":
@@ -255,6 +257,32 @@ def test_a_full_disk_deletes_nothing(three_months: Plant) -> None:
     with pytest.raises(UsageError, match="Nothing was deleted"):
         retired(three_months, "2026-06")
     assert counts(three_months) == before
+
+
+def test_a_disk_that_gets_full_while_it_is_written_keeps_no_part_of_it(
+    three_months: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resource = pytest.importorskip("resource", reason="a system with limits of file sizes")
+    before = counts(three_months)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    usual = archive.write_archive
+
+    def limited(*values: Any) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+        try:
+            usual(*values)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    monkeypatch.setattr(retire, "write_archive", limited)
+    before_signal = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        with pytest.raises(UsageError, match="cannot be written"):
+            retired(three_months, "2026-06")
+    finally:
+        signal.signal(signal.SIGXFSZ, before_signal)
+    assert counts(three_months) == before
+    assert list((three_months.folder / "archive").iterdir()) == []
 
 
 def test_changed_records_are_not_retired_unless_asked_for(three_months: Plant) -> None:
