@@ -19,6 +19,8 @@ _SCHEMES: Final = {"http": 80, "https": 443, "mqtt": 1883, "mqtts": 8883}
 """Schemes with their ports."""
 _SECURE: Final = ("https", "mqtts")
 _PASSWORD_MAX_SIZE: Final = 4096
+_TOPIC_MAX_BYTES: Final = 65_535
+"""MQTT 5, 1.5.4."""
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 
 
@@ -48,7 +50,8 @@ class Receiver(TomlTable):
     def _check_url(cls, value: str) -> str:
         try:
             parts = urlsplit(value)
-            has_host = bool(parts.hostname) and parts.port != 0
+            host = (parts.hostname or "").encode("idna")  # UnicodeError is a ValueError
+            has_host = bool(host) and b" " not in host and parts.port != 0
         except ValueError:
             has_host = False
         if not has_host or parts.scheme not in _SCHEMES or not value.isprintable():
@@ -61,6 +64,8 @@ class Receiver(TomlTable):
             topic = unquote(parts.path.removeprefix("/"))
             if not topic or set(topic) & {"+", "#", "\0"} or topic.startswith("$") or parts.query:
                 raise ValueError("after the host it has a topic without +, # and $")
+            if len(topic.encode()) > _TOPIC_MAX_BYTES:
+                raise ValueError(f"its topic has more than {_TOPIC_MAX_BYTES:,} bytes")
         return value
 
     @model_validator(mode="after")

@@ -110,7 +110,10 @@ class HttpTransport(Transport):
                 answer = _http_answer(response.status_code, "")
                 if answer.state is not DeliveryState.CONFIRMED:
                     answer = _http_answer(response.status_code, await _begin_of(response))
-        except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout) as error:
+        # InvalidURL: a host name that the client accepts less than `receivers` does.
+        except (
+            httpx2.InvalidURL, httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout,
+        ) as error:  # fmt: skip
             return _not_sent(error)
         except (httpx2.HTTPError, httpx2.StreamError, TimeoutError, OSError) as error:
             return answer or _lost(error)
