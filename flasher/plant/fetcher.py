@@ -15,6 +15,7 @@ from typing import Any, Final
 from sqlalchemy import text as sql
 
 from flasher.i18n import text
+from flasher.image.load import FILE_MAX_SIZE
 from flasher.plant.central import Central
 from flasher.plant.release_functions import PIECE_BYTES
 from flasher.protocol.text import printable
@@ -68,38 +69,40 @@ class Fetcher:
         self._records.close()
 
     def fetch(self) -> Fetched:
-        """Ask the plant, and fetch what is new. Raises RecordError if the plant cannot be reached
-        or the list cannot be saved.
+        """Ask the plant, and fetch what is new or damaged. Raises RecordError if the plant cannot
+        be reached, the list cannot be saved, or a recipe in use is not here any more.
         """
-        held = self._folder.digests()
         kept = needed(Records(self._records), self._station)
         with self._central.reading() as connection:
-            answer = connection.execute(_RECIPES, {"held": [*held, *kept]}).scalar_one()
+            held = {"held": [*self._folder.digests(), *kept]}
+            answer = connection.execute(_RECIPES, held).scalar_one()
         before = self._folder.given()
         withdrawn = frozenset(map(str, answer["withdrawn"]))
         recipes, new = [], []
         for given in self._newest(answer["published"]):
             if given.digest in withdrawn:
                 continue
-            if given.digest not in held or not self._is_whole(given.digest, before):
+            fault = ""
+            if not self._folder.is_whole(given.digest):
                 fault = self._fetch_one(given.digest)
-                given = replace(given, fault=fault)  # noqa: PLW2901
                 new += [] if fault else [given.digest]
-            recipes.append(given)
+            recipes.append(replace(given, fault=fault))
         given_now = Given(tuple(recipes), withdrawn)
         if given_now != before:
             self._folder.save_given(given_now)
         # The station may be about to approve one that was given a moment ago.
         self._folder.keep({*(each.digest for each in (*recipes, *before.recipes)), *kept})
+        for digest in sorted(kept.difference(each.digest for each in recipes)):
+            if not self._folder.is_whole(digest):
+                if fault := self._fetch_one(digest):
+                    raise RecordError(
+                        f"The copy of the recipe {digest} is missing or damaged, and the station"
+                        f" needs it at its next start. {fault}",
+                        where=self._central.shown,
+                        remedy="Approve another recipe of the plant before the station ends.",
+                    )
+                new.append(digest)
         return Fetched(tuple(recipes), tuple(sorted(withdrawn)), tuple(new))
-
-    def _is_whole(self, digest: str, before: Given) -> bool:
-        """Check a bundle that was not given at the last look; later ones are checked by the station
-        at each use.
-        """
-        if any(each.digest == digest and not each.fault for each in before.recipes):
-            return True
-        return self._folder.is_whole(digest)
 
     def _newest(self, published: Sequence[dict[str, Any]]) -> list[GivenRecipe]:
         """The newest publication for each socket, together for equal recipes."""
@@ -135,7 +138,9 @@ class Fetcher:
             named = {"digest": digest, "sha256": sha256, "start": start}
             with self._central.reading() as connection:
                 piece = bytes(connection.execute(_PIECE, named).scalar() or b"")
-            yield piece
             start += len(piece)
+            if start > FILE_MAX_SIZE:
+                raise ValueError(f"a file is larger than {FILE_MAX_SIZE:,} bytes")
+            yield piece
             if len(piece) < PIECE_BYTES:
                 return

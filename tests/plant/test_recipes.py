@@ -186,6 +186,38 @@ def test_a_connection_lost_between_two_pieces_leaves_nothing_half(
     assert centre.fetcher.fetch().new == (digest,)
 
 
+def test_a_damaged_copy_is_fetched_again(centre: Centre) -> None:
+    used = centre.publish(REVISION_5)
+    centre.fetcher.fetch()
+    facts = {"digest": used, "socket": "A", "name": "Battery 36 V", "revision": "5", "sha256": ""}
+    centre.sender.bench.store.note(AuditEvent.RECIPE_USED, facts)
+    newest = centre.publish(REVISION_5.replace('"5"', '"6"'))
+    centre.fetcher.fetch()
+    for digest in (newest, used):
+        image = centre.folder.folder / digest / "files" / "bms.bin"
+        image.write_bytes(image.read_bytes()[:-1])
+    assert set(centre.fetcher.fetch().new) == {newest, used}
+    assert centre.folder.is_whole(newest)
+    assert centre.folder.is_whole(used), "the next start needs it, although a newer one is there"
+
+
+def test_a_recipe_in_use_that_is_lost_and_not_given_any_more_is_reported(centre: Centre) -> None:
+    facts = {"digest": "0" * 64, "socket": "A", "name": "", "revision": "5", "sha256": ""}
+    centre.sender.bench.store.note(AuditEvent.RECIPE_USED, facts)
+    newest = centre.publish(REVISION_5)
+    with pytest.raises(RecordError, match="0000000000000000"):
+        centre.fetcher.fetch()
+    assert [each.digest for each in centre.folder.given().recipes] == [newest]
+
+
+def test_a_file_without_end_is_refused(centre: Centre, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flasher.plant.fetcher.FILE_MAX_SIZE", 100)
+    centre.publish(REVISION_5)
+    (given,) = centre.fetcher.fetch().recipes
+    assert "larger than 100 bytes" in given.fault
+    assert centre.folder.digests() == ()
+
+
 def test_large_files_come_in_pieces(centre: Centre) -> None:
     data = random.Random(1).randbytes(2 * PIECE_BYTES + 10)
     bundle = Bundle("recipe.toml", {"recipe.toml": hashlib.sha256(data).hexdigest()})
