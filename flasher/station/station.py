@@ -299,6 +299,9 @@ class Station:
         self._write_notes()
         while self._offered:
             self._offers = self._offered.popleft()
+            for name, offer in tuple(self._approved.items()):
+                if offer.given.digest in self._offers.withdrawn:
+                    del self._approved[name]
             self._show_offers()
         self._change_recipes()
         self._take_scans()
@@ -508,7 +511,7 @@ class Station:
                 found = replace(
                     found,
                     recipe=f"{rule.name}, {rule.revision}",
-                    changes=changes(self.recipes[sockets[0]], loaded),
+                    changes=self._changes(sockets, loaded),
                     scan=f"{Word.RECIPE.value} {given.digest[:SCAN_DIGITS]}",
                 )
             offered.append(found)
@@ -518,6 +521,22 @@ class Station:
             if recipe.digest in self._offers.withdrawn and name not in self._approved
         ]
         self.emit(RecipesOffered(tuple(offered), tuple(withdrawn)))
+
+    def _changes(self, sockets: Sequence[str], loaded: LoadedRecipe) -> tuple[str, ...]:
+        """Differences from the recipes that these sockets use now."""
+        users: dict[tuple[str, ...], list[str]] = {}
+        for name in sockets:
+            users.setdefault(tuple(self.recipes[name].files.values()), []).append(name)
+        found = {
+            ", ".join(names): changes(self.recipes[names[0]], loaded) for names in users.values()
+        }
+        if len(found) == 1:
+            return found.popitem()[1]
+        return tuple(
+            text("socket {socket}, {change}", socket=printable(names), change=each)
+            for names, differences in found.items()
+            for each in differences
+        )
 
     def _waits_for(self, socket: str, digest: str) -> bool:
         """True if a socket neither uses this recipe nor will do so."""
@@ -564,9 +583,6 @@ class Station:
         """Give the sockets that are between two units their approved recipe."""
         for name, offer in tuple(self._approved.items()):
             recipe = offer.loaded
-            if offer.given.digest in self._offers.withdrawn:
-                del self._approved[name]
-                continue
             if recipe is None or name in self._runs or not self.line.is_between_units(name):
                 continue
             try:

@@ -118,6 +118,16 @@ def test_a_supervisor_sees_what_changes_and_approves_with_the_badge(plant: Plant
     assert plant.line.bench.store.examine().problems == ()
 
 
+def test_differences_are_shown_from_the_recipe_of_each_socket(plant: Plant) -> None:
+    plant.approve(plant.give(REVISION_5, "B"))
+    plant.give(REVISION_5.replace('"5"', '"6"'))
+    (offer,) = plant.line.last(RecipesOffered).offered
+    assert offer.changes == (
+        "socket A, revision: 6, was 4",
+        "socket B, revision: 6, was 5",
+    )
+
+
 @pytest.mark.parametrize(
     ("badge", "scan", "code"),
     [
@@ -270,6 +280,23 @@ def test_a_recipe_that_was_withdrawn_meanwhile_is_not_approved(plant: Plant) -> 
     plant.list_(*given, withdrawn=frozenset({digest}))
     plant.approve(digest)
     assert plant.line.last(ScanRefused).code == "RECIPE_WITHDRAWN"
+
+
+def test_an_approval_of_a_recipe_that_is_withdrawn_before_it_is_used_is_dropped(
+    plant: Plant,
+) -> None:
+    line = plant.line
+    first = plant.give(REVISION_5)
+    plant.approve(first)
+    plant.restart("A")
+    plant.restart("B")
+    line.scan("SOCKET A")
+    line.scan(SERIAL)
+    second = plant.give(REVISION_5.replace('"5"', '"6"'), withdrawn=frozenset({first}))
+    plant.approve(second)
+    assert line.last(RecipesOffered).withdrawn == ()
+    plant.list_(withdrawn=frozenset({first, second}))
+    assert line.last(RecipesOffered).withdrawn == ("A", "B")
 
 
 def test_after_a_restart_the_approved_one_is_used_without_the_server(plant: Plant) -> None:
