@@ -667,11 +667,13 @@ class Station:
     def _claim(self, order: Order) -> line.SocketInput:
         socket = order.socket
         recipe = self.recipes[socket]
-        if (refused := self._needs_golden(order)) is not None:
-            return refused
-        if recipe.digest in self._offers.withdrawn:
+        refused = self._needs_golden(order)
+        if refused is None and recipe.digest in self._offers.withdrawn:
             reason = text("The plant has withdrawn the recipe of this socket.")
-            return line.NotClaimed(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
+            refused = line.NotClaimed(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
+        if refused is not None:
+            self._gate.dropped(order.admission)
+            return refused
         try:
             lives = self.store.read.units(order.serial)
             claim = self.store.claim(order, recipe)

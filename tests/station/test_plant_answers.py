@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
 from flasher.station.events import OperatorPrompted, RunEnded, ScanRefused, SocketState
 from flasher.station.gate import Gate
+from flasher.station.recipe_offers import Offers
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import Answer, Elsewhere, ElsewhereState, RunState, StepState
 from tests.station.factory import SERIAL, USUAL, Bench
@@ -20,7 +22,9 @@ THERE = "2026-05-17T08:00:00.000000Z"
 class Plant:
     """A station whose plant answers when the test says so."""
 
-    def __init__(self, bench: Bench, *, question: bool = False) -> None:
+    def __init__(
+        self, bench: Bench, *, question: bool = False, needs_golden: bool = False
+    ) -> None:
         self.claims, self.question = _Claims(), _Question()
         self.threads: list[Callable[[], None]] = []
         gate = Gate(
@@ -30,7 +34,7 @@ class Plant:
             bench.clock.monotonic_s,
             start=self.threads.append,
         )
-        self.line = LineBench(bench, gate=gate)
+        self.line = LineBench(bench, gate=gate, needs_golden=needs_golden)
 
     def answer(self) -> None:
         self.threads.pop(0)()
@@ -93,6 +97,27 @@ def test_a_unit_that_runs_elsewhere_is_refused_by_name(plant: Plant) -> None:
     assert refused.code == Refusal.UNIT_RUNNING
     assert refused.reason == f"{SERIAL} is running on socket B of line-3."
     assert plant.line.state("A") is SocketState.SCAN
+    assert plant.claims.released == plant.claims.asked
+
+
+def test_a_unit_that_has_to_wait_for_a_golden_one_is_free_for_other_stations(
+    bench: Bench,
+) -> None:
+    bench.use(USUAL + '\n[golden]\nserial_numbers = ["W2605000"]\nevery_h = 100\n')
+    plant = Plant(bench, needs_golden=True)
+    plant.scan()
+    plant.answer()
+    assert plant.line.last(ScanRefused).code == "GOLDEN_DUE"
+    assert plant.claims.released == plant.claims.asked
+
+
+def test_a_unit_of_a_withdrawn_recipe_is_free_for_other_stations(plant: Plant) -> None:
+    station = plant.line.station
+    station.recipes["A"] = replace(station.recipes["A"], digest="0" * 64)
+    station.offer(Offers((), frozenset({"0" * 64})))
+    plant.scan()
+    plant.answer()
+    assert plant.line.last(ScanRefused).code == Refusal.RECIPE_WITHDRAWN
     assert plant.claims.released == plant.claims.asked
 
 
