@@ -11,6 +11,7 @@ PASS, is published after the outcome is on disk. `flasher.station.line` assigns 
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -634,11 +635,13 @@ class Station:
 
     def _needs_golden(self, order: Order) -> line.NotClaimed | None:
         """The refusal of a unit before a golden unit has passed; None if it may begin."""
+        if not self.options.needs_golden:
+            return None
         recipe = self.recipes[order.socket]
         golden = recipe.recipe.golden
         serials = () if golden is None else golden.serial_numbers
         is_released = _release_key(_release(recipe, is_virtual=order.is_virtual)) in self._released
-        if not self.options.needs_golden or is_released or order.serial in serials:
+        if is_released or order.serial in serials:
             return None
         reason = text(
             "No golden unit has passed with flasher {version} and this recipe yet.",
@@ -649,14 +652,15 @@ class Station:
 
     def _note_golden(self, socket: str, claim: Claim) -> None:
         """Record the PASS of a golden unit, which releases this flasher with its recipe."""
-        facts = _release(self.recipes[socket], is_virtual=self.line.sockets[socket].is_virtual)
-        key = _release_key(facts)
         if claim.kind is not RunKind.GOLDEN or not self.options.needs_golden:
             return
+        recipe = self.recipes[socket]
+        facts = _release(recipe, is_virtual=self.line.sockets[socket].is_virtual)
+        key = _release_key(facts)
         if key not in self._released:
-            data = {**facts, "serial": claim.serial, "socket": socket}
+            run = {"recipe_sha256": recipe.sha256, "serial": claim.serial, "socket": socket}
             try:
-                self.store.note(AuditEvent.RELEASED, data, claim.run_id)
+                self.store.note(AuditEvent.RELEASED, {**facts, **run}, claim.run_id)
             except RecordError as error:
                 self._not_saved(socket, claim.serial, claim.run_id, error)
                 return
@@ -890,12 +894,15 @@ def _recipe_facts(recipe: LoadedRecipe) -> dict[str, str]:
     }
 
 
-_RELEASE: Final = ("flasher", "recipe_sha256", "units")
+_RELEASE: Final = ("flasher", "files_sha256", "units")
 
 
 def _release(recipe: LoadedRecipe, *, is_virtual: bool) -> dict[str, str]:
-    """What a golden unit releases. A virtual one proves nothing about real ones."""
-    values = (__version__, recipe.sha256, "virtual" if is_virtual else "real")
+    """What a golden unit releases: images, manifests and profile too, which change without the
+    recipe. A virtual one proves nothing about real ones.
+    """
+    files = hashlib.sha256("".join(sorted(recipe.files.values())).encode("ascii")).hexdigest()
+    values = (__version__, files, "virtual" if is_virtual else "real")
     return dict(zip(_RELEASE, values, strict=True))
 
 

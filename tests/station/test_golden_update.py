@@ -6,10 +6,11 @@ import pytest
 
 from flasher.station import station as station_module
 from flasher.station.events import RunEnded, RunStarted, ScanRefused
+from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import SchemaVersionError
 from flasher.station.records.model import AuditEvent, RunState
 from flasher.station.records.schema import SCHEMA_VERSION
-from tests.station.factory import SERIAL, USUAL, Bench
+from tests.station.factory import DAY, SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench
 
 GOLDEN = "W2605000"
@@ -61,7 +62,7 @@ def test_a_golden_unit_that_fails_releases_nothing(bench: Bench) -> None:
     assert bench.store.read.noted("line-2", AuditEvent.RELEASED) == []
 
 
-@pytest.mark.parametrize("what", ["flasher", "recipe"])
+@pytest.mark.parametrize("what", ["flasher", "recipe", "manifest"])
 def test_each_update_needs_a_golden_unit_again_and_going_back_does_not(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
@@ -70,6 +71,11 @@ def test_each_update_needs_a_golden_unit_again_and_going_back_does_not(
     with monkeypatch.context() as updated:
         if what == "flasher":
             updated.setattr(station_module, "__version__", "99.0")
+        elif what == "manifest":
+            bench.use(TEXT)
+            manifest = bench.recipe.path.with_name("bms.bin.toml")
+            manifest.write_bytes(manifest.read_bytes() + b"# other\n")
+            bench.recipe = load_checked(bench.recipe.path, DAY)
         else:
             bench.use(TEXT.replace('revision = "4"', 'revision = "5"'))
         line = Requiring(bench)

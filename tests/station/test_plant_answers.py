@@ -22,9 +22,7 @@ THERE = "2026-05-17T08:00:00.000000Z"
 class Plant:
     """A station whose plant answers when the test says so."""
 
-    def __init__(
-        self, bench: Bench, *, question: bool = False, needs_golden: bool = False
-    ) -> None:
+    def __init__(self, bench: Bench, *, question: bool = False, needs_golden: bool = False) -> None:
         self.claims, self.question = _Claims(), _Question()
         self.threads: list[Callable[[], None]] = []
         gate = Gate(
