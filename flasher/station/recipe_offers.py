@@ -68,8 +68,9 @@ class RecipeOffers:
         self._check = check
         self._give = give
         self._seen: Given | None = None
+        self._last = Offers()
+        """What was given last."""
         self._looks = 0
-        self._loaded: dict[str, tuple[LoadedRecipe | None, str]] = {}
 
     @contextmanager
     def watching(self) -> Iterator[None]:
@@ -96,29 +97,29 @@ class RecipeOffers:
         """Load and offer what changed. Raises RecordError."""
         given = self._folder.given()
         self._looks += 1
-        has_problem = any(problem for _, problem in self._loaded.values())
+        has_problem = any(each.problem for each in self._last.offers)
         if given == self._seen and not (has_problem and self._looks % _RETRY_LOOKS == 0):
             return
         found = [
-            Offer(each, *self._load(each))
-            for each in given.recipes
-            if set(each.sockets) & set(self._sockets)
+            self._offer(each) for each in given.recipes if set(each.sockets) & set(self._sockets)
         ]
-        self._give(Offers(tuple(found), given.withdrawn))
-        self._seen = given
+        offers = Offers(tuple(found), given.withdrawn)
+        if self._seen is None or offers != self._last:
+            self._give(offers)
+        self._seen, self._last = given, offers
 
-    def _load(self, given: GivenRecipe) -> tuple[LoadedRecipe | None, str]:
+    def _offer(self, given: GivenRecipe) -> Offer:
         if given.fault:
-            return None, given.fault
-        loaded, problem = self._loaded.get(given.digest, (None, ""))
+            return Offer(given, None, given.fault)
+        known = (each.loaded for each in self._last.offers if each.given.digest == given.digest)
+        loaded = next(known, None)
         if loaded is None:
             try:
                 loaded = self._folder.load(given.digest, datetime.now().astimezone().date())
                 self._check(loaded)
             except FlasherError as error:
-                loaded, problem = None, problem_of(error)
-            self._loaded[given.digest] = loaded, problem
-        return loaded, problem
+                return Offer(given, None, problem_of(error))
+        return Offer(given, loaded)
 
 
 def problem_of(error: FlasherError) -> str:

@@ -167,6 +167,24 @@ def test_a_recipe_that_does_not_fit_the_station_is_shown_and_not_approved(bench:
     assert plant.line.last(ScanRefused).code == "RECIPE_UNUSABLE"
 
 
+def test_a_recipe_with_a_problem_is_loaded_again_and_offered_once_it_fits(bench: Bench) -> None:
+    plant = Plant(bench)
+    given = plant.line.of(RecipesOffered)
+    problems = iter(["A badge could be a label."] * 2)
+
+    def check(_recipe: LoadedRecipe) -> None:
+        for problem in problems:
+            raise UsageError(problem)
+
+    plant.offers._check = check
+    plant.give(REVISION_5)
+    for _ in range(90):
+        plant.offers.look()
+        plant.line.turn()
+    shown = plant.line.of(RecipesOffered)[len(given) :]
+    assert [each.offered[0].problem for each in shown] == ["A badge could be a label.", ""]
+
+
 # -- between two units ----------------------------------------------------------------------------
 
 
