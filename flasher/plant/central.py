@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, text
 from sqlalchemy.exc import DBAPIError
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.plant.functions import REFUSED
+from flasher.plant.schema import PLANT_SCHEMA, VERSION_TABLE
 from flasher.protocol.text import printable
 from flasher.station.records.database import Location, locate, server_engine
 from flasher.station.records.errors import RuleBrokenError, mapped
@@ -112,6 +113,19 @@ class Central:
     def close(self) -> None:
         self._engine.dispose()
 
+    def check_schema(self) -> None:
+        """Check that the tables are those of this flasher. Raises UsageError, RecordError."""
+        with self.reading() as connection:
+            found = schema_of(connection, self.shown)
+        if found != PLANT_SCHEMA:
+            raise _other_schema(
+                found,
+                self.shown,
+                cause="an older flasher made its tables",
+                remedy="The owner of the database runs flasher plant init --database URL, which"
+                " upgrades them.",
+            )
+
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Open a read transaction with one consistent snapshot."""
@@ -146,3 +160,41 @@ class Central:
                 message = getattr(error.orig.diag, "message_primary", "")  # type: ignore[union-attr]
                 word, _, detail = message.partition(": ")
                 raise ChainRefusedError(Refusal(word), detail, where=self.shown) from error
+
+
+@contextmanager
+def open_central(url: str) -> Iterator[Central]:
+    """Open a plant's database for a command that knows its tables. A station, which knows only
+    its functions, opens `Central` itself: it goes on when the database is upgraded first. Raises
+    UsageError, RecordError.
+    """
+    with closing(Central(url)) as central:
+        central.check_schema()
+        yield central
+
+
+def schema_of(connection: Connection, where: str) -> str:
+    """Schema of a plant's tables: this flasher's or an older one. Raises UsageError for a newer
+    one.
+    """
+    query = text(f"SELECT version_num FROM {VERSION_TABLE}")  # noqa: S608  a constant
+    found = str(connection.execute(query).scalar_one())
+    if not found.isdecimal() or int(found) > int(PLANT_SCHEMA):
+        raise _other_schema(
+            found,
+            where,
+            cause="a newer flasher made its tables",
+            remedy="Update flasher on this computer to the version that made them.",
+        )
+    return found
+
+
+def _other_schema(found: str, where: str, *, cause: str, remedy: str) -> UsageError:
+    return UsageError(
+        f"The plant's database has schema {printable(found)}; this flasher has schema"
+        f" {PLANT_SCHEMA}.",
+        where=where,
+        cause=cause,
+        remedy=remedy,
+        code=ErrorCode.RECORDS_VERSION,
+    )

@@ -32,7 +32,6 @@ from flasher.plant.schema import (
     plant_receiver,
     plant_station,
 )
-from flasher.plant.setup import is_current
 from flasher.protocol.text import printable
 from flasher.station.records import schema
 from flasher.station.records.chain import GENESIS
@@ -108,16 +107,10 @@ class Retirement:
             "SELECT pg_has_role(current_user, relowner, 'USAGE'), pg_get_userbyid(relowner)"
             " FROM pg_class WHERE oid = 'chain_row'::regclass"
         )
+        # What another version keeps beside a run would be left, or be lost.
+        central.check_schema()
         with central.reading() as connection:
             is_owner, owner = connection.execute(owns).one()
-            # What another version keeps beside a run would be left, or be lost.
-            if not is_current(connection, central):
-                raise UsageError(
-                    "The tables of the plant's database are of an older flasher.",
-                    where=central.shown,
-                    remedy="Run flasher plant init, then this again.",
-                    code=ErrorCode.RECORDS_VERSION,
-                )
             self._plant = str(
                 connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
             )

@@ -16,7 +16,7 @@ from sqlalchemy.dialects.postgresql import insert
 
 from flasher.errors import ErrorCode, UsageError
 from flasher.plant import claim_functions, functions, queue, release_functions, takeover_functions
-from flasher.plant.central import Central, plant_location
+from flasher.plant.central import Central, plant_location, schema_of
 from flasher.plant.schema import (
     PLANT_SCHEMA,
     STATION_TABLES,
@@ -54,8 +54,8 @@ class StationRole:
 class Setup:
     """What `setup` did."""
 
-    is_new: bool
-    """True if the database was empty before."""
+    before: str | None
+    """Schema of the tables before; None if the database was empty."""
     created: tuple[StationRole, ...]
     """Roles that were created; they have no password yet."""
     stations: tuple[StationRole, ...]
@@ -103,7 +103,7 @@ def setup(
                 " true)"
             )
         )
-        is_new = _bring_up_to_date(connection, central, now)
+        before = _bring_up_to_date(connection, central, now)
         for role in _GROUPS:
             _make(connection, role)
         _execute(connection, *queue.statements(connection))
@@ -141,15 +141,18 @@ def setup(
                 .where(plant_station.c.name == station)
                 .values(station=None, records_id=None, entered_at=None)
             )
-    return Setup(is_new, tuple(made), tuple(named))
+    return Setup(before, tuple(made), tuple(named))
 
 
-def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -> bool:
-    """Create all tables, or run missing migrations; True if they were created."""
+def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -> str | None:
+    """Create all tables, or run missing migrations. Returns the schema before; None without any
+    tables.
+    """
     tables = inspect(connection).get_table_names()
     if VERSION_TABLE in tables:
-        _migrate(connection, central)
-        return False
+        before = schema_of(connection, central.shown)
+        _alembic(connection, "upgrade")
+        return before
     if tables:
         raise UsageError(
             f"The database {central.location.shown} holds other data.",
@@ -170,27 +173,7 @@ def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -
     )
     connection.execute(station_schema.alembic_version.insert().values(version_num=str(version)))
     _alembic(connection, "stamp")
-    return True
-
-
-def _migrate(connection: Connection, central: Central) -> None:
-    is_current(connection, central)
-    _alembic(connection, "upgrade")
-
-
-def is_current(connection: Connection, central: Central) -> bool:
-    """False if the tables have an older schema. Raises UsageError if they have a newer one."""
-    query = text(f"SELECT version_num FROM {VERSION_TABLE}")  # noqa: S608  a constant
-    found = str(connection.execute(query).scalar_one_or_none())
-    if found.isdecimal() and int(found) > int(PLANT_SCHEMA):
-        raise UsageError(
-            f"The plant's database has schema {found}; this flasher has schema {PLANT_SCHEMA}.",
-            where=central.location.shown,
-            cause="a newer flasher made it",
-            remedy="Use that newer flasher.",
-            code=ErrorCode.RECORDS_VERSION,
-        )
-    return found == PLANT_SCHEMA
+    return None
 
 
 def _alembic(connection: Connection, action: str) -> None:

@@ -17,9 +17,9 @@ from sqlalchemy import Connection, func, select, text
 
 from flasher.errors import UsageError
 from flasher.plant.archive import month_after
-from flasher.plant.central import plant_location
+from flasher.plant.central import open_central, plant_location
 from flasher.plant.schema import SHARED_PARTS, archive_file, shared_part, trace
-from flasher.station.records.database import Database, locate
+from flasher.station.records.database import Database, Location, locate, open_database
 from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
 from flasher.station.records.heads import ChainHead
@@ -132,10 +132,17 @@ class PlantRecords(Records):
         _refuse_certificate()
 
 
+def _open_checked(location: Location, now: datetime, **settings: Any) -> Database:
+    """`open_database`, after the check of the plant's own tables."""
+    with open_central(location.url.render_as_string(hide_password=False)):
+        return open_database(location, now, **settings)
+
+
 class PlantStore(Store):
     """The records of all stations, for reading."""
 
     located = staticmethod(locate)
+    opened = staticmethod(_open_checked)
 
     def __init__(
         self,

@@ -21,7 +21,7 @@ from uuid import UUID
 from sqlalchemy import Connection, select
 
 from flasher.errors import ErrorCode, UsageError
-from flasher.plant.central import Central, ChainRefusedError, Refusal
+from flasher.plant.central import Central, ChainRefusedError, Refusal, open_central
 from flasher.plant.forwarder import ADD_ROW, ENTER, row_values
 from flasher.plant.schema import (
     SHARED_PARTS,
@@ -94,7 +94,7 @@ class Takeover:
         """
         final = self.location.file
         assert final is not None  # noqa: S101  records are in a file
-        with closing(Central(self.central_url)) as central:
+        with open_central(self.central_url) as central:
             with mapped(printable(str(final)), writes=True):
                 final.parent.mkdir(parents=True, exist_ok=True)
                 self.location.folder.mkdir(parents=True, exist_ok=True)

@@ -27,6 +27,7 @@ from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold_output
 from tests.plant.conftest import plant, sender
 from tests.plant.factory import PASSWORD, Plant, Sender
+from tests.plant.old_databases import make_old
 from tests.schema_document import SCHEMA
 from tests.station.factory import IMAGES, USUAL, write_recipe
 from tests.station.postgres import Server
@@ -97,6 +98,59 @@ def test_a_database_without_the_plants_tables_is_named(flasher: Flasher, postgre
     assert run.code == ExitCode.USAGE
     assert "a table is not in the database" in run.err
     assert "flasher plant init" in run.err
+
+
+_READING: dict[str, tuple[str, ...]] = {
+    "status": (),
+    "report": (),
+    "verify": (),
+    "units": ("--image", BMS_SHA256),
+    "pages": ("--web", "0"),
+    "recipes": (),
+    "withdraw": ("0123", "--reason", "x"),
+    "deliveries": (),
+    "reconcile": ("list.json", "--receiver", "mes"),
+    "deliver": ("--receivers", "receivers.toml", "--once"),
+    "retire": ("--archive", "archive", "--before", "2026-06"),
+}
+
+
+@pytest.mark.parametrize("action", _READING)
+def test_tables_of_another_flasher_are_refused_with_the_next_step(
+    flasher: Flasher, plant: Plant, action: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("list.json").write_text("[]", "utf-8")
+    receiver = '[[receiver]]\nname = "mes"\nurl = "http://127.0.0.1:1/"\n'
+    Path("receivers.toml").write_text(receiver, "utf-8")
+    for found, step in (("6", "flasher plant init"), ("8", "Update flasher")):
+        with plant.connect() as owner:
+            owner.execute("UPDATE plant_version SET version_num = %s", [found])
+        run = flasher("plant", action, *_READING[action], "--database", plant.url())
+        assert (run.code, run.out) == (ExitCode.USAGE, "")
+        assert f"has schema {found}; this flasher has schema 7" in run.err
+        assert "E215" in run.err
+        assert step in run.err
+        assert "delivers to" not in run.err
+
+
+def test_init_names_the_schemas_of_an_upgrade(flasher: Flasher, plant: Plant) -> None:
+    make_old(plant, 2)
+    words = ("plant", "init", "--database", plant.url())
+    assert flasher(*words).out == "upgraded the tables from schema 2 to 7\n"
+    assert flasher(*words).out == "the tables are up to date\n"
+
+
+@pytest.mark.parametrize("action", ["report", "verify", "retire", "deliveries"])
+def test_an_empty_database_is_no_database_of_another_version(
+    flasher: Flasher, postgres: Server, action: str
+) -> None:
+    url = postgres.url(postgres.database())
+    run = flasher("plant", action, *_READING[action], "--database", url)
+    assert (run.code, run.out) == (ExitCode.USAGE, "")
+    assert "a table is not in the database" in run.err
+    assert "flasher plant init" in run.err
+    assert "E215" not in run.err
 
 
 def test_a_wrong_url_of_the_plant_is_refused_before_the_first_unit(

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from flasher import __version__
 from flasher.plant import forwarder as forwarder_module
 from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.forwarder import ForwarderState, load_state, state_file
@@ -184,6 +185,20 @@ def test_a_server_that_is_away_is_waited_for(plant: Plant, sender: Sender) -> No
     sender.send()
     assert hashes(plant) == own_hashes(sender)
     assert check_of(sender).is_good
+
+
+def test_a_station_that_is_older_than_the_database_goes_on(plant: Plant, sender: Sender) -> None:
+    # A newer schema keeps the functions that stations call; they may not even read its number.
+    with plant.connect() as owner:
+        owner.execute("UPDATE plant_version SET version_num = '99'")
+        owner.execute("ALTER TABLE plant_station ADD COLUMN new_in_99 text NOT NULL DEFAULT ''")
+        owner.execute("ALTER TABLE chain_row ADD COLUMN new_in_99 text NOT NULL DEFAULT ''")
+    sender.bench.make()
+    sender.send()
+    assert hashes(plant) == own_hashes(sender)
+    assert not sender.forwarder.state.fault
+    ((reported,),) = plant.rows("SELECT version FROM plant_station WHERE name = 'line-2'")
+    assert reported == __version__
 
 
 def test_it_sends_until_the_station_ends_and_then_the_rest(plant: Plant, sender: Sender) -> None:

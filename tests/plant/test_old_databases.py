@@ -19,7 +19,7 @@ def test_it_is_brought_up_to_date(plant: Plant, revision: int) -> None:
     expected = described(plant)
     make_old(plant, revision)
     assert described(plant) != expected
-    setup(plant.url(), STATIONS, NOW)
+    assert setup(plant.url(), STATIONS, NOW).before == str(revision)
     assert described(plant) == expected
 
 

@@ -386,7 +386,7 @@ def test_the_mark_of_duplicates_stays_with_the_last_run_of_a_unit(
     assert [tuple(each) for each in marks] == [(f"not checked: {doubt}" if doubt else "checked",)]
 
 
-@pytest.mark.parametrize(("schema", "what"), [("99", "has schema 99"), ("5", "an older flasher")])
+@pytest.mark.parametrize(("schema", "what"), [("99", "has schema 99"), ("5", "has schema 5")])
 def test_tables_of_another_version_are_not_retired(plant: Plant, schema: str, what: str) -> None:
     with closing(Central(plant.url())) as central, central.writing() as connection:
         connection.execute(text("UPDATE plant_version SET version_num = :to"), {"to": schema})

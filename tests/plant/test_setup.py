@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 import pytest
 
 from flasher.errors import UsageError
+from flasher.plant.schema import PLANT_SCHEMA
 from flasher.plant.setup import StationRole, create_database, role_of, setup
 from tests.plant.factory import Plant
 from tests.station.postgres import Server
@@ -20,9 +21,9 @@ def test_it_creates_the_database_once_and_a_role_for_each_station(postgres: Serv
     assert not create_database(url)
     made = setup(url, ["Line 7"], NOW)
     role = StationRole("flasher_line_7", "Line 7")
-    assert (made.is_new, made.created, made.stations) == (True, (role,), (role,))
+    assert (made.before, made.created, made.stations) == (None, (role,), (role,))
     again = setup(url, ["Line 7"], NOW)
-    assert (again.is_new, again.created, again.stations) == (False, (), (role,))
+    assert (again.before, again.created, again.stations) == (PLANT_SCHEMA, (), (role,))
 
 
 def test_a_user_who_may_not_create_it_learns_what_to_do(plant: Plant) -> None:

@@ -29,8 +29,9 @@ from flasher.plant.alerts import (
     alerts,
     overviews,
 )
-from flasher.plant.central import Central, plant_location
+from flasher.plant.central import open_central, plant_location
 from flasher.plant.process import Sending
+from flasher.plant.schema import PLANT_SCHEMA
 from flasher.plant.setup import create_database, role_of, setup
 from flasher.plant.store import passed_twice
 from flasher.protocol.text import printable
@@ -55,7 +56,12 @@ def init(
     if create_database(url):
         output.result(printable(f"created the database {location.url.database}"))
     made = setup(url, stations, datetime.now(UTC), renewed=renewed)
-    output.result("created the tables" if made.is_new else "the tables are up to date")
+    if made.before is None:
+        output.result("created the tables")
+    elif made.before != PLANT_SCHEMA:
+        output.result(f"upgraded the tables from schema {made.before} to {PLANT_SCHEMA}")
+    else:
+        output.result("the tables are up to date")
     for each in made.stations:
         is_new = each in made.created
         what = "created its role" if is_new else "has its role"
@@ -63,7 +69,7 @@ def init(
     roles = {each.station: each.role for each in made.stations}
     lines = list(_after(location, roles, [each.role for each in made.created]))
     output.results(lines)
-    return output.document(PlantInitDocument(is_new=made.is_new, roles=roles, to_run=lines))
+    return output.document(PlantInitDocument(is_new=made.before is None, roles=roles, to_run=lines))
 
 
 def _before(
@@ -114,7 +120,7 @@ def bounds_of(options: BoundsOptions) -> Bounds:
 
 def status(output: Output, url: str, options: BoundsOptions) -> int:
     now = datetime.now().astimezone()
-    with closing(Central(url)) as central, central.reading() as connection:
+    with open_central(url) as central, central.reading() as connection:
         found = overviews(connection, bounds_of(options), DEFAULT_SHIFTS, now)
         twice = passed_twice(connection, TWICE_MAX)
     for each in found:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 
 from flasher.cli.output import Output
 from flasher.cli.plant.documents import PlantPublishDocument, PlantRecipesDocument
 from flasher.plant import recipes as centre
-from flasher.plant.central import Central
+from flasher.plant.central import open_central
 from flasher.plant.recipes import WITHDRAWN, RecipeEvent, events_of
 from flasher.protocol.text import printable
 from flasher.station.recipe_file import load_checked
@@ -21,7 +20,7 @@ def publish(
 ) -> int:
     day = datetime.now().astimezone().date()
     loaded = load_checked(path, day)
-    with closing(Central(url)) as central:
+    with open_central(url) as central:
         bundle = centre.publish(central, loaded, stations, sockets, day)
     rule = loaded.recipe
     output.result(printable(f"published {rule.name}, revision {rule.revision}"))
@@ -42,14 +41,14 @@ def publish(
 
 
 def withdraw(output: Output, digest: str, url: str, reason: str) -> int:
-    with closing(Central(url)) as central:
+    with open_central(url) as central:
         event = centre.withdraw(central, digest, reason)
     output.results(_lines([event]))
     return output.document(PlantRecipesDocument([event]))
 
 
 def recipes(output: Output, url: str) -> int:
-    with closing(Central(url)) as central:
+    with open_central(url) as central:
         events = events_of(central)
     output.results(_lines(events))
     if not events:

@@ -83,7 +83,7 @@ def locate(url: str, folder: Path | None = None) -> Location:
     except (ArgumentError, ValueError) as error:
         raise _no_database(url) from error
     backend = parsed.get_backend_name()
-    shown = printable(parsed.set(query={}).render_as_string(hide_password=True))
+    shown = printable(parsed.set(drivername=backend, query={}).render_as_string(hide_password=True))
     if parsed.drivername == "postgresql":
         parsed = parsed.set(drivername=_POSTGRESQL)
     # An @ or a / of a password that is not written as %40 or %2F lands in host or name.

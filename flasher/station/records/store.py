@@ -95,6 +95,8 @@ class Store:
 
     located: Callable[[str, Path | None], Location] = staticmethod(locate_records)
     """Finds the records that `open` is given."""
+    opened: Callable[..., Database] = staticmethod(open_database)
+    """Opens and checks them."""
 
     def __init__(
         self,
@@ -135,7 +137,7 @@ class Store:
         clock = clock or SystemClock()
         location = cls.located(url, folder)
         opened = partial(
-            open_database,
+            cls.opened,
             location,
             clock.utc(),
             lock_timeout_s=lock_timeout_s,
