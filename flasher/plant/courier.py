@@ -22,10 +22,18 @@ from psycopg_pool import PoolTimeout
 from sqlalchemy import URL
 
 from flasher.plant.central import Central
-from flasher.plant.deliveries import HEARTBEAT_S, SILENCE_MAX_S, Answer, Attempt, Deliveries
+from flasher.plant.deliveries import (
+    HEARTBEAT_S,
+    SILENCE_MAX_S,
+    Answer,
+    Attempt,
+    Deliveries,
+    DeliveryState,
+)
 from flasher.plant.queue import TASK
 from flasher.plant.receivers import Receiver
 from flasher.plant.transport import Transport, transport_to
+from flasher.protocol.text import printable
 from flasher.station.records.errors import RecordError
 
 RETRY_FIRST_S: Final = 2
@@ -34,6 +42,7 @@ _POLL_S: Final = 2.0
 """Interval at which jobs are looked for that became due; new ones are notified."""
 _LOOK_S: Final = 0.2
 _RESTART_S: Final = 2.0
+_DATABASE: Final = "the plant's database"
 _FAULTS: Final = (ProcrastinateException, psycopg.Error, PoolTimeout, OSError, RecordError)
 """What the workers raise when the database cannot be reached."""
 
@@ -56,8 +65,9 @@ class _Pauses(BaseRetryStrategy):
 
 @dataclass
 class Courier:
-    """Delivers runs to receivers. `report` is called after each attempt, `warn` when the database
-    cannot be reached.
+    """Delivers runs to receivers. `report` is called after each attempt; `say` with a line about
+    each refused run, and when a receiver or the database fails and when it works again; `begun`
+    when deliveries begin.
     """
 
     url: str
@@ -65,10 +75,13 @@ class Courier:
     schema: int
     """Version of the schema of documents."""
     report: Callable[[Attempt, Answer], None] = lambda _attempt, _answer: None
-    warn: Callable[[str], None] = lambda _text: None
+    say: Callable[[str], None] = lambda _text: None
+    begun: Callable[[], None] = lambda: None
     _transports: dict[str, Transport] = field(default_factory=dict)
     _settled: int = 0
     """Deliveries that were settled."""
+    _failing: set[str] = field(default_factory=set)
+    """Receivers that fail at the moment, and `_DATABASE`."""
 
     def __post_init__(self) -> None:
         """Raises UsageError if the plant's database is named wrongly."""
@@ -92,7 +105,9 @@ class Courier:
         asyncio.get_running_loop().set_exception_handler(lambda _loop, _context: None)
         self._transports = {each.name: transport_to(each) for each in self.receivers}
         try:
+            await asyncio.to_thread(self._central.check_schema)
             await asyncio.to_thread(self._deliveries.register, self._transports)
+            self.begun()
             while not is_over():
                 before = self._settled
                 try:
@@ -100,7 +115,7 @@ class Courier:
                 except _FAULTS as error:
                     if once:
                         raise
-                    self.warn(str(error))
+                    self._fails(_DATABASE, " ".join(str(error).split()))
                     await _wait(_RESTART_S, is_over)
                 # After a run of a unit its next one is due.
                 if once and self._settled == before:
@@ -118,6 +133,7 @@ class Courier:
         app.task(name=TASK, retry=pauses)(self._attempt)
         async with app.open_async():
             await asyncio.to_thread(self._deliveries.sweep)
+            self._works(_DATABASE)
             workers = [asyncio.create_task(_run(app, each, once=once)) for each in self.receivers]
             tasks: list[asyncio.Future[Any]] = [
                 asyncio.gather(*workers),
@@ -144,8 +160,23 @@ class Courier:
         await asyncio.to_thread(self._deliveries.end, attempt, answer)
         self.report(attempt, answer)
         if not answer.state.is_settled:
+            self._fails(receiver, f"{answer.text} (run {attempt.key})")
             raise _NotSettledError
         self._settled += 1
+        self._works(receiver)
+        if answer.state is DeliveryState.REFUSED:
+            self.say(printable(f"{receiver}: {attempt.key} {answer.state}, {answer.text}"))
+
+    def _fails(self, what: str, why: str) -> None:
+        """Report an outage once; its attempts are many."""
+        if what not in self._failing:
+            self._failing.add(what)
+            self.say(printable(f"{what} fails: {why}; runs wait, and are sent when it works again"))
+
+    def _works(self, what: str) -> None:
+        if what in self._failing:
+            self._failing.remove(what)
+            self.say(f"{what} works again")
 
     async def _keep_sweeping(self) -> None:
         while True:

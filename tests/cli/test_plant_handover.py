@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from flasher.cli.documents import as_json
+from flasher.cli.plant import handover
 from flasher.errors import ExitCode
 from flasher.plant.central import Central
 from flasher.plant.deliveries import Deliveries
@@ -132,6 +133,27 @@ def test_a_reader_cannot_deliver(desk: Desk) -> None:
     run = desk.run("deliver", "--receivers", desk.file, "--once", role=READER)
     assert run.code == ExitCode.USAGE
     assert "lacks the right" in run.err
+
+
+def test_what_was_retired_is_listed_up_to_a_limit(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk.deliver()
+    for number in range(5):
+        desk.sender.bench.make(serial=f"W260502{number}")
+    desk.sender.send()
+    desk.deliver()
+    with desk.plant.connect() as owner:  # as `plant retire` leaves them
+        owner.execute("DELETE FROM chain_row")
+    monkeypatch.setattr(handover, "_SHOWN_MAX", 2)
+    listing = tmp_path / "list.json"
+    listing.write_text("[]", "utf-8")
+    run = desk.run("reconcile", listing, "--receiver", "mes", "--resend")
+    assert run.err.splitlines() == [
+        "5 runs that were retired to files are not sent again:",
+        *(f"  {key}" for key in run.document["missing"][:2]),
+        "  and 3 more",
+    ]
 
 
 def test_a_receiver_that_is_stopped_gets_no_more(desk: Desk) -> None:

@@ -8,6 +8,7 @@ import asyncio
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
@@ -22,7 +23,7 @@ from flasher.plant.courier import Courier
 from flasher.plant.deliveries import Answer, Attempt, Deliveries, Delivery, DeliveryState, parse_key
 from flasher.plant.receivers import Receiver as Settings
 from flasher.plant.transport import transport_to
-from flasher.station.records.errors import NotFoundError
+from flasher.station.records.errors import NotFoundError, RecordError
 from flasher.station.records.model import RunState
 from tests.plant.factory import COURIER, READER, Plant, Sender
 from tests.plant.receiver import Act, Receiver, receiving
@@ -170,6 +171,50 @@ def test_a_receiver_that_is_away_gets_nothing_and_nothing_is_unknown(desk: Desk)
     found = desk.only()
     assert found.state is DeliveryState.WAITING
     assert found.answer.startswith("no connection")
+
+
+def test_an_outage_is_one_line_and_its_end_is_another(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(courier, "RETRY_FIRST_S", 0)
+    monkeypatch.setattr(courier, "_POLL_S", 0.05)
+    lines: list[str] = []
+    desk.sender.bench.make()
+    desk.sender.send()
+    acts = iter([Act.FAIL] * 5)
+    desk.receiver.plan = lambda: next(acts, Act.REFUSE)
+    begun = threading.Event()
+    worker = Courier(
+        desk.plant.url(COURIER), [desk.settings()], 2, desk._keep, lines.append, begun.set
+    )
+    with closing(worker):
+        worker.deliver(lambda: desk.only().state is DeliveryState.REFUSED)
+    key = desk.only().key
+    assert begun.is_set()
+    assert lines == [
+        f"mes fails: HTTP 503: away (run {key}); runs wait, and are sent when it works again",
+        "mes works again",
+        f"mes: {key} refused, HTTP 422: no such part",
+    ]
+
+
+def test_a_database_that_is_away_is_one_line(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(courier, "_RESTART_S", 0.0)
+    lines: list[str] = []
+    sweep, calls = Deliveries.sweep, iter(range(6))
+
+    def broken(of: Deliveries) -> int:
+        if next(calls, 6) < 5:
+            raise RecordError("gone", cause="the server\nstops")
+        return sweep(of)
+
+    monkeypatch.setattr(Deliveries, "sweep", broken)
+    worker = Courier(desk.plant.url(COURIER), [desk.settings()], 2, say=lines.append)
+    with closing(worker):
+        worker.deliver(lambda: len(lines) > 1)
+    first, second = lines
+    assert first.startswith("the plant's database fails: gone")
+    assert second == "the plant's database works again"
 
 
 def test_a_worker_that_died_before_it_recorded_the_answer(desk: Desk) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,7 @@ from flasher.cli.output import Output, counted
 from flasher.cli.plant.documents import PlantDeliverDocument, PlantDeliveriesDocument
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
-from flasher.plant.central import Central
+from flasher.plant.central import open_central
 from flasher.plant.deliveries import (
     Answer,
     Attempt,
@@ -38,16 +38,15 @@ def deliver(output: Output, url: str, file: Path, *, once: bool) -> int:
     receivers = load_receivers(file)
     counts: Counter[DeliveryState] = Counter()
 
-    def report(attempt: Attempt, answer: Answer) -> None:
+    def count(_attempt: Attempt, answer: Answer) -> None:
         counts[answer.state] += 1
-        if answer.state is not DeliveryState.CONFIRMED:
-            words = f"{attempt.receiver}: {attempt.key} {answer.state}, {answer.text}"
-            output.progress(printable(words))
 
-    courier = Courier(url, receivers, SCHEMA_VERSION, report, output.progress)
-    with closing(courier), stop_on_signal() as stop:
+    def begun() -> None:
         names = ", ".join(each.name for each in receivers)
         output.progress(f"delivers to {names}{'' if once else ' until Ctrl-C'}")
+
+    courier = Courier(url, receivers, SCHEMA_VERSION, count, output.progress, begun)
+    with closing(courier), stop_on_signal() as stop:
         courier.deliver(stop, once=once)
     made = ", ".join(f"{count:,} {state}" for state, count in sorted(counts.items()))
     output.result(f"attempts: {made or 'none'}")
@@ -74,7 +73,7 @@ def deliveries(
             "--resend would send every run again.",
             remedy="Choose which: --state refused, --serial SERIAL, --key KEY or --receiver NAME.",
         )
-    with closing(Central(url)) as central:
+    with open_central(url) as central:
         found = Deliveries(central)
         if stop is not None:
             found.stop(stop)
@@ -121,7 +120,7 @@ def _lines(row: Delivery) -> Iterator[str]:
 
 def reconcile(output: Output, url: str, receiver: str, file: Path, *, resend: bool) -> int:
     listed = read_list(file)
-    with closing(Central(url)) as central:
+    with open_central(url) as central:
         found = Deliveries(central)
         if receiver not in {each.name for each in found.receivers()}:
             raise unknown_receiver(receiver)
@@ -130,8 +129,8 @@ def reconcile(output: Output, url: str, receiver: str, file: Path, *, resend: bo
     output.results(_differences(result))
     if resend and result.missing:
         output.result(f"{counted(len(result.missing) - len(retired), 'run')} will be sent again")
-    for key in retired:
-        output.progress(f"note: {key} was retired to a file, and is not sent again")
+    for line in _listed("that were retired to files are not sent again", retired):
+        output.progress(line)
     code = ExitCode.OK if result.agrees else ExitCode.VERIFICATION
     return output.document(result, exit_code=code)
 
@@ -143,11 +142,15 @@ def _differences(found: Reconciliation) -> Iterator[str]:
         ("there, but unknown here", found.unknown),
         ("there, but not confirmed yet", found.unconfirmed),
     ):
-        if keys:
-            yield f"{counted(len(keys), 'run')} {what}:"
-            yield from (printable(f"  {key}") for key in keys[:_SHOWN_MAX])
-        if len(keys) > _SHOWN_MAX:
-            yield f"  and {len(keys) - _SHOWN_MAX:,} more (--json lists them)"
+        yield from _listed(what, keys, " (--json lists them)")
     ending = "agree" if found.agrees else "DIFFER"
     rows = counted(found.listed, "row")
     yield f"{rows} of the list and {found.delivered:,} confirmed runs: they {ending}"
+
+
+def _listed(what: str, keys: Sequence[str], where_rest: str = "") -> Iterator[str]:
+    if keys:
+        yield f"{counted(len(keys), 'run')} {what}:"
+        yield from (printable(f"  {key}") for key in keys[:_SHOWN_MAX])
+    if len(keys) > _SHOWN_MAX:
+        yield f"  and {len(keys) - _SHOWN_MAX:,} more{where_rest}"
