@@ -1,0 +1,131 @@
+"""A recipe from the plant in a whole `flasher station run`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, Final
+
+import pytest
+
+from flasher.errors import ExitCode
+from flasher.plant.setup import PUBLISHERS
+from flasher.station.records.model import AuditEvent, RunState
+from tests.cli.conftest import Flasher
+from tests.cli.station_threads import ThreadPort
+from tests.plant.conftest import plant
+from tests.plant.factory import PASSWORD, Plant
+from tests.station.factory import USUAL, write_recipe
+
+__all__ = ["plant"]
+pytestmark = pytest.mark.slow
+BADGES = """\
+[[person]]
+name = "Jo"
+code = "BADGE-1"
+role = "operator"
+
+[[person]]
+name = "Kim"
+code = "BADGE-2"
+role = "supervisor"
+"""
+STATION = """\
+name = "line-2"
+plant = "{plant}"
+plant_recipes = true
+badges = "badges.toml"
+keys = "keys"
+
+[[socket]]
+name = "A"
+mock = {{ bad = 0.0, seed = 7 }}
+"""
+PUBLISHER: Final = "flasher_bert"
+_LIMIT_S: Final = 60.0
+
+
+class People:
+    """Both pipes of a station: reads the events that it prints, and answers with scans."""
+
+    def __init__(self, scans: Callable[[People], Iterator[str]]) -> None:
+        self._scans = scans
+        self._events: SimpleQueue[dict[str, Any]] = SimpleQueue()
+        self._line = ""
+
+    def write(self, text: str) -> int:
+        *lines, self._line = (self._line + text).split("\n")
+        for line in lines:
+            self._events.put(json.loads(line))
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+    def isatty(self) -> bool:
+        return False
+
+    def __iter__(self) -> Iterator[str]:
+        return self._scans(self)
+
+    def see(self, name: str, **values: object) -> dict[str, Any]:
+        """Wait for the next event of this name and these values."""
+        while True:
+            event = self._events.get(timeout=_LIMIT_S)
+            if event.get("event") == name and values.items() <= event.items():
+                return event
+
+
+def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
+    flasher: Flasher, plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.plant.process._END_S", 60.0)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    with plant.connect() as admin:
+        admin.execute(f"CREATE ROLE {PUBLISHER} LOGIN PASSWORD '{PASSWORD}'".encode())
+        admin.execute(f"GRANT {PUBLISHERS} TO {PUBLISHER}".encode())
+    centre, station = tmp_path / "centre", tmp_path / "station"
+    for folder in (centre, station):
+        folder.mkdir()
+    published = write_recipe(centre, USUAL.replace('revision = "4"', 'revision = "5"'))
+    words = ("--station", "line-2", "--database", plant.url(PUBLISHER), "--json")
+    digest = flasher("plant", "publish", published, *words).document["digest"]
+    local = write_recipe(station, USUAL)
+    file = station / "station.toml"
+    file.write_text(STATION.format(plant=plant.url("flasher_line_2")), encoding="utf-8")
+    (station / "badges.toml").write_text(BADGES, encoding="utf-8")
+    serials = []
+
+    def scans(people: People) -> Iterator[str]:
+        yield "BADGE-1"
+        for is_new in (False, True):
+            if is_new:
+                (offer,) = people.see("RecipesOffered")["offered"]
+                yield from ("BADGE-2", offer["scan"])
+                people.see("RecipeChanged", socket="A", digest=digest)
+            serials.append(people.see("UnitArrived")["label"])
+            yield serials[-1]
+            people.see("RunEnded", outcome="pass")
+
+    people = People(scans)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdin", people)
+        patch.setattr(sys, "stdout", people)
+        run = flasher("station", "run", "--recipe", local, "--sockets", file, "--mock-speed", "0")
+    assert run.code == ExitCode.OK, run.err
+    with closing(plant.store()) as store:
+        runs = [life.runs[-1].run for each in serials for life in store.read.units(each)]
+        used = [row["digest"] for row in store.read.noted("line-2", AuditEvent.RECIPE_USED)]
+        (approval,) = store.read.noted("line-2", AuditEvent.RECIPE_APPROVED)
+    facts = [(run.state, run.recipe, run.recipe_revision) for run in runs]
+    assert facts == [(RunState.PASS, "Battery 36 V", "4"), (RunState.PASS, "Battery 36 V", "5")]
+    assert runs[1].recipe_sha256 == hashlib.sha256(published.read_bytes()).hexdigest()
+    assert used == ["", digest]
+    assert (approval["by"], approval["published_by"]) == ("Kim", PUBLISHER)
+    (status,) = plant.status().recipes
+    assert (status.socket, status.digest) == ("A", digest)
