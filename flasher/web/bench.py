@@ -322,8 +322,11 @@ class BenchController:
             self.look()
 
     def look(self) -> None:
-        """Request the battery's identity, and receive from the others, which have no query."""
-        self.show(doing=Activity.LOOKING, bike=None, done=None, compared=None)
+        """Request the battery's identity, and receive from the others, which have no query. No
+        device is selected then: it may be another bike.
+        """
+        self.choose_target("")
+        self.show(doing=Activity.LOOKING, bike=None, done=None, checks=(), notes=(), compared=None)
         bike = self.seen(BMS)
         self.show(bike=bike)
         if not bike.survey.heard:
@@ -631,15 +634,13 @@ class BenchController:
         job = self.job(offer.path, chosen)
         if job.plan.image.sha256 != offer.sha256:
             raise changed_error(offer)
+        self.carry_out(job, offer, self.battery_shown)
+
+    @property
+    def battery_shown(self) -> str:
+        """Serial number of the battery that the page shows; "" if it is unknown."""
         bike = self.state.bike
-        shown = "" if bike is None or self.state.is_rescue else serial_number(bike.version)
-        if chosen is not BMS:  # its upgrade does not ask the battery
-            self.check_same_bike(shown)
-        self._expected_serial = shown
-        try:
-            self.carry_out(job, offer)
-        finally:
-            self._expected_serial, self._other_serial = "", None
+        return "" if bike is None or self.state.is_rescue else serial_number(bike.version)
 
     def check_same_bike(self, battery: str) -> None:
         """Raise WrongDeviceError if another battery answers than the one with this serial number;
@@ -652,8 +653,8 @@ class BenchController:
                 )
             except FlasherError as error:
                 error.remedy = text(
-                    "Connect the first bike and press the same button again, or look again for "
-                    "this one."
+                    "Connect the first bike and press the same button again, or search for devices "
+                    "again to upgrade this one."
                 )
                 raise
 
@@ -665,24 +666,35 @@ class BenchController:
         )  # fmt: skip
         self._last_image = None
 
-    def carry_out(self, job: Job, offer: Offer) -> Done:
-        """Run a prepared upgrade, and read what the device answers after it."""
+    def carry_out(self, job: Job, offer: Offer, battery: str) -> Done:
+        """Run a prepared upgrade on the bike whose battery has this serial number, "" if it is
+        unknown, and read what the device answers after it. Raises WrongDeviceError if another
+        battery answers before it.
+        """
+        if job.plan.target is not BMS:  # its upgrade does not ask the battery
+            self.check_same_bike(battery)
         self._begin()
         adapter = self.adapter()
-        carried = self.backend.upgrade(
-            adapter,
-            job,
-            self.connected,
-            keeps_settings=bool(self.state.keeps_settings),
-            on_event=self._happened,
-            cancelled=self.cancelled,
-        )
-        if self._other_serial is not None and isinstance(carried.error, InterruptedByUserError):
+        self._expected_serial = battery
+        try:
+            carried = self.backend.upgrade(
+                adapter,
+                job,
+                self.connected,
+                keeps_settings=bool(self.state.keeps_settings),
+                on_event=self._happened,
+                cancelled=self.cancelled,
+            )
+            other = self._other_serial
+        finally:
+            self._expected_serial, self._other_serial = "", None
+        if other is not None and isinstance(carried.error, InterruptedByUserError):
             carried.error = WrongDeviceError(
                 text(
-                    "The unit {other} answers now, and {serial} was shown: nothing was written.",
-                    other=self._other_serial or text("without serial number"),
-                    serial=self._expected_serial,
+                    "The unit {other} answers now, and {serial} answered before: nothing was "
+                    "written.",
+                    other=other or text("without serial number"),
+                    serial=battery,
                 ),
                 remedy=text("Leave one unit connected until its upgrade has ended."),
                 code=ErrorCode.NOT_FOR_DEVICE,

@@ -16,7 +16,7 @@ from flasher.errors import InterruptedByUserError, UsageError
 from flasher.i18n import text, with_value
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import RESCUE, BenchController, changed_error
-from flasher.web.bench_state import Activity, Done, Offer, SetDevice
+from flasher.web.bench_state import Activity, Offer, SetDevice
 
 _GO_ON: Final = text("Then go on with the bike.")
 
@@ -38,35 +38,38 @@ def upgrade_bike(bench: BenchController, sha256: str) -> None:
     jobs = {target: job for target, (_, job) in bench.set_jobs(chosen.path).items()}
     if "".join(job.plan.image.sha256 for job in jobs.values()) != sha256:
         raise changed_error(chosen)
-    before = bench.state.devices if bench.state.done is not None else ()
-    bench.show(doing=Activity.LOOKING, done=None, devices=(), compared=None)
+    bench.show(doing=Activity.LOOKING, compared=None)
     profiles = {target: bench.backend.profile(target) for target in jobs}
     try:
         with bench.connected() as connection:
             dialect = bench.backend.dialect
             found = look_at_bike(connection, dialect, profiles, cancelled=bench.cancelled)
+            bench.check_same_bike(bench.battery_shown)
             judge_bike(found, jobs, ())
             battery = serial_number(found.answers[BMS].version)
             kept = {
                 each.target: each
-                for each in before
+                for each in bench.state.devices
                 if _is_done(each, offers, battery) and each.target not in found.broken
             }
             order = in_safe_order(list(jobs), found.broken)
             devices = (
                 kept.get(each, SetDevice(each, offers[each], None, battery)) for each in order
             )
-            bench.show(devices=tuple(devices))
-            is_first = True
+            bench.show(done=None, devices=tuple(devices))
             for target in order:
                 if target in kept:
                     continue
                 bench.show(target=target, offer=offers[target])
-                if not is_first:
-                    _check_goes_on(bench, battery)
-                is_first = False
-                done = bench.carry_out(found.ready(jobs[target]), offers[target])
-                _ended(bench, done)
+                if bench.cancelled():
+                    raise InterruptedByUserError(
+                        text("The upgrade of the bike was stopped before its next device."),
+                        remedy=text("The same button goes on with the next one."),
+                    )
+                try:
+                    done = bench.carry_out(found.ready(jobs[target]), offers[target], battery)
+                finally:  # also if the adapter is lost while the device is read after its upgrade
+                    _ended(bench)
                 if done.error is not None:
                     if not done.is_refused:
                         done.error.remedy = with_value(done.error.remedy, RESCUE, _GO_ON)
@@ -83,19 +86,11 @@ def _is_done(device: SetDevice, offers: Mapping[Target, Offer], battery: str) ->
     return is_good and is_same and bool(battery) and device.battery == battery
 
 
-def _check_goes_on(bench: BenchController, battery: str) -> None:
-    """Raise FlasherError if the next device must not be upgraded."""
-    if bench.cancelled():
-        raise InterruptedByUserError(
-            text("The upgrade of the bike was stopped between two devices."),
-            remedy=text("The same button goes on with the next one."),
-        )
-    bench.check_same_bike(battery)
-
-
-def _ended(bench: BenchController, done: Done) -> None:
+def _ended(bench: BenchController) -> None:
+    """Keep the end of the last upgrade with its device."""
+    done = bench.state.done
     devices = (
-        replace(each, done=done) if each.target is done.target else each
+        replace(each, done=done) if done is not None and each.target is done.target else each
         for each in bench.state.devices
     )
     bench.show(devices=tuple(devices))

@@ -124,8 +124,8 @@ def test_an_upgrade_that_the_history_cannot_take_says_so(
 @each(
     "target, serial, words",
     [
-        ("bms", "W2605777", "The unit W2605777 answers now, and W2605001 was shown"),
-        ("bms", "", "The unit without serial number answers now, and W2605001 was shown"),
+        ("bms", "W2605777", "The unit W2605777 answers now, and W2605001 answered before"),
+        ("bms", "", "The unit without serial number answers now, and W2605001 answered before"),
         ("wmc", "W2605777", "The BMS has the serial number W2605777, and had W2605001"),
     ],
 )

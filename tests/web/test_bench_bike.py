@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flasher import events
-from flasher.errors import ErrorCode
-from flasher.web.bench import BenchController
+from flasher.api import DeviceInfo, Job
+from flasher.driver import Tap
+from flasher.errors import BusError, ErrorCode
+from flasher.protocol.spec import BMS, Target
+from flasher.web.bench import BenchController, UpgradeEnding
 from flasher.web.bench_bike import upgrade_bike
-from flasher.web.bench_state import BenchState
+from flasher.web.bench_state import Activity, Adapter, BenchState
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.loops import each
@@ -117,22 +121,93 @@ def test_stop_between_two_devices_leaves_the_next_one_alone(place: BenchPlace) -
     assert state.trouble.code is ErrorCode.INTERRUPTED
 
 
-def test_of_another_bike_all_devices_are_upgraded(place: BenchPlace) -> None:
+def _exchange(place: BenchPlace) -> None:
+    """Connect the next bike in place of the one that is connected."""
+    bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
+    bike._bikes = dict.fromkeys(bike._bikes, bike._bikes[BMS])
+    for socket in bike._places:
+        socket._device = socket._made()
+
+
+def test_another_bike_than_the_one_shown_gets_nothing(place: BenchPlace) -> None:
+    chosen(place, BikeFault.EXCHANGED)
+    _exchange(place)
+    state = upgraded(place)
+    assert state.trouble is not None
+    assert state.trouble.code is ErrorCode.NOT_FOR_DEVICE
+    assert "W2605002" in state.trouble.what
+    assert state.session == ()
+    state = place.do(BenchController.look)
+    assert state.offer is None, "the images are checked again for the bike that was found"
+    place.do(BenchController.choose_bike, order(BenchController.choose_image, SET))
+    assert set(outcome(upgraded(place)).values()) == {"done"}
+
+
+def test_another_bike_begins_again_and_the_first_one_goes_on(place: BenchPlace) -> None:
     chosen(place, BikeFault.EXCHANGED)
     bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
-
-    def exchange() -> None:
-        place.bench.stop()
-        for socket in bike._places:
-            socket._device = socket._made()
-
-    bike.ended = exchange  # type: ignore[method-assign]
+    bike.ended = place.bench.stop  # type: ignore[method-assign]
     upgraded(place)
     place.bench._stop.clear()
     bike.ended = lambda: None  # type: ignore[method-assign]
+    first = [socket._device for socket in bike._places]
+    _exchange(place)
+    state = upgraded(place)
+    assert state.trouble is not None
+    assert state.trouble.code is ErrorCode.NOT_FOR_DEVICE
+    assert outcome(state) == {"obc": "done", "wmc": "not begun", "bms": "not begun"}
+    for socket, device in zip(bike._places, first, strict=True):
+        socket._device = device
     state = upgraded(place)
     assert set(outcome(state).values()) == {"done"}
-    assert [entry.target.name for entry in state.session] == ["obc", "obc", "wmc", "bms"]
+    assert [entry.target.name for entry in state.session] == ["obc", "wmc", "bms"]
+    _exchange(place)
+    place.do(
+        BenchController.look,
+        BenchController.choose_bike,
+        order(BenchController.choose_image, SET),
+    )
+    state = upgraded(place)
+    assert set(outcome(state).values()) == {"done"}
+    assert [entry.target.name for entry in state.session[3:]] == ["obc", "wmc", "bms"]
+
+
+def test_a_battery_exchanged_in_the_last_moment_gets_nothing(place: BenchPlace) -> None:
+    chosen(place, BikeFault.EXCHANGED)
+    upgrade = place.bikes.upgrade
+
+    def exchanged(adapter: Adapter, job: Job, *args: Any, **named: Any) -> UpgradeEnding:
+        if job.plan.target is BMS:
+            _exchange(place)
+        return upgrade(adapter, job, *args, **named)
+
+    place.bikes.upgrade = exchanged  # type: ignore[method-assign]
+    bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
+    bike.ended = lambda: None  # type: ignore[method-assign]
+    state = upgraded(place)
+    assert outcome(state) == {"obc": "done", "wmc": "done", "bms": "failed"}
+    assert state.done is not None
+    assert state.done.error is not None
+    assert state.done.error.code is ErrorCode.NOT_FOR_DEVICE
+    assert not state.done.error.needs_rescue
+    assert state.done.packet == 0
+
+
+def test_an_adapter_lost_after_the_last_device_leaves_no_device_as_not_begun(
+    place: BenchPlace,
+) -> None:
+    chosen(place)
+    seen = place.bench.seen
+
+    def lost(target: Target, *taps: Tap) -> DeviceInfo:
+        if place.bench.state.doing is Activity.LOOKING_AGAIN:
+            raise BusError("The adapter is gone.")
+        return seen(target, *taps)
+
+    place.bench.seen = lost  # type: ignore[method-assign]
+    state = upgraded(place)
+    assert state.trouble is not None
+    assert set(outcome(state).values()) == {"done"}
 
 
 def test_a_set_of_another_version_than_it_states_is_refused_before_anything_is_sent(
