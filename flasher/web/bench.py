@@ -164,7 +164,8 @@ class BenchController:
         """An order is queued or being executed."""
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
-        self._agreement = threading.Event()
+        self._question = self._agreed = 0
+        """Number of the question asked last, and of the one to which a user agreed."""
         self._has_new_files = threading.Event()
         self._images_here: dict[str, str] = {}
         """Files of this computer by the firmware version inside."""
@@ -202,9 +203,9 @@ class BenchController:
         """End the current activity after the present message."""
         self._stop.set()
 
-    def agree(self) -> None:
-        """Agree to what the bench asks."""
-        self._agreement.set()
+    def agree(self, question: int) -> None:
+        """Agree to the question of this number."""
+        self._agreed = question
 
     def close(self, *, ends_upgrade: bool = True) -> None:
         """Start nothing more, and end the current activity; an upgrade only with `ends_upgrade`."""
@@ -271,14 +272,16 @@ class BenchController:
             self.show(is_stopping=True)
         return is_asked
 
-    def ask_again(self) -> None:
-        """Begin to ask for agreement."""
-        self._agreement.clear()
+    def ask(self) -> int:
+        """Begin to ask for agreement; return the number of the question."""
+        self._agreed = 0
+        self._question += 1
+        return self._question
 
     @property
     def is_agreed(self) -> bool:
-        """True if a user has agreed since `ask_again`."""
-        return self._agreement.is_set()
+        """True if a user has agreed to the question asked last."""
+        return self._agreed == self._question
 
     @property
     def has_new_files(self) -> bool:

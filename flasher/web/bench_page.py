@@ -235,9 +235,11 @@ class BenchPage:
         try:
             order = parse_json(await request.body())
             word = order["order"]
-            at_once = {"stop": self._bench.stop, "agree": self._bench.agree}.get(word)
-            if at_once is not None:
-                at_once()
+            if word == "stop":
+                self._bench.stop()
+                return JSONResponse({})
+            if word == "agree":
+                self._bench.agree(int(order["question"]))
                 return JSONResponse({})
             step, fields = _ORDERS[word]
             values = [order[name] for name in fields]

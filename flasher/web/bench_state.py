@@ -231,6 +231,8 @@ class Series:
     """Firmware version that the unit reports."""
     why: str = ""
     """Reason of a question."""
+    question: int = 0
+    """Number of the question, so that a late answer is not taken for the next one."""
     refusal: FlasherError | None = None
     left_s: int = 0
     """Seconds until the upgrade starts."""

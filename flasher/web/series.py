@@ -25,6 +25,7 @@ from flasher.errors import (
 )
 from flasher.i18n import text
 from flasher.procedures import two_devices_error
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS
 from flasher.station.presence import PROBE_S
 from flasher.web.bench import BenchController
@@ -62,8 +63,10 @@ class _SeriesRun:
             )
         self._target, self._sha256, self._path = state.target, state.offer.sha256, state.offer.path
         bench.show(waived=frozenset(), is_rescue=False, compared=None)
-        self._upgraded: set[str] = set()
-        """Serial numbers of this series."""
+        self._taken: dict[str, bool] = {}
+        """Serial numbers of this series; True if the upgrade of the unit has succeeded."""
+        self._lost_at: float | None = None
+        """Time at which the adapter was lost; None if a message was received since then."""
         self._remember(done)
         self._watch: UnitWatch | None = None
         self._followed_at = bench.now()
@@ -73,15 +76,13 @@ class _SeriesRun:
         seen = [each.version for each in (done.before, done.after) if each is not None]
         serials = set(filter(None, map(serial_number, seen)))
         self._is_last_known = bool(serials)
-        self._upgraded |= serials
+        self._taken |= dict.fromkeys(serials, done.error is None)
 
     def run(self) -> None:
-        lost_at: float | None = None
         try:
             while not self._bench.cancelled():
                 try:
                     with self._bench.connected() as connection:
-                        lost_at = None
                         self._use(connection.clock.speed)
                         while self._next():
                             pass
@@ -90,8 +91,7 @@ class _SeriesRun:
                     if not self._bench.cancelled():
                         raise
                 except BusError as error:
-                    lost_at = self._bench.now() if lost_at is None else lost_at
-                    self._await_adapter(error, self._bench.now() - lost_at)
+                    self._await_adapter(error)
         finally:
             self._bench.show(series=None)
 
@@ -105,7 +105,7 @@ class _SeriesRun:
             return False
         changes = watch.changes
         self._show(SeriesStep.READING)
-        bike = self._bench.seen(BMS, watch)
+        bike = self._bench.seen(BMS, watch, self._received)
         if self._bench.cancelled():
             return False
         self._bench.show(bike=bike, done=None, checks=(), notes=())
@@ -121,8 +121,8 @@ class _SeriesRun:
         running = str(getattr(bike.version, "firmware_version", ""))
         why = self._question(serial, running, offer)
         if why:
-            self._bench.ask_again()
-            self._show(SeriesStep.ASKED, serial=serial, running=running, why=why)
+            question = self._bench.ask()
+            self._show(SeriesStep.ASKED, serial=serial, running=running, why=why, question=question)
             if not self._run(lambda _now: watch.changes != changes or self._bench.is_agreed):
                 return False
             if watch.changes != changes:
@@ -140,9 +140,13 @@ class _SeriesRun:
     def _question(self, serial: str, running: str, offer: Offer) -> str:
         """Reason to ask before this unit is upgraded; "" if there is none."""
         if not serial:
-            return text("It reports no serial number: it may be the unit that was just upgraded.")
-        if serial in self._upgraded:
-            return text("This unit was upgraded already in this series.")
+            return text("It reports no serial number: it may be the same unit as before.")
+        if serial in self._taken:
+            return (
+                text("This unit was upgraded already in this series.")
+                if self._taken[serial]
+                else text("The upgrade of this unit has failed in this series.")
+            )
         if not self._is_last_known:
             return text("The unit before it reported no serial number: this may be the same one.")
         if running and running == offer.version and self._target is BMS:
@@ -214,7 +218,10 @@ class _SeriesRun:
         """Watch the unit until the condition holds; False if the series was stopped first."""
         with self._bench.connected() as connection:
             engine = self._watched().until(is_enough)
-            drive(engine, connection.link, connection.clock, cancelled=self._is_over)
+            drive(
+                engine, connection.link, connection.clock,
+                taps=(self._received,), cancelled=self._is_over,
+            )  # fmt: skip
         return not self._bench.cancelled()
 
     def _is_another_there(self, now: float) -> bool:
@@ -226,9 +233,7 @@ class _SeriesRun:
         settled_s = now - watch.unchanged_since
         if settled_s < SETTLED_S or (watch.serial is None and settled_s < _SERIAL_WAIT_S):
             return False
-        is_other_serial = bool(watch.serial and self._upgraded) and (
-            watch.serial not in self._upgraded
-        )
+        is_other_serial = bool(watch.serial and self._taken) and watch.serial not in self._taken
         return watch.was_gone or is_other_serial
 
     def _is_over(self) -> bool:
@@ -249,9 +254,17 @@ class _SeriesRun:
             )
         return self._bench.cancelled()
 
-    def _await_adapter(self, error: FlasherError, away_s: float) -> None:
+    def _received(self, frame: Frame, *, sent: bool, now: float) -> None:
+        """Process a frame: an adapter that opens may still not work, one that receives does."""
+        if not sent:
+            self._lost_at = None
+
+    def _await_adapter(self, error: FlasherError) -> None:
         """Wait before the adapter is tried again. Raises its error if it was away for too long."""
-        if away_s > ADAPTER_WAIT_S:
+        now = self._bench.now()
+        if self._lost_at is None:
+            self._lost_at = now
+        if now - self._lost_at > ADAPTER_WAIT_S:
             raise error
         self._show(SeriesStep.ADAPTER, refusal=error)
         self._is_over()

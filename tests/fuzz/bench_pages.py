@@ -126,6 +126,7 @@ def _requests() -> Iterator[bytes]:
         field = "path" if word == "folder" else "name"
         yield b"POST /bench/order\n\n" + json.dumps({"order": word, field: name}).encode()
     yield b'POST /bench/order\n\n{"order": "stop"}'
+    yield b'POST /bench/order\n\n{"order": "agree", "question": "x"}'
     yield b"GET /kept/story?trace=" + browser.MARK + b">"
     yield upload + browser.MARK + b">.hex\n\n:00"
     # These broke it.

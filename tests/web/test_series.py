@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import inf
 from pathlib import Path
 
 import pytest
 
 from flasher import events
 from flasher.driver import Tap
-from flasher.errors import BusError, ErrorCode
+from flasher.errors import BusError, ErrorCode, WrongDeviceError
 from flasher.mock.faults import AtTime, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.procedures import DeviceInfo
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Target
-from flasher.web.bench import BenchController
+from flasher.web.bench import BenchController, UpgradeEnding
 from flasher.web.bench_state import Activity, BenchState, Series, SeriesStep
 from flasher.web.series import SHOWN_S, take_next_bikes
 from flasher.web.virtual_bike import BikeFault, VirtualBike
@@ -65,6 +67,10 @@ class Session:
     @property
     def names(self) -> list[SeriesStep]:
         return [each.step for each in self.steps]
+
+    def agree(self) -> None:
+        """Agree to the question that is shown."""
+        self.bench.agree(self.steps[-1].question)
 
     def stop_after(self, count: int) -> Callable[[], None]:
         """Stop as soon as so many upgrades have ended."""
@@ -144,7 +150,7 @@ def test_the_same_unit_that_comes_back_is_upgraded_only_when_a_user_agrees(
     session.at[SeriesStep.REMOVAL] = lambda: (
         session.bench.stop() if len(session.steps) > 1 else _bounce(session, 5.0)
     )
-    session.at[SeriesStep.ASKED] = session.bench.agree
+    session.at[SeriesStep.ASKED] = session.agree
     state = session.run()
     assert SeriesStep.SHOWN not in session.names
     asked = next(each for each in session.steps if each.step is SeriesStep.ASKED)
@@ -172,9 +178,38 @@ def test_a_contact_that_bounces_is_no_next_bike(place: BenchPlace) -> None:
 def test_an_agreement_is_for_the_unit_that_was_shown(place: BenchPlace) -> None:
     session = Session(place, BikeFault.NONE)
     session.at[SeriesStep.REMOVAL] = lambda: _bounce(session, 5.0)
-    session.bench.agree()  # before it was asked
+    session.bench.agree(1)  # before it was asked
     session.at[SeriesStep.ASKED] = session.bench.stop
     state = session.run()
+    assert session.names[-1] is SeriesStep.ASKED
+    assert len(state.session) == 1
+
+
+def test_an_agreement_that_comes_late_is_not_for_the_next_unit(place: BenchPlace) -> None:
+    session = Session(place, BikeFault.NONE)
+    session.at[SeriesStep.REMOVAL] = lambda: _bounce(session, 5.0)
+    asked: list[int] = []
+
+    def ask() -> None:
+        asked.append(session.steps[-1].question)
+        if len(asked) == 1:
+            _bounce(session, 5.0)
+            return
+        session.bench.agree(asked[0])
+
+    turns = 0
+
+    def now() -> float:
+        nonlocal turns
+        turns += len(asked) > 1
+        if turns > 100:
+            place.bench.stop()
+        return 0.0
+
+    place.bench.now = now
+    session.at[SeriesStep.ASKED] = ask
+    state = session.run()
+    assert asked == [1, 2]
     assert session.names[-1] is SeriesStep.ASKED
     assert len(state.session) == 1
 
@@ -344,6 +379,67 @@ def test_an_adapter_that_stays_away_ends_the_series(
     assert now_s >= 300
 
 
+def test_an_adapter_on_which_sending_always_fails_ends_the_series(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(place, BikeFault.EXCHANGED)
+    now_s = 0.0
+
+    def pause(duration_s: float) -> None:
+        nonlocal now_s
+        now_s += duration_s
+        if now_s > 400:
+            place.bench.stop()
+
+    def failing(_frame: Frame) -> None:
+        raise BusError("The adapter does not send.")
+
+    place.bench.now = lambda: now_s
+    place.bench.pause = pause  # type: ignore[method-assign]
+    monkeypatch.setattr(type(place.bench.feed), "is_followed", True)
+    monkeypatch.setattr(session.bike._link, "send", failing)
+    for socket in session.bike._places:
+        socket._device, socket._at = None, inf
+    state = session.run()
+    assert state.trouble is not None
+    assert state.trouble.what == "The adapter does not send."
+    assert 300 <= now_s <= 302
+
+
+def test_an_adapter_that_was_lost_again_later_is_awaited_as_long_again(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(place, BikeFault.NONE)
+    now_s, losses = 0.0, 0
+
+    def pause(_duration_s: float) -> None:
+        nonlocal now_s
+        now_s += 200
+
+    link = session.bike._link
+    receive = link.receive
+    received = 0
+
+    def lost_after_some(deadline: float) -> Frame | None:
+        nonlocal received, losses
+        frame = receive(deadline)
+        received += frame is not None
+        if received == 5:
+            received, losses = 0, losses + 1
+            if losses == 4:
+                place.bench.stop()
+            session.bike._bus.unplug()
+        return frame
+
+    place.bench.now = lambda: now_s
+    place.bench.pause = pause  # type: ignore[method-assign, assignment]
+    monkeypatch.setattr(type(place.bench.feed), "is_followed", True)
+    monkeypatch.setattr(link, "receive", lost_after_some)
+    state = session.run()
+    assert state.trouble is None
+    assert losses == 4
+
+
 def test_a_closed_page_ends_the_series(place: BenchPlace) -> None:
     session = Session(place, BikeFault.EXCHANGED)
     turns = 0
@@ -371,6 +467,29 @@ def test_a_file_that_comes_ends_the_series_loudly(place: BenchPlace) -> None:
 
 def _overwrite(path: Path, data: bytes) -> None:
     path.write_bytes(data)
+
+
+def test_a_unit_whose_upgrade_was_refused_is_not_called_upgraded(place: BenchPlace) -> None:
+    session = Session(place, BikeFault.EXCHANGED)
+    upgrade = place.bikes.upgrade
+
+    def refused(*_args: object, **_named: object) -> UpgradeEnding:
+        error = WrongDeviceError("The charge is too low.", code=ErrorCode.NOT_FOR_DEVICE)
+        return UpgradeEnding(None, error, None)
+
+    def refuse() -> None:
+        place.bikes.upgrade = refused  # type: ignore[method-assign]
+
+    def again() -> None:
+        place.bikes.upgrade = upgrade  # type: ignore[method-assign]
+        if place.bench.state.failed_count:
+            _bounce(session, 5.0)
+
+    session.at[SeriesStep.UPGRADING] = refuse
+    session.at[SeriesStep.REMOVAL] = again
+    session.at[SeriesStep.ASKED] = session.bench.stop
+    session.run()
+    assert session.steps[-1].why == "The upgrade of this unit has failed in this series."
 
 
 def test_an_image_that_was_exchanged_ends_the_series(place: BenchPlace) -> None:
