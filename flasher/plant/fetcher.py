@@ -8,6 +8,7 @@ leaves what was there.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any, Final
@@ -72,11 +73,13 @@ class Fetcher:
         """Ask the plant, and fetch what is new or damaged. Raises RecordError if the plant cannot
         be reached, the list cannot be saved, or a recipe in use is not here any more.
         """
-        kept = needed(Records(self._records), self._station)
+        kept = needed(Records(self._records), self._station, self._sockets)
         with self._central.reading() as connection:
             held = {"held": [*self._folder.digests(), *kept]}
             answer = connection.execute(_RECIPES, held).scalar_one()
-        before = self._folder.given()
+        before = Given()
+        with suppress(RecordError):  # a list that cannot be read is written again
+            before = self._folder.given()
         withdrawn = frozenset(map(str, answer["withdrawn"]))
         recipes, new = [], []
         for given in self._newest(answer["published"]):

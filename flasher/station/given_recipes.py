@@ -39,6 +39,7 @@ _FILES: Final = "files"
 _STATE: Final = "given.json"
 _PART: Final = ".part-"
 _STATE_MAX_SIZE: Final = 256 * 1024
+_NOT_KEPT: Final = "A recipe from the plant cannot be saved"
 _DAMAGED: Final = text(
     "The copy of a recipe from the plant is damaged. It is fetched again when the server can be"
     " reached."
@@ -149,7 +150,8 @@ class RecipeFolder:
             raise RecordError(
                 "The list of recipes from the plant cannot be read.",
                 where=printable(str(path)),
-                remedy="Delete the file; it is written again when the server can be reached.",
+                remedy="Fetch it again: flasher plant fetch --sockets FILE. Without the server,"
+                " delete the file: what the plant has withdrawn is not known until it answers.",
             ) from error
 
     def save_given(self, given: Given) -> None:
@@ -173,7 +175,7 @@ class RecipeFolder:
                 if found != sha256:
                     raise ValueError(f"{name} has another hash than its manifest states")
             self._write(part / _MANIFEST, [bundle.to_text().encode("ascii")])
-            with mapped(printable(str(self.folder)), writes=True):
+            with mapped(printable(str(self.folder)), writes=True, begin=_NOT_KEPT):
                 final = self.folder / bundle.digest
                 shutil.rmtree(final, ignore_errors=True)  # a damaged copy
                 part.replace(final)
@@ -226,7 +228,7 @@ class RecipeFolder:
         """Write a file beside its place, then move it there; returns its SHA-256."""
         digest = hashlib.sha256()
         part = path.with_name(f"{_PART}{token_hex(4)}")
-        with mapped(printable(str(path)), writes=True):
+        with mapped(printable(str(path)), writes=True, begin=_NOT_KEPT):
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 with part.open("wb") as out:

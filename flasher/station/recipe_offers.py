@@ -9,7 +9,7 @@ Loading a recipe takes a moment; the station's thread, which all sockets wait fo
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -142,7 +142,12 @@ def used(read: Records, station: str) -> Mapping[str, Mapping[str, Any]]:
     return {str(data.get("socket")): data for data in read.noted(station, AuditEvent.RECIPE_USED)}
 
 
-def needed(read: Records, station: str) -> frozenset[str]:
-    """Digests of the recipes that a station uses, or will use. Raises RecordError."""
-    found = (*approved(read, station).values(), *used(read, station).values())
+def needed(read: Records, station: str, sockets: Collection[str]) -> frozenset[str]:
+    """Digests of the recipes that these sockets use, or will use. Raises RecordError."""
+    found = [
+        data
+        for by_socket in (approved(read, station), used(read, station))
+        for socket, data in by_socket.items()
+        if socket in sockets
+    ]
     return frozenset(str(data["digest"]) for data in found if data.get("digest"))

@@ -160,7 +160,7 @@ def test_a_full_disk_leaves_the_old_recipe(centre: Centre, monkeypatch: pytest.M
 
     with monkeypatch.context() as patched:
         patched.setattr("flasher.station.given_recipes.os.fsync", full)
-        with pytest.raises(RecordError, match="No space left"):
+        with pytest.raises(RecordError, match="A recipe from the plant cannot be saved: No space"):
             centre.fetcher.fetch()
     assert centre.folder.digests() == (good,)
     assert centre.folder.given().recipes[0].digest == good
@@ -208,6 +208,23 @@ def test_a_recipe_in_use_that_is_lost_and_not_given_any_more_is_reported(centre:
     with pytest.raises(RecordError, match="0000000000000000"):
         centre.fetcher.fetch()
     assert [each.digest for each in centre.folder.given().recipes] == [newest]
+
+
+def test_a_socket_that_is_no_longer_there_needs_no_recipe(centre: Centre) -> None:
+    facts = {"digest": "0" * 64, "socket": "C", "name": "", "revision": "5", "sha256": ""}
+    centre.sender.bench.store.note(AuditEvent.RECIPE_USED, facts)
+    newest = centre.publish(REVISION_5)
+    assert centre.given() == {newest: ("A", "B")}
+
+
+def test_a_list_that_cannot_be_read_is_written_again(centre: Centre) -> None:
+    newest = centre.publish(REVISION_5)
+    centre.fetcher.fetch()
+    (centre.folder.folder / "given.json").write_text('{"recipes": [', encoding="utf-8")
+    with pytest.raises(RecordError, match="cannot be read"):
+        centre.folder.given()
+    assert centre.given() == {newest: ("A", "B")}
+    assert centre.folder.given().recipes[0].digest == newest
 
 
 def test_a_file_without_end_is_refused(centre: Centre, monkeypatch: pytest.MonkeyPatch) -> None:
