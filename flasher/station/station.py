@@ -548,28 +548,27 @@ class Station:
 
     def _approve(self, digits: str, data: Mapping[str, str]) -> Refused | None:
         """Approve the offered recipe of these digits; returns the refusal, or None."""
-        found = {
-            offer.given.digest: offer
+        found = [
+            offer
             for offer in self._offers.offers
             if len(digits) >= SCAN_DIGITS and offer.given.digest.startswith(digits.lower())
-        }
-        sockets = [
-            name
-            for offer in self._offers.offers
-            if offer.given.digest in found
-            for name in offer.given.sockets
-            if self._waits_for(name, offer.given.digest)
         ]
-        if len(found) != 1 or not sockets:
+        if len(found) != 1:
             reason = text("The plant offers no recipe with this digest.")
             return Refused("NO_SUCH_RECIPE", reason, text("Scan what the operator page shows."))
-        (offer,) = found.values()
+        (offer,) = found
         loaded = offer.loaded
         if offer.given.digest in self._offers.withdrawn:
             reason = text("The plant has withdrawn this recipe.")
             return Refused(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
         if loaded is None or offer.problem:
             return Refused("RECIPE_UNUSABLE", offer.problem, _OTHER_RECIPE)
+        sockets = [
+            name for name in offer.given.sockets if self._waits_for(name, offer.given.digest)
+        ]
+        if not sockets:
+            reason = text("This recipe is approved already.")
+            return Refused("RECIPE_APPROVED", reason, text("Nothing to do."))
         facts = {**_recipe_facts(loaded), "sockets": sockets}
         published = {"published_at": offer.given.at, "published_by": offer.given.by}
         try:
@@ -582,6 +581,8 @@ class Station:
 
     def _change_recipes(self) -> None:
         """Give the sockets that are between two units their approved recipe."""
+        if self.line.stopped is not None:
+            return  # what could not be recorded is tried again after RESUME
         for name, offer in tuple(self._approved.items()):
             recipe = offer.loaded
             if recipe is None or name in self._runs or not self.line.is_between_units(name):

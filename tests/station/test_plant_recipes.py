@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from flasher.release.store import TrustStore
 from flasher.station.events import (
     RecipeChanged,
     RecipesOffered,
+    RecordNotSaved,
     RunEnded,
     RunStarted,
     ScanRefused,
@@ -29,6 +31,7 @@ from flasher.station.messages import AdapterReady, Quit
 from flasher.station.operators import Crew, Person, Role
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.recipe_offers import RecipeOffers, approved, used
+from flasher.station.records.errors import RecordError
 from flasher.station.records.model import AuditEvent, RunState
 from tests.release.maker import chain_of, first_trust
 from tests.station.factory import DAY, HEAD, SERIAL, USUAL, Bench, make_recipe, target_table
@@ -167,6 +170,14 @@ def test_a_recipe_that_does_not_fit_the_station_is_shown_and_not_approved(bench:
     assert plant.line.last(ScanRefused).code == "RECIPE_UNUSABLE"
 
 
+def test_a_second_approval_states_that_there_is_one(plant: Plant) -> None:
+    digest = plant.give(REVISION_5)
+    plant.approve(digest)
+    plant.approve(digest)
+    assert plant.line.last(ScanRefused).code == "RECIPE_APPROVED"
+    assert len(plant.line.bench.store.read.noted("line-2", AuditEvent.RECIPE_APPROVED)) == 1
+
+
 def test_a_recipe_with_a_problem_is_loaded_again_and_offered_once_it_fits(bench: Bench) -> None:
     plant = Plant(bench)
     given = plant.line.of(RecipesOffered)
@@ -210,6 +221,43 @@ def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None
     line.end("A")
     assert plant.revision(OTHER) == "5"
     assert line.ports["A"].setup.recipe.is_relative_to(plant.folder.folder / digest)
+
+
+def test_a_change_that_cannot_be_recorded_is_tried_again_after_resume(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line, store = plant.line, plant.line.bench.store
+    note, fault = store.note, RecordError("RECORD NOT SAVED: the disk is full.", remedy="")
+
+    def full(what: AuditEvent, *rest: Any) -> None:
+        if what is AuditEvent.RECIPE_USED:
+            raise fault
+        note(what, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "note", full)
+        plant.approve(plant.give(REVISION_5))
+        for _ in range(5):
+            line.turn()
+    assert line.of(RecipeChanged) == []
+    assert len(line.of(RecordNotSaved)) == 1, "once, not in each turn of the loop"
+    line.scan("RESUME")
+    line.turn()
+    assert {each.socket for each in line.of(RecipeChanged)} == {"A", "B"}
+
+
+def test_a_copy_that_is_damaged_in_use_is_named_as_the_plants(plant: Plant) -> None:
+    digest = plant.give(REVISION_5)
+    plant.approve(digest)
+    plant.restart("A")
+    plant.restart("B")
+    (image,) = (plant.folder.folder / digest).rglob("bms.bin")
+    image.write_bytes(b"")
+    plant.line.scan(SERIAL)
+    plant.line.arrive("A")
+    refused = plant.line.last(ScanRefused)
+    assert refused.code == "RECIPE_CHANGED"
+    assert "fetched again" in refused.remedy
 
 
 def test_sockets_change_on_their_own(plant: Plant) -> None:

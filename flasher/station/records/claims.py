@@ -64,11 +64,15 @@ def check_order(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
         ) from error
     if not loaded.is_unchanged():
         path = printable(str(loaded.path))
-        raise ClaimRefusedError(
-            Refusal.RECIPE_CHANGED,
-            text("The recipe {path}, or a file that it refers to, was changed.", path=path),
-            remedy=text("Check it with `flasher station check`, then start the station again."),
-        )
+        what = text("The recipe {path}, or a file that it refers to, was changed.", path=path)
+        remedy = text("Check it with `flasher station check`, then start the station again.")
+        if loaded.digest:
+            what = text("The copy of the recipe from the plant is damaged.")
+            remedy = text(
+                "It is fetched again when the server can be reached: scan RESUME after a minute,"
+                " or approve another recipe."
+            )
+        raise ClaimRefusedError(Refusal.RECIPE_CHANGED, what, remedy=remedy)
     if not order.operator.strip() or not order.socket.strip():
         raise UsageError("A run needs an operator and a socket.")
     return replace(order, lot=scan.lot)
