@@ -362,10 +362,8 @@ class Station:
 
     @property
     def figures(self) -> Figures:
-        """Totals of this recipe since the station started. Raises RecordError."""
-        chosen = RunFilter(
-            since=self._started_at, recipe=self.recipe.recipe.name, part=self.recipe.recipe.part
-        )
+        """Totals of this station since it started. Raises RecordError."""
+        chosen = RunFilter(since=self._started_at, station=self.store.station)
         return self.store.read.figures(chosen)
 
     # -- inputs and effects of the line -----------------------------------------------------------

@@ -13,14 +13,17 @@ from typing import Any, Final
 
 import pytest
 
+from flasher.cli.station.setup import gate_of
 from flasher.errors import ExitCode
+from flasher.plant.central import Central
 from flasher.plant.setup import PUBLISHERS
+from flasher.station.config import MockUnits, mock_config
 from flasher.station.records.model import AuditEvent, RunState
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.plant.conftest import plant
 from tests.plant.factory import PASSWORD, Plant
-from tests.station.factory import USUAL, write_recipe
+from tests.station.factory import USUAL, Bench, make_recipe, write_recipe
 
 __all__ = ["plant"]
 pytestmark = pytest.mark.slow
@@ -129,3 +132,29 @@ def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
     assert (approval["by"], approval["published_by"]) == ("Kim", PUBLISHER)
     (status,) = plant.status().recipes
     assert (status.socket, status.digest) == ("A", digest)
+
+
+def test_the_database_is_given_the_longest_time_limit_of_the_recipes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gate applies the limit of each socket's recipe."""
+    limits: list[float] = []
+
+    class Limits(Central):
+        def __init__(self, url: str, **limits_s: float) -> None:
+            super().__init__(url)
+            limits.append(limits_s["statement_limit_s"])
+
+    monkeypatch.setattr("flasher.plant.central.Central", Limits)
+    plant = {"plant": "postgresql://x@127.0.0.1:1/plant"}
+    config = mock_config(2, MockUnits()).model_copy(update=plant)
+    bench = Bench(tmp_path)
+    recipes = {
+        name: make_recipe(tmp_path, f"{USUAL}\n[plant]\ntime_limit_s = {limit_s}\n")
+        for name, limit_s in (("1", 1.0), ("2", 9.0))
+    }
+    gate = gate_of(config, recipes, bench.store)
+    assert gate is not None
+    gate.close()
+    bench.store.close()
+    assert limits == [9.0]

@@ -15,22 +15,28 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import httpx2
 import pytest
 
 from flasher.cli.station import pages
+from flasher.cli.station.pages import OperatorView
 from flasher.errors import ExitCode, UsageError
+from flasher.station.board import Board
+from flasher.station.events import RunEnded, StationEvent
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.keys import KeyLocations
+from flasher.station.records.model import RunId, RunKind, RunState
 from flasher.station.records.store import Store
 from flasher.web.guard import TOKEN_HEADER
+from flasher.web.operator import CurrentLot, Screen
 from flasher.web.server import Server
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.loops import each
-from tests.station.factory import Bench
+from tests.station.factory import USUAL, Bench, make_recipe
+from tests.station.line_bench import LineBench
 
 pytestmark = pytest.mark.slow
 
@@ -276,3 +282,35 @@ def test_a_full_disk_leaves_no_half_secret(tmp_path: Path, monkeypatch: pytest.M
             pages.kept_secret(key_locations)
     assert list((tmp_path / "keys").iterdir()) == []
     assert len(pages.kept_secret(key_locations)) > 30
+
+
+def test_the_lot_counts_as_the_recipes_of_all_sockets_do(tmp_path: Path) -> None:
+    """The smallest quantity is in force first; golden units are no part of a lot."""
+    bench = Bench(tmp_path)
+    line = LineBench(bench)
+    station, seen = line.station, Lots()
+    view = OperatorView(cast("Screen", seen), station, Board())
+    station.line.lot = "L17"
+    for quantity, name in ((20, "A"), (10, "B")):
+        text = f"{USUAL}\n[lot]\nquantity_max = {quantity}\n"
+        station.recipes[name] = make_recipe(bench.folder, text)
+    view.turn()
+    ends = [("W2605002", RunKind.PRODUCTION), ("W2605003", RunKind.GOLDEN)]
+    for serial, kind in ends:
+        ended = RunEnded("A", serial, RunId(1), kind, RunState.PASS, "OK", "", "", 1.0)
+        view.show(ended)
+    view.turn()
+    assert seen.lots == [CurrentLot("L17", 10, 0), CurrentLot("L17", 10, 1)]
+
+
+class Lots:
+    """A screen that keeps the lots that it is given."""
+
+    def __init__(self) -> None:
+        self.lots: list[CurrentLot] = []
+
+    def show(self, event: StationEvent, board: Board) -> None:
+        pass
+
+    def turn(self, _board: Board, *, operator: str, lot: CurrentLot) -> None:
+        self.lots.append(lot)

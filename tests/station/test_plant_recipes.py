@@ -38,6 +38,7 @@ from tests.station.factory import DAY, HEAD, SERIAL, USUAL, Bench, make_recipe, 
 from tests.station.line_bench import LineBench
 
 OTHER = "W2605003"
+OTHER_PART = USUAL.replace("Battery 36 V", "Battery 48 V").replace("BAT-36", "BAT-48")
 REVISION_5 = USUAL.replace('revision = "4"', 'revision = "5"')
 OPERATOR, SUPERVISOR = "BADGE-1", "BADGE-2"
 
@@ -92,6 +93,14 @@ class Plant:
         assert self.line.ports[socket] is not old
         self.line.say(socket, AdapterReady("a bus", sees_units=True))
         self.line.leave(socket)
+
+    def make(self, socket: str, serial: str) -> None:
+        """A whole run of a unit."""
+        self.line.arrive(socket)
+        self.line.scan(f"SOCKET {socket}")
+        self.line.scan(serial)
+        self.line.work(socket)
+        self.line.end(socket)
 
     def revision(self, serial: str) -> str:
         (life,) = self.line.bench.store.read.units(serial)
@@ -214,11 +223,7 @@ def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None
     assert line.last(RunEnded).outcome is RunState.PASS
     plant.restart("A")
     assert plant.revision(SERIAL) == "4"
-    line.arrive("A")
-    line.scan("SOCKET A")
-    line.scan(OTHER)
-    line.work("A")
-    line.end("A")
+    plant.make("A", OTHER)
     assert plant.revision(OTHER) == "5"
     assert line.ports["A"].setup.recipe.is_relative_to(plant.folder.folder / digest)
 
@@ -266,12 +271,16 @@ def test_sockets_change_on_their_own(plant: Plant) -> None:
     plant.restart("B")
     assert [each.socket for each in plant.line.of(RecipeChanged)] == ["B"]
     for socket, serial, revision in (("A", SERIAL, "4"), ("B", OTHER, "5")):
-        plant.line.arrive(socket)
-        plant.line.scan(f"SOCKET {socket}")
-        plant.line.scan(serial)
-        plant.line.work(socket)
-        plant.line.end(socket)
+        plant.make(socket, serial)
         assert plant.revision(serial) == revision
+
+
+def test_figures_count_the_runs_of_all_recipes(plant: Plant) -> None:
+    plant.approve(plant.give(OTHER_PART, "B"))
+    plant.restart("B")
+    for socket, serial in (("A", SERIAL), ("B", OTHER)):
+        plant.make(socket, serial)
+    assert plant.line.station.figures.units == 2
 
 
 def test_a_label_that_waits_for_its_unit_goes_first(plant: Plant) -> None:

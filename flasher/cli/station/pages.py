@@ -38,7 +38,7 @@ from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import RunFilter, RunState, StationClock, utc_moment
+from flasher.station.records.model import RunFilter, RunKind, RunState, StationClock, utc_moment
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
 from flasher.station.station import Station
@@ -77,29 +77,33 @@ class OperatorView:
         self._screen = screen
         self._station = station
         self._board = board
-        self._lot = ""
+        self._lot = CurrentLot("")
         self._good: dict[str, bool] = {}
         """Units of the lot by serial number; True if the last run passed."""
 
     def show(self, event: StationEvent) -> None:
         """Show an event that the board has applied."""
-        if isinstance(event, RunEnded):
+        if isinstance(event, RunEnded) and event.kind is not RunKind.GOLDEN:
             self._good[event.serial] = event.outcome is RunState.PASS
         self._screen.show(event, self._board)
 
     def turn(self) -> None:
         """Update operator and lot; called in each turn of the station's loop."""
         line, board = self._station.line, self._board
-        rule = self._station.recipe.recipe
-        if rule.lot.quantity_max and line.lot != self._lot:
-            runs = self._station.store.read.table(RunFilter(lot=line.lot, part=rule.part))
-            self._good = {run.serial: run.state is RunState.PASS for run in runs}
-        self._lot = line.lot
-        lot = CurrentLot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
+        rules = [each.recipe.lot for each in self._station.recipes.values()]
+        size = min((each.quantity_max for each in rules if each.quantity_max), default=0)
+        if size and (line.lot, size) != (self._lot.name, self._lot.size):
+            runs = self._station.store.read.table(RunFilter(lot=line.lot))
+            self._good = {
+                run.serial: run.state is RunState.PASS
+                for run in runs
+                if run.kind is not RunKind.GOLDEN
+            }
+        self._lot = CurrentLot(line.lot, size, sum(self._good.values()))
         operator = line.operator or text("none: scan a badge")
         if not board.has_badges:
             operator = text("{name} (no badges)", name=line.operator)
-        self._screen.turn(board, operator=operator, lot=lot)
+        self._screen.turn(board, operator=operator, lot=self._lot)
 
 
 @contextmanager
@@ -160,7 +164,8 @@ def _plant_checks(station: Station) -> Collection[HealthCheck]:
     """Check the sending of records to the plant's database, and the clock against it."""
     from flasher.plant.health import checks  # noqa: PLC0415  an extra
 
-    store, most_s = station.store, station.recipe.recipe.plant.clock_offset_max_s
+    store = station.store
+    most_s = min(each.recipe.plant.clock_offset_max_s for each in station.recipes.values())
     return checks(store.files.folder, store.station, station.clock.utc(), most_s)
 
 

@@ -124,7 +124,7 @@ def run(
                 for each in recipes.values()
             )
         output.has_opened = True
-        gate = None if _is_temporary(options, records) else gate_of(config, recipe, store)
+        gate = None if _is_temporary(options, records) else gate_of(config, recipes, store)
         setups = worker_setups(
             sockets,
             recipe,

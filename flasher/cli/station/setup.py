@@ -65,14 +65,16 @@ def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | Non
     )
 
 
-def gate_of(config: StationConfig, recipe: LoadedRecipe, store: Store) -> Gate | None:
-    """What asks the plant before each run; None if the station file names no plant. Raises
-    UsageError.
+def gate_of(
+    config: StationConfig, recipes: Mapping[str, LoadedRecipe], store: Store
+) -> Gate | None:
+    """What asks the plant before each run; None if the station file names no plant. `recipes`:
+    that of each socket. Raises UsageError.
     """
     question, claims = config.question, None
     if question is None and not config.plant:
         return None
-    clock = SystemClock()
+    clock, recipe = SystemClock(), next(iter(recipes.values()))
     asked = None
     if question is not None:
         from flasher.station.question import Question  # noqa: PLC0415  few stations ask
@@ -82,7 +84,8 @@ def gate_of(config: StationConfig, recipe: LoadedRecipe, store: Store) -> Gate |
         from flasher.plant.central import Central  # noqa: PLC0415  an extra
         from flasher.plant.claims import PlantClaims  # noqa: PLC0415
 
-        limit_s = recipe.recipe.plant.time_limit_s
+        # The gate applies the limit of each recipe.
+        limit_s = max(each.recipe.plant.time_limit_s for each in recipes.values())
         central = Central(config.plant, lock_timeout_s=limit_s, statement_limit_s=limit_s)
         claims = PlantClaims(central, store.database, config.name, clock)
     return Gate(recipe.recipe, claims, asked, clock.monotonic_s)
