@@ -28,8 +28,8 @@ from flasher.host.outcome import (
     _late,
 )
 from flasher.protocol.catalogue import ITEMS
-from flasher.protocol.contents import BatteryFault
-from flasher.protocol.fields import flag_names, label
+from flasher.protocol.contents import BatteryFault, BatteryStatus
+from flasher.protocol.fields import FlagsField, flag_names, label
 from flasher.protocol.messages import BootVersion, Packet, UpdateCommand
 from flasher.report.chart import MarkKind
 from flasher.station.records.chain import NAMED, OWN
@@ -120,8 +120,12 @@ def sentences() -> Iterator[str]:
     yield AGAIN
     yield from message_titles()
     for item in ITEMS:
-        yield from (label(*each) for each in meaningful_fields(item.content))
+        for name, codec in meaningful_fields(item.content):
+            yield label(name, codec)
+            if isinstance(codec, FlagsField):
+                yield codec.none
     yield from flag_names(BatteryFault, sum(BatteryFault))
+    yield from flag_names(BatteryStatus, sum(BatteryStatus))
     yield from ("label", *(word.value.lower() for word in Word))  # what a scan means
 
 

@@ -281,15 +281,15 @@ def _versions_unknown(identity: Identity, target: Target) -> CheckResult:
     previous = release is not None and release.rules_previous
     if not hardware and not previous:
         sentence = text(
-            "the {node}'s application does not report its versions: neither hardware nor downgrade "
-            "can be checked",
+            "the {node}'s application reported no version: neither hardware nor downgrade can be "
+            "checked",
             node=target.node.name,
         )
         return CheckResult(IdentityCheck.HARDWARE, CheckVerdict.UNKNOWN, sentence)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
     sentence = text(
-        "the {node}'s application does not report its versions: the manifest's rule on {rules} "
-        "cannot be checked",
+        "the {node}'s application reported no version: the manifest's rule on {rules} cannot "
+        "be checked",
         node=target.node.name,
         rules=rules,
     )

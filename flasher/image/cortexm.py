@@ -130,8 +130,8 @@ def check_starts_inside(image: Image) -> None:
         where=f"the bytes to send are at 0x{image.base:08X}..0x{end - 1:08X}",
         cause="part of a program, or the wrong part of a file that merges bootloader and "
         "application",
-        remedy="choose the application with --range START:END, or waive this check with "
-        "--allow-outside-vector",
+        remedy="Choose the application with --range START:END, or waive this check with "
+        "--allow-outside-vector.",
         code=ErrorCode.IMAGE_OUTSIDE,
     )
     error.waiver = "outside-vector"

@@ -121,7 +121,7 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
         raise ImageError(
             f"{source} is an ELF file for a 64-bit processor",
             cause="it is a program for a computer, not for the device",
-            remedy="name the firmware file",
+            remedy="Name the firmware file.",
         )
     fields = header.unpack_from(data)
     if fields[10] > _PROGRAM_HEADERS_MAX or fields[12] > _SECTIONS_MAX:
@@ -156,7 +156,7 @@ def _loads(data: bytes, source: str, order: str, fields: tuple[int, ...]) -> lis
         raise ImageError(
             f"{source} has no loadable segment",
             cause="it is an object file, or contains only debug information",
-            remedy="name the linked program",
+            remedy="Name the linked program.",
             code=ErrorCode.IMAGE_EMPTY,
         )
     return loads
@@ -166,6 +166,6 @@ def _refuse(source: str, what: str) -> ImageError:
     return ImageError(
         f"{source} is a damaged ELF file: {what}",
         cause="cut off or damaged while it was written or copied",
-        remedy="make the file again, or convert it: objcopy -O ihex",
+        remedy="Make the file again, or convert it: objcopy -O ihex.",
         code=ErrorCode.IMAGE_DAMAGED,
     )

@@ -149,13 +149,13 @@ def read(
                 raise UsageError(
                     f"a base is for a raw binary, and {source} is an {form.title} file",
                     where="the file itself contains the addresses",
-                    remedy="leave out the base; choose a part of the file with --range START:END",
+                    remedy="Leave out the base. Choose a part of the file with --range START:END.",
                 )
             if size_bytes > FILE_MAX_SIZE:
                 raise ImageError(
                     f"{source} is too large for an {form.title} file: {size_bytes} bytes",
                     cause="it contains debug information, or is not firmware",
-                    remedy="strip it, or convert it to a raw binary: objcopy -O binary",
+                    remedy="Strip it, or convert it to a raw binary: objcopy -O binary.",
                     code=ErrorCode.IMAGE_TOO_LARGE,
                 )
             READERS[form](file, source, sparse)
@@ -185,7 +185,7 @@ def _check_options(form: str | None, base: int | None, range_: tuple[int, int] |
     if range_ is not None and not 0 <= range_[0] < range_[1] <= ADDRESS_SPACE:
         raise UsageError(
             f"the range {range_[0]:#x}:{range_[1]:#x} is empty or not inside 32-bit addresses",
-            remedy="give START:END with END one past the last byte",
+            remedy="Give START:END with END one past the last byte.",
         )
 
 
@@ -229,7 +229,7 @@ def _read_binary(file: BinaryIO, size_bytes: int, sparse: SparseBytes, base: int
     if window and base is None:
         raise UsageError(
             f"--range chooses addresses, and {source} is a raw binary, which has none",
-            remedy="give the address of its first byte with --base",
+            remedy="Give the address of its first byte with --base.",
         )
     start = base or 0
     end = start + size_bytes

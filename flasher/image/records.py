@@ -106,7 +106,7 @@ class _Scanner:
             f"{self.source} is a damaged {self.format} file: {what}",
             where=_place(self.line),
             cause=cause or "damaged while it was copied, or edited by hand",
-            remedy="copy or make the file again",
+            remedy="Copy or make the file again.",
             code=ErrorCode.IMAGE_DAMAGED,
         )
 

@@ -146,7 +146,7 @@ class SparseBytes:
             f"first {there[at]:02X}, then {data[at]:02X}",
             where=place(address),
             cause="two overlapping builds or parts were merged into one file",
-            remedy="make the file again from one build",
+            remedy="Make the file again from one build.",
             code=ErrorCode.IMAGE_CONFLICT,
         )
 
@@ -158,7 +158,7 @@ class SparseBytes:
         return ImageError(
             f"{self.source} contains no bytes in the range 0x{start:08X}:0x{end:08X}",
             where=f"its bytes are between 0x{low:08X} and 0x{high:08X}",
-            remedy="correct --range START:END",
+            remedy="Correct --range START:END.",
             code=ErrorCode.IMAGE_EMPTY,
         )
 
@@ -166,9 +166,9 @@ class SparseBytes:
         named = ", ".join(str(span) for span in spans[:_NAMED_SPANS_MAX])
         if len(spans) > _NAMED_SPANS_MAX:
             named += f" and {len(spans) - _NAMED_SPANS_MAX} more"
-        remedy = "choose the application with --range START:END"
+        remedy = "Choose the application with --range START:END."
         if spans[-1].end - min(start, spans[0].start) <= IMAGE_MAX_SIZE:
-            remedy += f", or fill the gap with FF by --fill-gaps-up-to {end - start}"
+            remedy += f" Or fill the gap with FF by --fill-gaps-up-to {end - start}."
         return ImageError(
             f"{self.source} has a gap of {end - start} bytes between 0x{start:08X} and 0x{end:08X}",
             where=f"segments {named}",
@@ -183,7 +183,7 @@ def empty_error(source: str) -> ImageError:
     return ImageError(
         f"{source} is empty: it contains no bytes to send",
         cause="the build or the conversion that made it failed",
-        remedy="make the file again",
+        remedy="Make the file again.",
         code=ErrorCode.IMAGE_EMPTY,
     )
 
@@ -193,7 +193,7 @@ def scattered_error(source: str) -> ImageError:
     return ImageError(
         f"{source} contains more than {PIECES_MAX} separate pieces of data",
         cause="the file is damaged, or was not made by a linker",
-        remedy="make the file again, or choose part of it with --range START:END",
+        remedy="Make the file again. Or choose part of it with --range START:END.",
         code=ErrorCode.IMAGE_GAP,
     )
 
@@ -204,6 +204,6 @@ def too_large_error(source: str, size_bytes: int, *, more: bool = False) -> Imag
         f"{source} is too large: {'at least ' if more else ''}{size_bytes} bytes to send, "
         f"and {PACKET_COUNT_MAX} packets hold {IMAGE_MAX_SIZE}",
         cause="it is not a firmware image, or contains more than the application",
-        remedy="choose the application with --range START:END (a raw binary needs --base too)",
+        remedy="Choose the application with --range START:END (a raw binary needs --base too).",
         code=ErrorCode.IMAGE_TOO_LARGE,
     )

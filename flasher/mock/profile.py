@@ -213,5 +213,5 @@ def _parse_query(text: str) -> tuple[int | None, int]:
         return (int(can_id, 16) if can_id else None), int(command, 16)
     except ValueError:
         raise UsageError(
-            f"silent_queries: {text!a} is not a command", remedy="write 3800 or 732:5000"
+            f"silent_queries: {text!a} is not a command", remedy="Write 3800 or 732:5000."
         ) from None

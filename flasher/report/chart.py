@@ -235,10 +235,11 @@ def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
             f": {duration_text(min(known))} to {duration_text(max(known))}, "
             f"median {duration_text(median(known))}"
         )
-    for kind in (MarkKind.REPEATED, MarkKind.NAK):
-        count = sum(_count(sample, kind) for sample in samples)
-        summary += f"; {count:,} {'repetitions' if kind is MarkKind.REPEATED else 'NAKs'}"
-    return summary + "."
+    repeated, naks = (
+        sum(_count(sample, kind) for sample in samples)
+        for kind in (MarkKind.REPEATED, MarkKind.NAK)
+    )
+    return f"{'; '.join((summary, f'{repeated:,} repetitions', f'{naks:,} NAKs'))}."
 
 
 # -- distributions --------------------------------------------------------------------------------

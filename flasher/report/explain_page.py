@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
+from flasher.i18n import text
 from flasher.protocol.spec import Node
 from flasher.report import chart, sequence
 from flasher.report.base import Status, render_page
@@ -275,7 +276,7 @@ def _item(
             sequence.ItemKind.BLOCK,
             line.begin_s,
             f"{some} acknowledged",
-            translate.numbers(translate(f"in {duration_text(line.end_s - line.begin_s)}")),
+            translate(text("in {time}", time=duration_text(line.end_s - line.begin_s))),
             end_s=line.end_s,
         )
     if not line.sender or line.kind not in (StepKind.MESSAGE, StepKind.DAMAGED):

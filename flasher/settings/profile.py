@@ -247,7 +247,7 @@ class Profile:
                 f"{image.source}: {image.size_bytes} bytes exceed the limit of the device, {limit}",
                 where="the profile's limit",
                 cause="a merged file, or an image for another device",
-                remedy="choose the application with --range START:END",
+                remedy="Choose the application with --range START:END.",
                 code=ErrorCode.IMAGE_TOO_LARGE,
             )
         if area is None or image.base is None:
@@ -258,7 +258,7 @@ class Profile:
                 where=f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}, the area is "
                 f"0x{area.start:08X}..0x{area.end - 1:08X}",
                 cause="a merged file, or an image for another device",
-                remedy="choose the application with --range START:END",
+                remedy="Choose the application with --range START:END.",
                 code=ErrorCode.IMAGE_OUTSIDE,
             )
 

@@ -77,7 +77,7 @@ WATCH_TURN_S: Final = 0.5
 """Refresh interval of the bus view, slow enough to read."""
 SUBJECT: Final = "bench"
 _AGAIN: Final = text("Start again with the adapter.")
-RESCUE: Final = text("Then rescue this device.")
+RESCUE: Final = text("Rescue this device.")
 T = TypeVar("T")
 Order = Callable[["BenchController"], object]
 """A function that the bench's own thread calls."""
@@ -450,8 +450,8 @@ class BenchController:
     def watch(self) -> None:
         """Show the bus traffic until stopped, without sending."""
         board = MessageTable()
-        since_s = self.now()
         messages = troubles = 0
+        began_s = 0.0
 
         def happened(event: object) -> None:
             nonlocal messages, troubles
@@ -467,11 +467,12 @@ class BenchController:
                     )
                     for line in board.lines()
                 )
-                self.show(watched=BusWatch(self.now() - since_s, messages, troubles, rows))
+                self.show(watched=BusWatch(now - began_s, messages, troubles, rows))
 
         self.show(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
         watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self.backend.dialect)
         with self.connected(asks=False) as connection:
+            began_s = connection.clock.now()
             drive(
                 watcher, connection.link, connection.clock,
                 on_event=happened, cancelled=self.cancelled,

@@ -18,7 +18,7 @@ from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import RESCUE, BenchController, changed_error
 from flasher.web.bench_state import Activity, Offer, SetDevice
 
-_GO_ON: Final = text("Then go on with the bike.")
+_GO_ON: Final = text("Go on with the bike.")
 
 
 def upgrade_bike(bench: BenchController, sha256: str) -> None:

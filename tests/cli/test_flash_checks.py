@@ -157,13 +157,13 @@ def test_a_rule_that_cannot_be_checked_refuses_as_one_that_fails(
     stage = Stage(has_application=False)
     run = bench.flash(stage, manifest=rule)
     assert run.code == ExitCode.WRONG_DEVICE
-    assert "does not report its versions: the manifest's rule on" in run.err
+    assert "reported no version: the manifest's rule on" in run.err
     assert "cannot be checked; --allow-hardware waives this" in run.err
     assert "flasher rescue goes on without it" in run.err
     assert not wrote(stage)
     run = bench.flash(stage, "--allow-hardware", manifest=rule)
     assert run.code == ExitCode.OK, run.err
-    assert "warning: the BMS's application does not report its versions" in run.err
+    assert "warning: the BMS's application reported no version" in run.err
 
 
 def test_a_rescue_says_that_it_goes_on_unchecked(bench: Workbench) -> None:

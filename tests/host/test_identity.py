@@ -111,7 +111,7 @@ def test_what_the_device_says_of_the_image(
 def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() -> None:
     found = list(judge_device(IMAGE, OBC, Identity(), DeviceAnswers()))
     assert len(found) == 1
-    assert "the OBC's application does not report its versions" in found[0].text
+    assert "the OBC's application reported no version" in found[0].text
 
 
 @each(
@@ -267,7 +267,7 @@ def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
 ) -> None:
     found = judged(IMAGE, Identity(release(**stated)))[IdentityCheck.HARDWARE]
     assert found.text == (
-        "the BMS's application does not report its versions: "
+        "the BMS's application reported no version: "
         f"the manifest's rule on {rules} cannot be checked"
     )
     assert found.verdict is REFUSED

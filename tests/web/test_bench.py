@@ -393,11 +393,11 @@ def test_a_bootloader_that_announces_itself_instead_runs_no_new_version(place: B
 def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> None:
     error = _done(place, BikeFault.POWER).error
     assert error is not None
-    assert "Then rescue this device." in error.remedy
+    assert "Rescue this device." in error.remedy
     german = translator("de")
     assert german(error.what).startswith("BMS: ein Paket wurde nicht bestätigt")
     assert german(error.where) == "wird übertragen, Paket 8 von 20, Versuch 3"
-    assert "Dann dieses Gerät retten." in german(error.remedy)
+    assert "Dieses Gerät retten." in german(error.remedy)
     assert "Zustand des Geräts: seine Anwendung" in german(error.remedy)
 
 
@@ -556,6 +556,25 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
     assert any(each.seen.is_trouble for each in state.watched.board)  # the fault of this bike
     assert place.do(order(BenchController.use_adapter, BikeFault.NONE.value)).watched is None
+
+
+def test_the_bus_is_watched_in_the_time_of_its_messages(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
+    put = place.bench.feed.put
+
+    def stop_after_a_minute(subject: str, state: BenchState, *, word: object) -> None:
+        put(subject, state, word=word)
+        if state.watched is not None and state.watched.since_s >= 60:
+            place.bench.stop()
+
+    monkeypatch.setattr(place.bench.feed, "put", stop_after_a_minute)
+    watched = place.do(BenchController.watch).watched
+    assert watched is not None
+    row = watched.board[0]
+    assert row.rate_hz is not None
+    assert watched.since_s == pytest.approx(row.count / row.rate_hz, rel=0.1)
 
 
 def test_a_bus_that_fails_while_it_is_watched_says_so(
@@ -812,6 +831,23 @@ def test_an_error_on_the_page_names_no_option_of_the_command_line(
     assert "--" not in "".join(shown)
     assert all(shown)
     assert shown[0].endswith(")."), "the brackets stay whole"
+
+
+def test_a_silent_bus_has_something_to_do_on_the_page(place: BenchPlace) -> None:
+    trouble = place.do(order(BenchController.use_adapter, BikeFault.OFF.value)).trouble
+    assert trouble is not None
+    assert without_options(trouble.remedy) == "Switch the system on."
+
+
+def test_after_a_rescue_no_check_denies_that_the_battery_reports_its_version(
+    place: BenchPlace,
+) -> None:
+    _done(place, BikeFault.POWER)
+    place.do(BenchController.rescue_it)
+    done = place.do(_upgrade(place.bench.state)).done
+    assert done is not None
+    assert done.is_running
+    assert not any("does not report" in made.text for made in done.checks)
 
 
 def test_a_message_without_options_is_the_same_and_one_of_options_alone_is_empty() -> None:

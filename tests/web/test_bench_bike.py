@@ -100,7 +100,7 @@ def test_after_a_stop_it_goes_on_with_the_device_where_it_stopped(place: BenchPl
     assert state.done is not None
     assert state.done.error is not None
     assert state.done.error.code is ErrorCode.INTERRUPTED
-    assert "Then go on with the bike." in state.done.error.remedy
+    assert "Go on with the bike." in state.done.error.remedy
     place.bikes.hold = lambda _event: None
     place.bench._stop.clear()
     state = upgraded(place)

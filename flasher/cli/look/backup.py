@@ -358,9 +358,11 @@ def backup_of(
             range_from=area.source,
             names_running_version=running.encode("ascii") in data if running else None,
         )
-    not_in_it = {"other memory": "bootloader, settings, RAM: the documents give no addresses"}
+    not_in_it = {
+        text("other memory"): text("bootloader, settings, RAM: the documents give no addresses")
+    }
     if memory is None:
-        not_in_it = {"memory": "left out on request"}
+        not_in_it = {text("memory"): text("left out on request")}
     taken_at = datetime.datetime.now().astimezone()
     info = info_document(found)
     at = taken_at.isoformat(timespec="seconds")

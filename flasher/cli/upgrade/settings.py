@@ -92,7 +92,7 @@ def save_settings(
     saved = SavedSettings(values, command(path))
     what = text("the settings are saved: `{command}` restores them", command=saved.command)
     emit(CheckMade(SETTINGS, "passed", what))
-    emit(CheckMade(SETTINGS, "passed", _NOT_KEPT))
+    emit(CheckMade(SETTINGS, "unknown", _NOT_KEPT))
     return saved
 
 
